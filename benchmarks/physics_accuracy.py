@@ -1,0 +1,185 @@
+"""What each physics setting costs, and how far it ends from a 0.5 ms reference of the same model.
+
+    python -m benchmarks.physics_accuracy [--cars 64] [--json FILE] [--markdown]
+
+Every setting drives the same cars with the same random commands. A setting that changes the model (wheel
+shape, friction cone, contact stiffness) is held against a reference of that model. Costs are taken in turns, so that
+their ratios within one run are fair.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.sim.batch import CarBatch
+
+CAR_FILE = Path(__file__).parents[1] / "conf/car/deepracer.yaml"
+SECONDS = 10
+REFERENCE_STEP_S = 0.0005
+MODEL_KEYS = ("wheel_contact", "friction_cone", "contact_time_s", "contact_impedance")
+"""Settings that change what is simulated, not how exactly."""
+
+SETTINGS: tuple[dict[str, Any], ...] = (
+    {},
+    *({"substeps": n} for n in (4, 5, 6, 7, 10, 14, 20, 40)),
+    *({"integrator": "discrete", "substeps": n} for n in (5, 10)),
+    *({"integrator": "euler", "substeps": n} for n in (5, 10, 20)),
+    *({"solver_iterations": n} for n in (1, 2, 3, 8)),
+    *({"line_search_iterations": n} for n in (2, 4, 20)),
+    *({"solver_tolerance": tolerance} for tolerance in (1e-8, 1e-2)),
+    *({"solver": "cg", "solver_iterations": n} for n in (4, 8, 20)),
+    *({"friction_cone": "pyramidal", "substeps": n} for n in (5, 7, 10)),
+    *({"contact_impedance": rigid} for rigid in (0.3, 0.7, 0.9)),
+    *({"contact_time_s": 0.04, "substeps": n} for n in (4, 5)),
+    # MuJoCo's own contact stiffness needs a step of at most 10 ms.
+    *(
+        {"friction_cone": "pyramidal", "contact_time_s": 0.02, "contact_impedance": 0.9, "substeps": 10, **more}
+        for more in ({}, {"solver_iterations": 8})
+    ),
+    {"wheel_contact": "ellipsoid"},
+    {"wheel_contact": "cylinder"},
+)
+Array = NDArray[np.float64]
+
+
+def commands(n_cars: int, steps: int) -> tuple[Array, Array]:
+    """Return speeds (m/s) and steering angles (rad), (steps, n_cars): new ones after 1 to 8 steps."""
+    rng = np.random.default_rng(0)
+    speed, steering = np.empty((steps, n_cars)), np.empty((steps, n_cars))
+    for car in range(n_cars):
+        at = 0
+        while at < steps:
+            until = at + int(rng.integers(1, 9))
+            speed[at:until, car] = rng.uniform(0.5, 3.0)
+            steering[at:until, car] = np.deg2rad(rng.uniform(-30.0, 30.0))
+            at = until
+    return speed, steering
+
+
+def path(car: CarConfig, speed: Array, steering: Array) -> Array | None:
+    """Return the origins (steps, n_cars, 2) in metres, or None where the physics blows up."""
+    cars = CarBatch(car, speed.shape[1], threads=0)
+    places = np.empty((*speed.shape, 2))
+    try:
+        for t, command in enumerate(zip(speed, steering, strict=True)):
+            cars.drive(*command)
+            state = cars.read()
+            places[t] = np.stack([state.x_m, state.y_m], axis=-1)
+    except RunFailed:
+        return None
+    return places
+
+
+def costs_us(cars: list[CarConfig], speed: Array, steering: Array, rounds: int) -> list[float]:
+    """Return the least microseconds per control step and car, one thread, all settings in turns."""
+    batches = [CarBatch(car, speed.shape[1], threads=1) for car in cars]
+    best = [np.inf] * len(cars)
+    for batch in batches:
+        batch.drive(speed[0], steering[0])
+    for t in range(1, rounds + 1):
+        for i, batch in enumerate(batches):
+            begin = time.perf_counter()
+            batch.drive(speed[t], steering[t])
+            best[i] = min(best[i], time.perf_counter() - begin)
+    return [1e6 * seconds / speed.shape[1] for seconds in best]
+
+
+def measure(n_cars: int, rounds: int) -> list[dict[str, Any]]:
+    """Measure every setting; errors in metres, median and 90th percentile over cars."""
+    default = TypeAdapter(CarConfig).validate_python(yaml.safe_load(CAR_FILE.read_text()))
+    steps = int(SECONDS * default.control_hz)
+    speed, steering = commands(n_cars, steps)
+    references: dict[tuple[Any, ...], Array] = {}
+    rows, timed = [], []
+    for change in SETTINGS:
+        car = dataclasses.replace(default, **change)
+        model = tuple(getattr(car, key) for key in MODEL_KEYS)
+        if model not in references:
+            exact = dataclasses.replace(
+                car,
+                substeps=round(car.control_period_s / REFERENCE_STEP_S),
+                integrator="implicitfast",
+                solver="newton",
+                solver_iterations=100,
+                line_search_iterations=50,
+                solver_tolerance=1e-12,
+            )
+            reference = path(exact, speed, steering)
+            if reference is None:
+                raise RunFailed(f"the reference of {model} blew up")
+            references[model] = reference
+        driven = path(car, speed, steering)
+        row: dict[str, Any] = {
+            "setting": ", ".join(f"{key}={value}" for key, value in change.items()) or "default",
+            **{f.name: getattr(car, f.name) for f in dataclasses.fields(car) if f.name in PHYSICS_KEYS},
+        }
+        for seconds in (1, SECONDS):
+            at = int(seconds * default.control_hz) - 1
+            error = None if driven is None else np.linalg.norm(driven[at] - references[model][at], axis=-1)
+            row[f"median_{seconds}s_m"] = None if error is None else float(np.median(error))
+            row[f"p90_{seconds}s_m"] = None if error is None else float(np.percentile(error, 90))
+        rows.append(row)
+        if driven is not None:
+            timed.append((row, car))
+    for (row, _), cost in zip(timed, costs_us([car for _, car in timed], speed, steering, rounds), strict=True):
+        row["us_per_step"] = cost
+    return rows
+
+
+PHYSICS_KEYS = (
+    "substeps",
+    "integrator",
+    "solver",
+    "solver_iterations",
+    "line_search_iterations",
+    *MODEL_KEYS,
+)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the rows as a Markdown table."""
+    head = ("setting (otherwise default)", "after 1 s: median, p90 (mm)", "after 10 s: median, p90 (mm)", "µs")
+    lines = [head, ("---", "---:", "---:", "---:")]
+    for row in rows:
+        errors = [
+            "blows up"
+            if row[f"median_{s}s_m"] is None
+            else f"{1e3 * row[f'median_{s}s_m']:.1f}, {1e3 * row[f'p90_{s}s_m']:.1f}"
+            for s in (1, SECONDS)
+        ]
+        cost = f"{row['us_per_step']:.1f}" if "us_per_step" in row else ""
+        lines.append((row["setting"], *errors, cost))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--cars", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=60, help="timed control steps per setting")
+    parser.add_argument("--json", type=Path, help="also write the rows as JSON to this file")
+    parser.add_argument("--markdown", action="store_true", help="print nothing but the table")
+    options = parser.parse_args()
+    rows = measure(options.cars, options.rounds)
+    if not options.markdown:
+        cores = len(os.sched_getaffinity(0))
+        sys.stdout.write(f"{options.cars} cars, {SECONDS} s; cost per control step and car, one of {cores} cores\n")
+    sys.stdout.write(table(rows) + "\n")
+    if options.json:
+        options.json.write_text(json.dumps({"settings": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,228 @@
+"""Clipped proximal policy optimisation, from TorchRL's parts."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from deepracer_exp.config.learning import AlgorithmConfig
+from deepracer_exp.errors import RunFailed
+
+from .actor_critic import ActorCritic
+from .schedules import Schedule
+
+_VALUE_LOSSES = {"huber": "smooth_l1", "mean squared error": "l2"}
+_LOSS_NAMES = {"loss_objective": "policy loss", "loss_critic": "value loss", "loss_entropy": "entropy"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdateMetrics:
+    """What one update did; means over its gradient steps unless said otherwise."""
+
+    policy_loss: float
+    value_loss: float
+    """Before it is weighted by `critic_coeff`."""
+    entropy: float
+    """In nats."""
+    kl: float
+    """KL divergence of the collecting policy from the updated one, estimated over the last epoch."""
+    clip_fraction: float
+    """Share of steps whose probability ratio was clipped."""
+    explained_variance: float
+    """Of the value targets by the values before the update; 1 is perfect, 0 no better than their mean."""
+    grad_norm: float
+    """Before clipping."""
+    lr: float
+
+
+class _Loss(ClipPPOLoss):
+    """ClipPPOLoss for distributions that know their entropy.
+
+    The library's version looks at every entropy of the minibatch and falls back to sampling where one is not
+    finite, which would end in torch.multinomial's complaint instead of the name of the offender.
+    """
+
+    def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        return dist.entropy().unsqueeze(-1)
+
+
+class PPO:
+    """Improves an actor-critic from batches of its own driving.
+
+    The meaning of the hyperparameters is DeepRacer's: advantages standardised once over the whole batch,
+    a constant clip range, every epoch a new shuffle, a last minibatch that is not full left out. Unlike
+    DeepRacer's trainer, episodes need not be complete: an open or truncated one is continued by the value of
+    its last observation.
+    """
+
+    def __init__(
+        self, actor_critic: ActorCritic, config: AlgorithmConfig, schedule: Schedule, seed: int
+    ) -> None:
+        """Set up loss, advantages and optimizer for `actor_critic`, which is updated in place.
+
+        `seed` starts the stream that shuffles the minibatches.
+        """
+        self._networks, self._config, self._schedule = actor_critic, config, schedule
+        self._generator = torch.Generator().manual_seed(seed)
+        self._parameters = list(actor_critic.parameters())
+        device = self._parameters[0].device
+        # Adam's epsilon as in DeepRacer's trainer; one fused kernel instead of a dozen over all tensors.
+        self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
+        self._max_grad_norm = config.max_grad_norm or math.inf
+        self._advantages = GAE(
+            gamma=config.discount,
+            lmbda=config.gae_lambda,
+            value_network=None,
+            average_gae=True,
+            vectorized=True,
+            device=device,
+        )
+        self._loss = _Loss(
+            actor_critic.policy_head,
+            actor_critic.value_head,
+            clip_epsilon=config.clip_epsilon,
+            entropy_coeff=config.entropy_coeff,
+            critic_coeff=config.critic_coeff,
+            loss_critic_type=_VALUE_LOSSES[config.loss_type],
+            functional=False,
+            log_explained_variance=False,
+            device=device,
+        )
+
+    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
+        """Run all epochs on one batch.
+
+        Args:
+            batch: Leading dimensions [..., T], time last and contiguous. Holds `observation`, `action`,
+                `action_log_prob` and `next` with `observation` (of a finished episode: its last one, not the
+                first of the new one), `reward`, `done`, `terminated`, each of the latter [..., T, 1].
+            iteration: Updates made before this one.
+            fraction: Share of the budget spent, 0 to 1.
+
+        Raises:
+            RunFailed: Input, loss or gradient is not finite; the networks are as before that gradient step.
+        """
+        lr = self._config.lr * self._schedule.factor(iteration, fraction)
+        for group in self._optimizer.param_groups:
+            group["lr"] = lr
+        steps, explained_variance = self._prepare(batch)
+        count = steps.shape[0]
+        size = min(self._config.batch_size, count)
+        minibatches = count // size
+        results = [
+            self._gradient_step(minibatch)
+            for _ in range(self._config.epochs)
+            for minibatch in steps[self._shuffled(count)[: minibatches * size]].split(size)
+        ]
+        # One transfer for the whole update: .item() per minibatch would wait for the device each time.
+        table = torch.stack(results)
+        policy_loss, value_loss, entropy, clip_fraction, _, grad_norm = table.mean(0).tolist()
+        kl = table[-minibatches:, 4].mean().item()
+        self._schedule.observe(kl)
+        return UpdateMetrics(
+            policy_loss=policy_loss,
+            value_loss=value_loss / self._config.critic_coeff,
+            entropy=entropy,
+            kl=kl,
+            clip_fraction=clip_fraction,
+            explained_variance=explained_variance,
+            grad_norm=grad_norm,
+            lr=lr,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, optimizer, schedule and shuffling stream: tensors and plain values only."""
+        return {
+            "networks": self._networks.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "schedule": self._schedule.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`; further updates are those of the original bit for bit."""
+        self._networks.load_state_dict(state["networks"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._schedule.load_state_dict(state["schedule"])
+        self._generator.set_state(state["generator"])
+
+    def _shuffled(self, count: int) -> Tensor:
+        return torch.randperm(count, generator=self._generator).to(self._parameters[0].device)
+
+    @torch.no_grad()
+    def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:
+        """Return the steps in one row with `advantage` and `value_target`, and the explained variance."""
+        _require_finite(batch)
+        value = self._value_of(batch["observation"])
+        # An unfinished step's next observation is the next row's observation, whose value is known: only ends
+        # of episodes and of the batch are evaluated. 4 ms for 8192 steps, against 14 ms of two full passes.
+        ends = batch["next", "done"].squeeze(-1).clone()
+        ends[..., -1] = True
+        next_value = value.roll(-1, dims=-2)
+        next_value[ends] = self._value_of(batch["next", "observation"][ends])
+        estimates = TensorDict(
+            {
+                "state_value": value,
+                "next": {
+                    "state_value": next_value,
+                    **{key: batch["next", key] for key in ("reward", "done", "terminated")},
+                },
+            },
+            batch.batch_size,
+        )
+        self._advantages(estimates)
+        target = estimates["value_target"]
+        unexplained, total = (target - value).var(correction=0), target.var(correction=0)
+        steps = batch.select("observation", "action", "action_log_prob")
+        steps.update(estimates.select("advantage", "value_target"))
+        # A constant target has no variance to explain.
+        explained = 1 - unexplained / total.clamp_min(torch.finfo(total.dtype).tiny)
+        return steps.reshape(-1), explained.item() if total > 0 else 0.0
+
+    def _value_of(self, observation: Tensor) -> Tensor:
+        steps = TensorDict({"observation": observation}, observation.shape[:-1])
+        return self._networks.value(steps)["state_value"]
+
+    def _gradient_step(self, minibatch: TensorDictBase) -> Tensor:
+        """Step along one minibatch's gradient and return the parts of UpdateMetrics on the device."""
+        if self._networks.trunk is not None:
+            minibatch = self._networks.trunk(minibatch)
+        losses = self._loss(minibatch)
+        loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        self._optimizer.zero_grad()
+        loss.backward()
+        grad_norm = nn.utils.get_total_norm([p.grad for p in self._parameters if p.grad is not None])
+        if not torch.isfinite(loss.detach() + grad_norm):
+            self._fail(losses)
+        nn.utils.clip_grads_with_norm_(self._parameters, self._max_grad_norm, grad_norm)
+        self._optimizer.step()
+        # E[r - 1 - log r] for r = new / old probability: never negative, and far less noisy than E[-log r].
+        kl = losses["mean_ratio"] - 1 + losses["kl_approx"]
+        keys = ("loss_objective", "loss_critic", "entropy", "clip_fraction")
+        return torch.stack([*(losses[key].detach() for key in keys), kl, grad_norm])
+
+    def _fail(self, losses: TensorDictBase) -> NoReturn:
+        """Raise RunFailed with the first thing that is not finite."""
+        for key, name in _LOSS_NAMES.items():
+            if not torch.isfinite(losses[key]):
+                raise RunFailed(f"{name} is {losses[key].item()}; the gradient step was not made")
+        for name, parameter in self._networks.named_parameters():
+            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                raise RunFailed(f"gradient of {name} is not finite; the gradient step was not made")
+        raise RunFailed("norm of the gradient is not finite; the gradient step was not made")
+
+
+def _require_finite(batch: TensorDictBase) -> None:
+    keys = ("observation", "action", "action_log_prob", ("next", "observation"), ("next", "reward"))
+    for key in keys:
+        finite = torch.isfinite(batch[key])
+        if not finite.all():
+            name = " ".join(key) if isinstance(key, tuple) else key
+            position = (~finite).nonzero()[0].tolist()
+            raise RunFailed(f"{name} is {batch[key][tuple(position)].item()} at {position} of the batch")

@@ -1,0 +1,87 @@
+"""Learning-rate schedules, as factors of `algorithm.lr`.
+
+Pure functions of the progress: a resumed or cloned run needs no replay of past steps, and lengths may be in
+iterations or in fractions of the budget, neither of which torch.optim.lr_scheduler's step counting can say.
+"""
+
+import math
+from typing import assert_never
+
+from deepracer_exp.config.learning import (
+    AdaptiveKLLR,
+    ConstantLR,
+    CosineLR,
+    ExponentialLR,
+    LinearLR,
+    LRScheduleConfig,
+    StepLR,
+)
+
+# A warm-up counted in fractions of the budget begins at fraction 0; its first update must still learn.
+_LOWEST_WARMUP_FACTOR = 0.01
+
+
+class Schedule:
+    """The factor of the learning rate at each point of a run.
+
+    Warm-up and decay are both counted from the start of the run and multiplied.
+    """
+
+    def __init__(self, config: LRScheduleConfig) -> None:
+        self._config = config
+        self._adapted = 1.0
+
+    def factor(self, iteration: int, fraction: float) -> float:
+        """Return the factor for the coming update.
+
+        Args:
+            iteration: Updates made before this one.
+            fraction: Share of the budget spent, 0 to 1.
+        """
+        by_iteration = self._config.by == "iteration"
+        position = iteration if by_iteration else fraction
+        # The first of n warm-up iterations is worth 1/n, the last the full rate.
+        return self._warmup(iteration + 1 if by_iteration else fraction) * self._decay(position)
+
+    def observe(self, kl: float) -> None:
+        """Take note of how far the last update moved the policy (only `adaptive_kl` acts on it).
+
+        The rate falls where `kl` is above twice the target and rises where it is below half of it: the rule
+        of torchrl.objectives.KLAdaptiveLR, kept apart from the optimizer so that a warm-up can multiply it.
+        """
+        if not isinstance(self._config, AdaptiveKLLR):
+            return
+        step, target = self._config.step_factor, self._config.target_kl
+        change = 1 / step if kl > 2 * target else step if kl < target / 2 else 1.0
+        lowest, highest = self._config.lowest_factor, self._config.highest_factor
+        self._adapted = min(highest, max(lowest, self._adapted * change))
+
+    def state_dict(self) -> dict[str, float]:
+        """Return what `observe` has learned."""
+        return {"adapted": self._adapted}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Take over a `state_dict`."""
+        self._adapted = state["adapted"]
+
+    def _warmup(self, position: float) -> float:
+        if position >= self._config.warmup:
+            return 1.0
+        return max(position / self._config.warmup, _LOWEST_WARMUP_FACTOR)
+
+    def _decay(self, position: float) -> float:
+        match self._config:
+            case ConstantLR():
+                return 1.0
+            case LinearLR(length=length, end_factor=end):
+                return 1 + (end - 1) * min(position / length, 1.0)
+            case CosineLR(length=length, end_factor=end):
+                return end + (1 - end) * (1 + math.cos(math.pi * min(position / length, 1.0))) / 2
+            case StepLR(length=length, factor=factor):
+                return factor ** math.floor(position / length)
+            case ExponentialLR(length=length, factor=factor):
+                return factor ** (position / length)
+            case AdaptiveKLLR():
+                return self._adapted
+            case _:
+                assert_never(self._config)

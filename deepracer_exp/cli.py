@@ -1,0 +1,214 @@
+"""The command line; each command imports what it needs, so that `--help` answers at once."""
+
+import argparse
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deepracer_exp import __version__
+from deepracer_exp.errors import BadInput, RunFailed
+
+if TYPE_CHECKING:
+    from deepracer_exp.training.run import Outcome
+
+_TRAIN_EPILOG = """\
+An experiment is one option of each group, and any value in it can be set:
+
+  deepracer-exp train                                       the default: re:Invent 2018, PPO, stops when reliable
+  deepracer-exp train track=Oval_track reward=racing_line   other options
+  deepracer-exp train algorithm.lr=3e-4 seed=7              other values
+  deepracer-exp train experiment=fast_lap                   a set of choices from conf/experiment/
+  deepracer-exp train reward.file=my_reward.py              your own reward function
+  deepracer-exp train reward.constants.SPEED_WEIGHT=2       an UPPERCASE constant of the reward function
+  deepracer-exp train -m seed=0,1,2 network=mlp_small,mlp   every combination, one run after the other
+  deepracer-exp train track=Oval_track --cfg                print the experiment and stop
+
+groups: track car action_space observation randomization episode reward network algorithm lr_schedule
+        collector stopping budget tracking experiment
+  deepracer-exp train --options GROUP                       the options of a group
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130/143 interrupted."""
+    parser = _parser()
+    args = parser.parse_args(arguments)
+    try:
+        code = args.command(args)
+    except BadInput as error:
+        code = _fail(error, BadInput.exit_code, args)
+    except RunFailed as error:
+        code = _fail(error, RunFailed.exit_code, args)
+    except KeyboardInterrupt:
+        code = 130
+    except BrokenPipeError:
+        # The reader of our output (`| head`) has gone; what Python still holds for it is of no use.
+        sys.stderr.close()
+        code = 141
+    sys.exit(code)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="deepracer-exp",
+        description="Hundreds of DeepRacer-style racing experiments a day, on one machine.",
+        epilog="`deepracer-exp COMMAND --help` tells more. Results go to runs/ in the current folder.",
+    )
+    parser.add_argument("--version", action="version", version=f"deepracer-exp {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    train = commands.add_parser(
+        "train",
+        help="train a car",
+        description="Train a car: compose an experiment from overrides and run it.",
+        epilog=_TRAIN_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    train.add_argument("overrides", nargs="*", metavar="GROUP=OPTION | KEY=VALUE")
+    train.add_argument("--cfg", action="store_true", help="print the composed experiment as YAML and stop")
+    train.add_argument("--options", metavar="GROUP", help="print the options of a group and stop")
+    train.add_argument(
+        "-m", "--multirun", action="store_true", help="run every combination of values given as lists"
+    )
+    train.set_defaults(command=_train)
+
+    tracks = commands.add_parser(
+        "tracks",
+        help="list the tracks, or draw one",
+        description="List the tracks with length, width and shape; with a name, write a picture of that track.",
+    )
+    tracks.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
+    tracks.add_argument("-o", "--output", help="picture to write (default: NAME.png)")
+    tracks.set_defaults(command=_tracks)
+
+    ui = commands.add_parser(
+        "ui",
+        help="open the MLflow pages of the recorded runs",
+        description="Serve the MLflow pages of the project's runs on 127.0.0.1 until Ctrl-C.",
+    )
+    ui.add_argument("--port", type=int, default=5000)
+    ui.add_argument("--runs-dir", default="runs", help="where the runs are (default: runs)")
+    ui.add_argument("--uri", help="another MLflow store, as given to tracking.uri")
+    ui.set_defaults(command=_ui)
+    return parser
+
+
+def _train(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_experiment, expand_grid, options_of
+
+    if args.options is not None:
+        print("\n".join(options_of(args.options)))
+        return 0
+    grid = expand_grid(args.overrides) if args.multirun else [list(args.overrides)]
+    # All combinations are checked before the first one runs.
+    composed = [compose_experiment(overrides) for overrides in grid]
+    args.debug = any(experiment.debug for experiment, _ in composed)
+    if args.cfg:
+        print("---\n".join(composition.yaml() for _, composition in composed), end="")
+        return 0
+    _start_workers_early(any(experiment.collector.mode != "in_process" for experiment, _ in composed))
+
+    from rich.console import Console
+
+    from deepracer_exp.training.run import train
+
+    outcomes = []
+    for experiment, composition in composed:
+        outcome = train(experiment, composition, Console(stderr=True))
+        outcomes.append(outcome)
+        _tell(outcome, ui=experiment.tracking.kind == "mlflow")
+        if outcome.status == "interrupted":
+            break
+    if args.multirun:
+        _tell_all(outcomes)
+    return max(outcome.exit_code for outcome in outcomes)
+
+
+def _start_workers_early(wanted: bool) -> None:
+    """Let a server process import torch while this one does, so that workers fork from it at once."""
+    if not wanted or not sys.platform.startswith("linux"):
+        return
+    import multiprocessing
+    from multiprocessing import forkserver
+
+    multiprocessing.set_start_method("forkserver", force=True)
+    multiprocessing.set_forkserver_preload(["deepracer_exp.training.worker"])
+    forkserver.ensure_running()
+
+
+def _tell(outcome: "Outcome", ui: bool) -> None:
+    summary = outcome.summary
+    if outcome.status == "failed":
+        print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
+        print(f"  what is known: {outcome.folder}", file=sys.stderr)
+        return
+    best = summary["best_lap_time_s"]
+    share = summary["lap_share"]
+    print(f"\n{outcome.status}: {outcome.reason}")
+    print(
+        f"  {summary['env_steps']:,} steps, {summary['episodes']:,} episodes, {summary['laps']:,} laps in "
+        f"{summary['wall_clock_s']:.0f} s"
+        + (f"; best lap {best:.2f} s" if best is not None else "; no lap yet")
+        + (f"; {share:.0%} of the last episodes were laps" if share is not None else "")
+    )
+    print(f"  results       {outcome.folder}")
+    for name, what in (("best_lap.png", "driven line  "), ("learning.png", "learning     ")):
+        if (outcome.folder / name).exists():
+            print(f"  {what} {outcome.folder / name}")
+    if ui:
+        print("  compare runs  deepracer-exp ui")
+
+
+def _tell_all(outcomes: "Sequence[Outcome]") -> None:
+    print(f"\n{len(outcomes)} runs:")
+    for outcome in outcomes:
+        best = outcome.summary.get("best_lap_time_s")
+        lap = f"best lap {best:.2f} s" if best is not None else "no lap"
+        print(f"  {outcome.folder.name}  {outcome.status}  {lap}  {outcome.reason}")
+
+
+def _tracks(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_experiment, options
+    from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
+    from deepracer_exp.tracks.track import Track
+
+    def load(override: str) -> Track:
+        return Track.from_config(compose_experiment([override])[0].track)
+
+    if args.name is not None:
+        is_file = Path(args.name).suffix in (".npy", ".yaml", ".yml")
+        quoted = args.name.replace("\\", "\\\\").replace("'", "\\'")
+        track = load(f"track.file='{quoted}'" if is_file else f"track={args.name}")
+        output = Path(args.output or f"{track.name}.png")
+        try:
+            draw_picture(track, output)
+        except (OSError, ValueError) as error:
+            raise BadInput(f"--output {output}: cannot be written: {error}") from error
+        print(f"{track.title}: {track.length_m:.2f} m, {track.width_m:.2f} m wide -> {output}")
+        return 0
+    for name in options("track"):
+        track = load(f"track={name}")
+        print(f"\n{name} ({track.title}): {track.length_m:.2f} m, {track.width_m:.2f} m wide")
+        print(draw_terminal(track, columns=48, rows=12))
+    return 0
+
+
+def _ui(args: argparse.Namespace) -> int:
+    from deepracer_exp.tracking.ui import serve_ui
+
+    announce: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731 - print has no such type
+    serve_ui(Path(args.runs_dir), args.uri, args.port, announce)
+    return 0
+
+
+def _fail(error: Exception, code: int, args: argparse.Namespace) -> int:
+    if getattr(args, "debug", False) or "debug=true" in getattr(args, "overrides", ()):
+        traceback.print_exception(error)
+    print(f"deepracer-exp: {error}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    main()

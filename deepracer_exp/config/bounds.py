@@ -1,0 +1,14 @@
+"""Number types with bounds, so that a dataclass states what its YAML may hold."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+"""A whole number of at least one."""
+Natural = Annotated[int, Field(ge=0)]
+"""A whole number of at least zero."""

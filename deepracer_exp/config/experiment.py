@@ -1,0 +1,40 @@
+"""The whole experiment: one frozen dataclass per group of `conf/`."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from .car import CarConfig
+from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
+from .learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
+from .running import BudgetConfig, CollectorConfig, StoppingConfig, TrackingConfig
+from .track import TrackConfig
+
+SafeName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,79}$")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """Everything that defines a run."""
+
+    name: SafeName
+    """Folder under `runs_dir` and experiment in MLflow."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)]
+    runs_dir: str
+    debug: bool
+    """Show a traceback for errors."""
+    track: TrackConfig
+    car: CarConfig
+    action_space: ActionSpaceConfig
+    observation: ObservationConfig
+    randomization: RandomizationConfig
+    episode: EpisodeConfig
+    reward: RewardConfig
+    network: NetworkConfig
+    algorithm: AlgorithmConfig
+    lr_schedule: LRScheduleConfig
+    collector: CollectorConfig
+    stopping: StoppingConfig
+    budget: BudgetConfig
+    tracking: TrackingConfig

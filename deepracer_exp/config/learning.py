@@ -1,0 +1,124 @@
+"""Network, algorithm and learning-rate schedule."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .bounds import Count, Fraction, NonNegative, Positive
+
+By = Literal["iteration", "fraction"]
+"""Unit of a schedule's lengths: training iterations, or fractions of the budget (0 to 1)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """A multi-layer perceptron for policy and value."""
+
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    """Units of each hidden layer."""
+    activation: Literal["tanh", "relu", "elu", "silu"]
+    shared_trunk: bool
+    """One trunk with two heads, instead of two separate networks."""
+    initial_std: Positive
+    """Standard deviation of a continuous policy at the start, in units of the action range -1..1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgorithmConfig:
+    """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them."""
+
+    lr: Positive
+    batch_size: Count
+    """Steps per gradient step (minibatch)."""
+    epochs: Count
+    """Passes over the collected steps per iteration (`num_epochs`)."""
+    discount: Fraction
+    """`discount_factor`, per control step of 1/15 s."""
+    gae_lambda: Fraction
+    clip_epsilon: Positive
+    entropy_coeff: NonNegative
+    """`beta_entropy`."""
+    critic_coeff: Positive
+    loss_type: Literal["huber", "mean squared error"]
+    """Loss of the value network."""
+    max_grad_norm: NonNegative
+    """Largest norm of a gradient step (0: unlimited)."""
+    frames_per_iteration: Count | None
+    """Control steps, over all cars, between two updates; null when episodes_per_iteration is used."""
+    episodes_per_iteration: Count | None
+    """Finished episodes between two updates (`num_episodes_between_training`); null when frames are used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConstantLR:
+    """The learning rate stays as it is after the warm-up."""
+
+    kind: Literal["constant"]
+    by: By
+    warmup: NonNegative
+    """Length of a linear rise from zero at the start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearLR:
+    """A straight line down to `end_factor` over `length`."""
+
+    kind: Literal["linear"]
+    by: By
+    warmup: NonNegative
+    length: Positive
+    end_factor: NonNegative
+
+
+@dataclass(frozen=True, kw_only=True)
+class CosineLR:
+    """Half a cosine down to `end_factor` over `length`."""
+
+    kind: Literal["cosine"]
+    by: By
+    warmup: NonNegative
+    length: Positive
+    end_factor: NonNegative
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepLR:
+    """Multiplied by `factor` after every `length`."""
+
+    kind: Literal["step"]
+    by: By
+    warmup: NonNegative
+    length: Positive
+    factor: Positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExponentialLR:
+    """Multiplied by `factor` over each `length`, continuously."""
+
+    kind: Literal["exponential"]
+    by: By
+    warmup: NonNegative
+    length: Positive
+    factor: Positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveKLLR:
+    """Raised while the policy moves less than `target_kl` an iteration, lowered while it moves more."""
+
+    kind: Literal["adaptive_kl"]
+    by: By
+    warmup: NonNegative
+    target_kl: Positive
+    step_factor: Annotated[float, Field(gt=1, allow_inf_nan=False)]
+    """Factor of one rise or fall."""
+    lowest_factor: Positive
+    """Bounds of the learning rate, relative to `algorithm.lr`."""
+    highest_factor: Positive
+
+
+LRScheduleConfig = Annotated[
+    ConstantLR | LinearLR | CosineLR | StepLR | ExponentialLR | AdaptiveKLLR, Field(discriminator="kind")
+]

@@ -1,0 +1,72 @@
+"""How an experiment is collected, ended and recorded."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .bounds import Count, Fraction, Natural, Positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectorConfig:
+    """Where the cars are driven."""
+
+    mode: Literal["in_process", "sync", "async"]
+    """Cars in this process; in several, all waited for; in several, whichever is ready."""
+    processes: Count | None
+    """Worker processes of `sync` and `async`; null: one per core."""
+    cars: Count
+    """Cars per process, stepped together."""
+    threads: Natural
+    """Physics threads per process (0: in_process one per core, else one)."""
+    hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
+    """Seconds without a control step after which a worker process counts as hanging."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetConfig:
+    """Limits that end a run; null means none. The first one reached ends it."""
+
+    env_steps: Count | None
+    iterations: Count | None
+    wall_clock_s: Positive | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoStopping:
+    """Only the budget ends the run."""
+
+    kind: Literal["none"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReliableStopping:
+    """Stop once the car drives reliably: a share of the last episodes completed the lap."""
+
+    kind: Literal["reliable"]
+    lap_share: Fraction
+    episodes: Count
+    """How many of the last finished episodes are looked at."""
+
+
+StoppingConfig = Annotated[NoStopping | ReliableStopping, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingOff:
+    """No MLflow; the run folder alone tells everything."""
+
+    kind: Literal["off"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MLflowTracking:
+    """Record the run in MLflow."""
+
+    kind: Literal["mlflow"]
+    uri: str | None
+    """Store or server; null: SQLite in `runs_dir`."""
+
+
+TrackingConfig = Annotated[TrackingOff | MLflowTracking, Field(discriminator="kind")]

@@ -1,0 +1,141 @@
+"""What a policy's action means: steering in degrees and speed in metres per second."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from deepracer_exp.config.driving import (
+    ActionSpaceConfig,
+    ContinuousActionSpace,
+    DiscreteActionSpace,
+    GridActionSpace,
+    SpeedRange,
+    SteeringRange,
+)
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.model_metadata import read_model_metadata
+
+Commands = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Steering in degrees, positive to the left, and speed in metres per second, each (N,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteActions:
+    """A list of choices; an action is the position of one of them."""
+
+    steering_deg: NDArray[np.float64]
+    """(n,) degrees, positive to the left."""
+    speed_mps: NDArray[np.float64]
+    """(n,)"""
+
+    @property
+    def n(self) -> int:
+        """Number of choices."""
+        return len(self.steering_deg)
+
+    @property
+    def low(self) -> NDArray[np.float64]:
+        """Lowest [steering_deg, speed_mps] of any choice, (2,)."""
+        return np.array([self.steering_deg.min(), self.speed_mps.min()])
+
+    @property
+    def high(self) -> NDArray[np.float64]:
+        """Highest [steering_deg, speed_mps] of any choice, (2,)."""
+        return np.array([self.steering_deg.max(), self.speed_mps.max()])
+
+    def commands(self, action: NDArray[Any]) -> Commands:
+        """Look up the commands of N action numbers, (N,) integers from 0 to n - 1."""
+        return self.steering_deg[action], self.speed_mps[action]
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousActions:
+    """Two numbers from -1 to 1, [steering, speed], scaled linearly to low..high."""
+
+    low: NDArray[np.float64]
+    """[steering_deg, speed_mps] at -1, (2,)."""
+    high: NDArray[np.float64]
+    """[steering_deg, speed_mps] at 1, (2,)."""
+
+    @property
+    def n(self) -> None:
+        """None: there is no number of choices."""
+        return None
+
+    def commands(self, action: NDArray[Any]) -> Commands:
+        """Clip N actions, (N, 2) floats, to -1..1 and scale them; NaN stays NaN."""
+        share = (np.clip(action, -1.0, 1.0) + 1.0) * 0.5
+        # This form of the interpolation is exact at both ends.
+        scaled = self.low * (1.0 - share) + self.high * share
+        return scaled[:, 0], scaled[:, 1]
+
+
+ActionSpace = DiscreteActions | ContinuousActions
+
+
+def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
+    """Build the action space of an experiment; `config.file` takes the place of everything else in it.
+
+    The commands are what the policy asked for: the simulator's limits of steering and speed are not
+    applied here, and the trace shows these unclipped values.
+
+    Raises:
+        BadInput: contradictory values (both are named), an empty list, or a bad model_metadata.json.
+    """
+    if config.file is not None:
+        return _from_file(config.file)
+    if isinstance(config, DiscreteActionSpace):
+        if not config.actions:
+            raise BadInput(
+                "action_space.actions: [] is empty; accepted: at least one steering_angle and speed"
+            )
+        return _discrete(
+            [action.steering_angle for action in config.actions], [action.speed for action in config.actions]
+        )
+    _check_order("steering_angle", config.steering_angle)
+    _check_order("speed", config.speed)
+    low = np.array([config.steering_angle.low, config.speed.low], dtype=np.float64)
+    high = np.array([config.steering_angle.high, config.speed.high], dtype=np.float64)
+    if isinstance(config, ContinuousActionSpace):
+        return ContinuousActions(low, high)
+    return _grid(config)
+
+
+def _from_file(path: str) -> ActionSpace:
+    metadata = read_model_metadata(path)
+    if metadata.low is not None and metadata.high is not None:
+        return ContinuousActions(np.array(metadata.low), np.array(metadata.high))
+    return _discrete(
+        [action.steering_deg for action in metadata.actions],
+        [action.speed_mps for action in metadata.actions],
+    )
+
+
+def _grid(config: GridActionSpace) -> DiscreteActions:
+    """Cross every steering level with every speed level, steering in the outer loop as the console does."""
+    _check_levels("steering", config.steering_angle, config.steering_levels)
+    _check_levels("speed", config.speed, config.speed_levels)
+    steering = np.linspace(config.steering_angle.low, config.steering_angle.high, config.steering_levels)
+    speed = np.linspace(config.speed.low, config.speed.high, config.speed_levels)
+    return _discrete(np.repeat(steering, len(speed)), np.tile(speed, len(steering)))
+
+
+def _discrete(steering_deg: ArrayLike, speed_mps: ArrayLike) -> DiscreteActions:
+    return DiscreteActions(np.array(steering_deg, dtype=np.float64), np.array(speed_mps, dtype=np.float64))
+
+
+def _check_order(key: str, bounds: SteeringRange | SpeedRange) -> None:
+    if bounds.low > bounds.high:
+        raise BadInput(
+            f"action_space.{key}: low {bounds.low:g} is above high {bounds.high:g}; accepted: low <= high"
+        )
+
+
+def _check_levels(name: str, bounds: SteeringRange | SpeedRange, levels: int) -> None:
+    if (levels == 1) != (bounds.low == bounds.high):
+        raise BadInput(
+            f"action_space.{name}_levels: {levels} from low {bounds.low:g} to high {bounds.high:g};"
+            " accepted: 1 level with low = high, or at least 2 with low < high"
+        )

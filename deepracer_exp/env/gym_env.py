@@ -1,0 +1,148 @@
+"""The race for Gymnasium; importing this module registers `DeepRacer-v0`.
+
+import gymnasium
+import deepracer_exp.env.gym_env
+
+env = gymnasium.make("DeepRacer-v0", overrides=["track=Oval_track"])
+cars = gymnasium.make_vec("DeepRacer-v0", num_envs=64, overrides=["action_space=continuous"])
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.formats.trace import EPISODE_STATUS, PACKED
+
+from .race import CONTROL_PERIOD_S, Race
+from .setup import RaceSetup, build_setup
+
+_METADATA: dict[str, Any] = {"render_modes": [], "render_fps": round(1 / CONTROL_PERIOD_S)}
+
+
+class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
+    """One car.
+
+    Observation: the features of `Features`, float32. Action: a number of the action space's list, or steering and
+    speed in -1..1. `info` holds `progress` in per cent and `episode_status` of the pose that was judged.
+    """
+
+    metadata = _METADATA
+
+    def __init__(self, overrides: Sequence[str] = ()):
+        """Compose an experiment and put its car on the track.
+
+        Args:
+            overrides: as for `deepracer-exp train`.
+
+        Raises:
+            BadInput: an override or a file it names is not accepted.
+        """
+        setup = build_setup(compose_experiment(overrides)[0])
+        self._race = Race(setup, 1)
+        self.observation_space, self.action_space = _spaces(self._race)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode, further along the track than the last; with a seed, begin anew."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._race.seed(seed)
+        self._race.reset()
+        return self._race.observation[0], {}
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Drive for 1/15 s."""
+        race = self._race
+        race.step(np.asarray(action)[None])
+        info = {
+            "progress": float(race.trace[0, PACKED["progress"]]),
+            "episode_status": EPISODE_STATUS[int(race.trace[0, PACKED["episode_status"]])],
+        }
+        terminated, truncated = bool(race.terminated[0]), bool(race.truncated[0])
+        return race.observation[0], float(race.reward[0]), terminated, truncated, info
+
+
+class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
+    """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
+
+    `infos` holds arrays `progress` and `episode_status` (codes of `formats.trace.EPISODE_STATUS`), and, where an
+    episode ended, `final_obs` with the mask `_final_obs`.
+    """
+
+    metadata = {**_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        overrides: Sequence[str] = (),
+        threads: int = 1,
+        setup: RaceSetup | None = None,
+    ):
+        """Compose an experiment and put its cars on the track.
+
+        Args:
+            num_envs: number of cars.
+            overrides: as for `deepracer-exp train`.
+            threads: physics threads; 0 means one per core.
+            setup: instead of overrides, what is already built.
+
+        Raises:
+            BadInput: an override or a file it names is not accepted.
+        """
+        self._race = Race(setup or build_setup(compose_experiment(overrides)[0]), num_envs, threads)
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = _spaces(self._race)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode with every car; with a seed, begin anew (of a list, the first counts)."""
+        first = seed[0] if isinstance(seed, list) else seed
+        super().reset(seed=first)
+        if first is not None:
+            self._race.seed(first)
+        self._race.reset()
+        return self._race.observation, {}
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Drive for 1/15 s with every car."""
+        race = self._race
+        race.step(np.asarray(actions))
+        reward, terminated, truncated = race.reward, race.terminated, race.truncated
+        infos: dict[str, Any] = {
+            "progress": race.trace[:, PACKED["progress"]].copy(),
+            "episode_status": race.trace[:, PACKED["episode_status"]].astype(np.int64),
+        }
+        ended = terminated | truncated
+        if ended.any():
+            infos["final_obs"] = race.observation
+            infos["_final_obs"] = ended
+            race.reset(np.flatnonzero(ended))
+        return race.observation, reward, terminated, truncated, infos
+
+
+def _spaces(race: Race) -> tuple[spaces.Box, spaces.Space[Any]]:
+    observation = spaces.Box(-np.inf, np.inf, (race.observation.shape[1],), np.float32)
+    n_actions = race.setup.actions.n
+    if n_actions is None:
+        return observation, spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return observation, spaces.Discrete(n_actions)
+
+
+gym.register(
+    id="DeepRacer-v0",
+    entry_point="deepracer_exp.env.gym_env:DeepRacerEnv",
+    vector_entry_point="deepracer_exp.env.gym_env:DeepRacerVectorEnv",
+)

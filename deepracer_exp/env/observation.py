@@ -1,0 +1,88 @@
+"""The features a policy sees."""
+
+import numpy as np
+
+from ..config.driving import ObservationConfig
+
+
+def feature_names(config: ObservationConfig) -> tuple[str, ...]:
+    """Return the names of the features, in their order."""
+    return (
+        "offset",
+        "heading_error_sin",
+        "heading_error_cos",
+        "speed",
+        "yaw_rate",
+        "last_steering",
+        "last_speed",
+        *(f"ahead_{axis}_{distance:g}" for distance in config.lookahead_m for axis in "xy"),
+    )
+
+
+class Features:
+    """Feature vector of a car, each entry scaled to about -1..1.
+
+    In order: `offset` from the centre line over half the road's width, positive to the left; `heading_error_sin`
+    and `heading_error_cos` of the car's yaw against the centre line; `speed` and `yaw_rate` as measured;
+    `last_steering` and `last_speed` as last commanded, over the largest the action space has; then for each
+    look-ahead distance `ahead_x_D` and `ahead_y_D`: the centre line's point D metres further on in the frame
+    of the car's front point, x forward and y to the left.
+    """
+
+    def __init__(
+        self, config: ObservationConfig, track_length_m: float, steering_max_deg: float, speed_max_mps: float
+    ):
+        self._config = config
+        self._ahead_ndist = np.asarray(config.lookahead_m) / track_length_m
+        self._steering_max_deg = steering_max_deg
+        self._speed_max_mps = speed_max_mps
+        self.names = feature_names(config)
+        self.size = len(self.names)
+
+    def ahead(self, ndist: np.ndarray) -> np.ndarray:
+        """Return the normalised distances (N, K) along the centre line at which the road is looked at."""
+        return ndist[:, None] + self._ahead_ndist
+
+    def compute(
+        self,
+        front: np.ndarray,
+        yaw_rad: np.ndarray,
+        offset_m: np.ndarray,
+        half_width_m: np.ndarray,
+        heading_error_rad: np.ndarray,
+        speed_mps: np.ndarray,
+        yaw_rate_radps: np.ndarray,
+        steering_deg: np.ndarray,
+        commanded_mps: np.ndarray,
+        road: np.ndarray,
+    ) -> np.ndarray:
+        """Return the features, shape (N, size), float32.
+
+        Args:
+            front: front points (N, 2) in metres.
+            yaw_rad: yaw of the cars (N,).
+            offset_m: signed distance from the centre line (N,), positive to the left.
+            half_width_m: half the road's width (N,).
+            heading_error_rad: yaw minus the centre line's heading (N,).
+            speed_mps: measured forward speed (N,).
+            yaw_rate_radps: measured yaw rate (N,).
+            steering_deg: last commanded steering (N,).
+            commanded_mps: last commanded speed (N,).
+            road: centre-line points at `ahead(ndist)`, shape (N, K, 2).
+        """
+        config = self._config
+        out = np.empty((len(front), self.size), np.float32)
+        out[:, 0] = offset_m / half_width_m
+        out[:, 1] = np.sin(heading_error_rad)
+        out[:, 2] = np.cos(heading_error_rad)
+        out[:, 3] = speed_mps / config.speed_scale_mps
+        out[:, 4] = yaw_rate_radps / config.yaw_rate_scale_radps
+        out[:, 5] = steering_deg / self._steering_max_deg
+        out[:, 6] = commanded_mps / self._speed_max_mps
+        dx = road[:, :, 0] - front[:, None, 0]
+        dy = road[:, :, 1] - front[:, None, 1]
+        cos = np.cos(yaw_rad)[:, None] / config.lookahead_scale_m
+        sin = np.sin(yaw_rad)[:, None] / config.lookahead_scale_m
+        out[:, 7::2] = dx * cos + dy * sin
+        out[:, 8::2] = dy * cos - dx * sin
+        return out

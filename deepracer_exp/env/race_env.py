@@ -1,0 +1,115 @@
+"""The one TorchRL environment: N cars stepped together."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ..formats.trace import PACKED
+from .race import Race
+
+
+class RaceEnv(EnvBase):
+    """A `Race` as a TorchRL environment of batch size [N].
+
+    Keys: `observation` (float32 features), `action` (int64 index, or float32 steering and speed in -1..1), and
+    under `next` also `reward`, `done`, `terminated`, `truncated` and `trace` (float64, columns
+    `formats.trace.PACKED_COLUMNS`). `trace` stands with the reward because it exists after a step only.
+    """
+
+    def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
+        """Wrap a race.
+
+        Args:
+            race: the cars.
+            on_step: called after every step, as a sign of life.
+        """
+        super().__init__(device="cpu", batch_size=[race.n_cars])
+        self.race = race
+        self._on_step = on_step
+        n_cars, size = race.observation.shape
+        n_actions = race.setup.actions.n
+        self.observation_spec = Composite(
+            observation=Unbounded((n_cars, size), dtype=torch.float32), shape=(n_cars,)
+        )
+        self.action_spec = (
+            Bounded(-1.0, 1.0, (n_cars, 2), dtype=torch.float32)
+            if n_actions is None
+            else Categorical(n_actions, shape=(n_cars,), dtype=torch.int64)
+        )
+        self.full_reward_spec = Composite(
+            reward=Unbounded((n_cars, 1), dtype=torch.float32),
+            trace=Unbounded((n_cars, len(PACKED)), dtype=torch.float64),
+            shape=(n_cars,),
+        )
+        flags = {
+            key: Categorical(2, shape=(n_cars, 1), dtype=torch.bool)
+            for key in ("done", "terminated", "truncated")
+        }
+        self.full_done_spec = Composite(flags, shape=(n_cars,))
+        self._no = torch.zeros(n_cars, 1, dtype=torch.bool)
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step, and start new episodes where one ended; what the base class does, without its generic passes.
+
+        The base class looks at specs and copies keys for about 0.6 ms a step, which 64 cars feel.
+        """
+        following = self._step(tensordict)
+        tensordict.set("next", following)
+        done = following.get("done")
+        observation = following.get("observation")
+        if done.any():
+            self.race.reset(np.flatnonzero(done.numpy()))
+            observation = torch.from_numpy(self.race.observation)
+        root = TensorDict._new_unsafe(
+            {
+                "observation": observation,
+                "done": self._no.clone(),
+                "terminated": self._no.clone(),
+                "truncated": self._no.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+        return tensordict, root
+
+    def _reset(self, tensordict: TensorDictBase | None, **_: object) -> TensorDictBase:
+        ids = None
+        if tensordict is not None and "_reset" in tensordict:
+            ids = np.flatnonzero(tensordict.get("_reset").numpy())
+        self.race.reset(ids)
+        return TensorDict(
+            {"observation": torch.from_numpy(self.race.observation), **self._flags(self._no)},
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        race = self.race
+        race.step(tensordict.get("action").numpy())
+        if self._on_step is not None:
+            self._on_step()
+        terminated = torch.from_numpy(race.terminated)[:, None]
+        truncated = torch.from_numpy(race.truncated)[:, None]
+        return TensorDict._new_unsafe(
+            {
+                "observation": torch.from_numpy(race.observation),
+                "reward": torch.from_numpy(race.reward.astype(np.float32))[:, None],
+                "trace": torch.from_numpy(race.trace.copy()),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _flags(self, value: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {key: value.clone() for key in ("done", "terminated", "truncated")}
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.race.seed(seed)

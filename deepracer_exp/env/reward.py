@@ -1,0 +1,224 @@
+"""Calls reward functions for many cars and trusts none of them."""
+
+import math
+import reprlib
+from collections.abc import Callable, Mapping
+from types import CodeType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.errors import BadInput, RunFailed
+
+from .params import Waypoints, batch_params, rows, scalar_params, select
+from .prints import RewardPrints
+from .reward_deadline import DeadlinePassed, deadline
+from .reward_source import RewardSource, source_with_constants
+
+MAX_REWARD = 1e5
+"""Rewards beyond it, to either side, end the job on the service (deepracer-simapp rollout_agent_ctrl.py)."""
+
+
+class RewardFailed(RunFailed):
+    """A reward function raised, hung or returned something that is no reward."""
+
+    def __init__(self, message: str, params: dict[str, Any] | None = None, car: int | None = None) -> None:
+        super().__init__(message)
+        self.params = params
+        """What the function was given (`reward_batch`: of all cars, where the car is not known)."""
+        self.car = car
+
+
+class RewardFunction:
+    """One reward module, run for `n_cars` cars.
+
+    Each car has a module namespace of its own, as on the service, where a process has one car: module globals
+    persist from call to call, and never pass from one car to another. They are no part of a checkpoint. A
+    module with `reward_batch(params)` is loaded once and called once a step for all cars instead.
+
+    Args:
+        source: The module; its overriding constants are set.
+        n_cars: Number of cars.
+        time_limit_s: Wall-clock seconds for all calls of one step (see `deadline` for where it holds).
+        prints: Where `print` goes; None discards it.
+
+    Raises:
+        BadInput: The module cannot be run or has no callable `reward_function` or `reward_batch`.
+    """
+
+    def __init__(
+        self, source: RewardSource, n_cars: int, time_limit_s: float, prints: RewardPrints | None
+    ) -> None:
+        self.source = source
+        self.n_cars = n_cars
+        self.time_limit_s = time_limit_s
+        code = compile(source_with_constants(source), source.path, "exec", dont_inherit=True)
+        # Names that the module binds at its top level are listed in its code.
+        self._is_batch = "reward_batch" in code.co_names
+        name = "reward_batch" if self._is_batch else "reward_function"
+        cars = [None] if self._is_batch else list(range(n_cars))
+        with deadline(time_limit_s):
+            self._functions = [self._load(code, name, prints, car) for car in cars]
+        self._waypoints: object = None
+        self._waypoint_array = np.empty((0, 2))
+
+    def __call__(
+        self,
+        columns: Mapping[str, np.ndarray],
+        constants: Mapping[str, Any],
+        active: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the reward of every car, shape (n_cars,); 0 for the cars that are not active.
+
+        Args:
+            columns: `params.COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
+            constants: `params.CONSTANTS`; `waypoints` is a list of (x, y) tuples.
+            active: Cars to reward, shape (n_cars,); None: all.
+
+        Raises:
+            RewardFailed: The function raised, hung, or returned no finite number within +-`MAX_REWARD`.
+        """
+        rewards = np.zeros(self.n_cars)
+        cars = np.arange(self.n_cars) if active is None else np.flatnonzero(active)
+        if len(cars):
+            selected = select(columns, None if active is None else cars)
+            call = self._call_batch if self._is_batch else self._call_each
+            rewards[cars] = call(selected, constants, cars.tolist())
+        return rewards
+
+    def _load(
+        self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
+    ) -> Callable[[dict[str, Any]], object]:
+        printer = _discard if prints is None else prints.printer(car)
+        namespace: dict[str, Any] = {
+            "__name__": "reward_function",
+            "__file__": self.source.path,
+            "print": printer,
+        }
+        try:
+            exec(code, namespace)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            message = f"{self.source.path}: cannot be run: {self._what_happened(error)}"
+            raise BadInput(message) from error
+        function = namespace.get(name)
+        if not callable(function):
+            raise BadInput(f"{self.source.path}: {name} is {_short(function)}, a function is wanted")
+        return function
+
+    def _call_each(
+        self, selected: dict[str, np.ndarray], constants: Mapping[str, Any], cars: list[int]
+    ) -> list[float]:
+        road = _road(constants)
+        functions = self._functions
+        rewards: list[float] = []
+        table = list(rows(selected))
+        try:
+            with deadline(self.time_limit_s):
+                for car, row in zip(cars, table, strict=True):
+                    reward = functions[car](scalar_params(row, *road))
+                    # A plain float within the bounds needs no closer look; NaN fails the comparison.
+                    if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
+                        reward = _as_reward(reward)
+                    rewards.append(reward)
+        except KeyboardInterrupt:
+            # Ctrl-C may well arrive in here, and is no fault of the function.
+            raise
+        except BaseException as error:
+            # One reward a car that came through; a time limit may pass right after the last of them.
+            at = min(len(rewards), len(cars) - 1)
+            raise self._failure(error, cars[at], scalar_params(table[at], *road)) from error
+        return rewards
+
+    def _call_batch(
+        self, selected: dict[str, np.ndarray], constants: Mapping[str, Any], cars: list[int]
+    ) -> NDArray[np.float64]:
+        waypoints, length, is_reversed = road = _road(constants)
+        if waypoints is not self._waypoints:
+            self._waypoints, self._waypoint_array = waypoints, np.array(waypoints, dtype=float).reshape(-1, 2)
+        try:
+            with deadline(self.time_limit_s):
+                result = self._functions[0](batch_params(selected, self._waypoint_array, length, is_reversed))
+            rewards = _as_rewards(result, len(cars))
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            params = batch_params(selected, self._waypoint_array, length, is_reversed)
+            raise self._failure(error, None, params) from error
+        bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
+        if len(bad):
+            row = list(rows(selected))[bad[0]]
+            no_reward = _NotAReward(_no_reward(float(rewards[bad[0]])))
+            raise self._failure(no_reward, cars[bad[0]], scalar_params(row, *road))
+        return rewards
+
+    def _failure(self, error: BaseException, car: int | None, params: dict[str, Any]) -> RewardFailed:
+        function = "reward_batch" if self._is_batch else "reward_function"
+        where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
+        what = self._what_happened(error)
+        return RewardFailed(f"reward {self.source.name}: {function} {what} ({where})", params, car)
+
+    def _what_happened(self, error: BaseException) -> str:
+        if isinstance(error, _NotAReward):
+            return str(error)
+        line, trace = 0, error.__traceback__
+        while trace is not None:
+            if trace.tb_frame.f_code.co_filename == self.source.path:
+                line = trace.tb_lineno
+            trace = trace.tb_next
+        place = f" in line {line} of {self.source.path}" if line else ""
+        if isinstance(error, DeadlinePassed):
+            return f"took longer than the time limit of {self.time_limit_s:g} s for one step{place}"
+        message = _one_line(str(error))
+        return f"raised {type(error).__name__}{': ' + message if message else ''}{place}"
+
+
+class _NotAReward(Exception):  # noqa: N818 - never leaves this module
+    """The function returned, but no number that can be a reward; the message says what."""
+
+
+def _as_reward(value: object) -> float:
+    """Return what AWS's `float()` makes of `value`; text is refused, though `float("1")` would do."""
+    if isinstance(value, str | bytes | bytearray):
+        raise _NotAReward(_no_reward(value))
+    try:
+        reward = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _NotAReward(_no_reward(value)) from error
+    if not math.fabs(reward) <= MAX_REWARD:
+        raise _NotAReward(_no_reward(value))
+    return reward
+
+
+def _as_rewards(value: object, n: int) -> NDArray[np.float64]:
+    try:
+        rewards = np.asarray(value)
+    except ValueError as error:  # rows of different lengths
+        raise _NotAReward(_no_reward(value)) from error
+    if rewards.shape != (n,) or rewards.dtype.kind not in "biuf":
+        shape = f"{rewards.dtype} of shape {rewards.shape}"
+        raise _NotAReward(f"returned {shape}; one number a car, shape ({n},), is wanted")
+    return rewards.astype(np.float64)
+
+
+def _no_reward(value: object) -> str:
+    return f"returned {_short(value)}; a finite number from {-MAX_REWARD:g} to {MAX_REWARD:g} is wanted"
+
+
+def _road(constants: Mapping[str, Any]) -> tuple[Waypoints, float, bool]:
+    return constants["waypoints"], float(constants["track_length"]), bool(constants["is_reversed"])
+
+
+def _short(value: object) -> str:
+    return _one_line(reprlib.repr(value))
+
+
+def _one_line(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= 300 else f"{text[:300]}..."
+
+
+def _discard(*values: object, **options: object) -> None:
+    """Stand in for `print` where there is no log."""

@@ -1,0 +1,167 @@
+"""Course files: AWS's route arrays (.npy) and YAML files of spline knots."""
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml  # type: ignore[import-untyped]
+
+from deepracer_exp.errors import BadInput, nearest
+
+REPEAT_M = 1e-9
+"""A centre point closer than this to the one before it repeats it."""
+FARTHEST_M = 10_000.0
+"""Coordinates beyond this are not metres."""
+KNOT_KEYS = ("knots", "width_m", "closed", "title")
+ROUTE_ROWS = "rows of 6 numbers: centre x, y, inner x, y, outer x, y in metres"
+
+
+class Knots(NamedTuple):
+    """What a YAML of knots holds; `width_m` has one value or one per knot."""
+
+    knots: np.ndarray
+    width_m: np.ndarray
+    closed: bool
+    title: str | None
+
+
+def read_route(path: str | Path) -> np.ndarray:
+    """Read a route file.
+
+    Rows whose centre repeats the one before are dropped, as deepracer-simapp does since 2025
+    (track_geom); the last row stays, since it says whether the course is closed.
+
+    Args:
+        path: A `.npy` file of shape (n, 6).
+
+    Returns:
+        Rows (n, 6) float64: centre x, y, inner x, y, outer x, y in metres. The course is closed if and
+        only if the first row equals the last.
+
+    Raises:
+        BadInput: The file cannot be read, or does not hold such rows.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            rows = np.lib.format.read_array(file, allow_pickle=False)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    except (ValueError, MemoryError) as error:  # MemoryError: a torn header that claims terabytes
+        raise BadInput(f"{path}: not a NumPy array file; accepted is a .npy with {ROUTE_ROWS}") from error
+    if rows.dtype.kind not in "fiu":
+        raise BadInput(f"{path}: holds {rows.dtype.name} values; accepted are {ROUTE_ROWS}")
+    try:
+        return checked_rows(rows)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from None
+
+
+def checked_rows(rows: np.ndarray) -> np.ndarray:
+    """Return route rows as float64 without repeated centre points.
+
+    Args:
+        rows: Numbers of shape (n, 6).
+
+    Raises:
+        BadInput: Wrong shape, too few distinct rows, or a value that is not finite or not in metres.
+    """
+    if rows.ndim != 2 or rows.shape[1] != 6:
+        raise BadInput(f"shape {rows.shape}; accepted are {ROUTE_ROWS}")
+    rows = np.array(rows, dtype=np.float64)
+    wrong = ~(np.abs(rows) <= FARTHEST_M)
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        value = f"row {row}, column {column} is {rows[row, column]:g}"
+        raise BadInput(f"{value}; accepted are numbers within +-{FARTHEST_M:g} m")
+    rows = _without_repeats(rows)
+    closed = bool(len(rows) and (rows[0] == rows[-1]).all())
+    needed = 4 if closed else 3
+    if len(rows) < needed:
+        kind = "closed course with its closing row" if closed else "course"
+        raise BadInput(f"{len(rows)} distinct rows; accepted are at least {needed} for a {kind}")
+    return rows
+
+
+def _without_repeats(rows: np.ndarray) -> np.ndarray:
+    step_m = np.linalg.norm(np.diff(rows[:, :2], axis=0), axis=1)
+    keep = np.ones(len(rows), bool)
+    keep[1:] = step_m >= REPEAT_M
+    if len(rows) > 2 and not keep[-1]:
+        # The closing row must equal the first to the last bit: drop the row it repeats instead.
+        keep[np.flatnonzero(keep)[-1]] = False
+        keep[-1] = True
+    return rows[keep]
+
+
+def read_knots(path: str | Path) -> Knots:
+    """Read a YAML of spline knots.
+
+    Keys: `knots` (list of [x, y] in metres) and `width_m` (a number, or one per knot) are required;
+    `closed` (default true) and `title` are not.
+
+    Raises:
+        BadInput: The file cannot be read, a key is unknown or missing, or a value has the wrong type.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    except UnicodeDecodeError as error:
+        raise BadInput(f"{path}: not UTF-8 text; accepted is a YAML file of knots") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise BadInput(f"{path}: not YAML{where}; accepted is a file with the keys {_keys()}") from error
+    if not isinstance(content, dict):
+        raise BadInput(f"{path}: no keys found; accepted are {_keys()}")
+    for key in content:
+        if key not in KNOT_KEYS:
+            hint = nearest(str(key), KNOT_KEYS)
+            raise BadInput(f"{path}: unknown key {key!r}{hint}; accepted are {_keys()}")
+    for key in ("knots", "width_m"):
+        if key not in content:
+            raise BadInput(f"{path}: key {key} is missing; accepted are {_keys()}")
+    closed = content.get("closed", True)
+    if not isinstance(closed, bool):
+        raise BadInput(f"{path}: closed is {closed!r}; accepted are true and false")
+    title = content.get("title")
+    if title is not None and not isinstance(title, str):
+        raise BadInput(f"{path}: title is {title!r}; accepted is text")
+    return Knots(_points(path, content["knots"]), _widths(path, content["width_m"]), closed, title)
+
+
+def _points(path: Path, value: Any) -> np.ndarray:
+    if not isinstance(value, list):
+        raise BadInput(f"{path}: knots is {value!r}; accepted is a list of [x, y] in metres")
+    for index, point in enumerate(value):
+        if not (isinstance(point, list) and len(point) == 2 and all(map(_is_coordinate, point))):
+            raise BadInput(
+                f"{path}: knots[{index}] is {point!r}; accepted is [x, y], numbers within +-{FARTHEST_M:g} m"
+            )
+    return np.array(value, dtype=np.float64).reshape(-1, 2)
+
+
+def _widths(path: Path, value: Any) -> np.ndarray:
+    widths = value if isinstance(value, list) else [value]
+    for width in widths:
+        if not _is_coordinate(width) or width <= 0:
+            raise BadInput(f"{path}: width_m has {width!r}; accepted are metres above 0, one or one per knot")
+    return np.array(widths, dtype=np.float64)
+
+
+def _is_coordinate(value: Any) -> bool:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value) and abs(value) <= FARTHEST_M
+
+
+def _unreadable(path: Path, error: OSError) -> BadInput:
+    reason = error.strerror or "cannot be read"
+    return BadInput(f"{path}: {reason}; accepted is a route (.npy) or a YAML of knots")
+
+
+def _keys() -> str:
+    return ", ".join(KNOT_KEYS)

@@ -1,0 +1,207 @@
+"""All cars of a process, stepped together."""
+
+import os
+from typing import NamedTuple
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.errors import RunFailed
+
+from .car import STEERED, WHEELS, build_model
+
+Floats = NDArray[np.float64]
+Ids = NDArray[np.intp]
+
+_SETTLE_PERIODS = 60
+"""Control periods (4 s) for the car to come to rest after being put down: contacts are damped within 0.1 s."""
+
+
+class CarState(NamedTuple):
+    """Where the cars are and how they move: float64 arrays of shape (N,), copies of the physics' state."""
+
+    x_m: Floats
+    """Chassis origin, world frame."""
+    y_m: Floats
+    yaw_rad: Floats
+    """Heading in (-pi, pi], counter-clockwise from the world's x axis."""
+    speed_mps: Floats
+    """Speed of the chassis origin along the heading."""
+    lateral_mps: Floats
+    """Speed of the chassis origin to the left of the heading."""
+    yaw_rate_radps: Floats
+
+
+class CarBatch:
+    """N cars, each alone on its own endless floor, advanced by one control period at a time.
+
+    The result is bit-identical whatever the number of threads and however the cars are split into batches.
+
+    Args:
+        car: dimensions and physics settings, the same for all cars.
+        n_cars: number of cars.
+        threads: number of threads including the caller's; 0 takes all cores this process may run on.
+        floor_friction: factor on the tyre friction.
+    """
+
+    def __init__(self, car: CarConfig, n_cars: int, threads: int, floor_friction: float = 1.0) -> None:
+        self.car = car
+        self.n_cars = n_cars
+        self.model = build_model(car)
+        self._wheel_geoms = np.array([self.model.geom(name).id for name in WHEELS])
+        self._motors = np.array([self.model.actuator(f"{name}_motor").id for name in WHEELS])
+        self._servos = np.array([self.model.actuator(f"{name}_servo").id for name in STEERED])
+        self._floor_friction = floor_friction
+        self.model.geom_friction[self._wheel_geoms, 0] = car.tyre_friction * floor_friction
+        self._batch = mujoco.batch.Batch(self.model, n_cars, threads or len(os.sched_getaffinity(0)))
+        self._rows: Floats = self._batch.state
+        self._qpos: Floats = self._batch.bind("qpos")
+        self._qvel: Floats = self._batch.bind("qvel")
+        self._ctrl: Floats = self._batch.bind("ctrl")
+        self._rest_row, self._rest_qpos = self._settle()
+        self._max_steering_rad = np.deg2rad(car.max_steering_deg)
+        self._rows[:] = self._rest_row
+
+    def place(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
+        """Put cars at rest on their wheels, steering straight, with no memory of what they did before.
+
+        Args:
+            ids: distinct car numbers, (n,).
+            x_m: where the chassis origin goes, (n,) or one for all.
+            y_m: likewise.
+            yaw_rad: heading, likewise.
+        """
+        rows = np.asarray(ids, np.intp)
+        half = 0.5 * np.asarray(yaw_rad, np.float64)
+        cos, sin = np.cos(half), np.sin(half)
+        w, x, y, z = self._rest_qpos[3:7]
+        self._rows[rows] = self._rest_row
+        self._qpos[rows, 0] = x_m
+        self._qpos[rows, 1] = y_m
+        # The heading's turn about the vertical, after the slight pitch in which the car came to rest.
+        self._qpos[rows, 3] = cos * w - sin * z
+        self._qpos[rows, 4] = cos * x - sin * y
+        self._qpos[rows, 5] = cos * y + sin * x
+        self._qpos[rows, 6] = cos * z + sin * w
+
+    def drive(
+        self, speed_mps: ArrayLike, steering_rad: ArrayLike, moving: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Send one command to every car, clipped to the car's limits, and advance one control period.
+
+        Args:
+            speed_mps: wanted speeds, (N,).
+            steering_rad: wanted steering angles, positive to the left, (N,).
+            moving: False for cars that are held at their place, wheels straight, whatever the command, (N,).
+
+        Raises:
+            RunFailed: a command or a car's state is not finite, or MuJoCo gave up on a car; the message
+                names the first such car. `state` still holds what it was then.
+        """
+        speed = np.clip(speed_mps, self.car.min_speed_mps, self.car.max_speed_mps)
+        steering = np.clip(steering_rad, -self._max_steering_rad, self._max_steering_rad)
+        # MuJoCo replaces a control that is not finite by zero, for all actuators of that car.
+        _require_finite("command", speed + steering)
+        if moving is not None:
+            speed, steering = speed * moving, steering * moving
+        self._ctrl[:, self._servos] = steering[:, None]
+        self._ctrl[:, self._motors] = (speed / self.car.drive_radius_m)[:, None]
+        try:
+            self._batch.step(nstep=self.car.substeps)
+        except mujoco.batch.SimulationError as error:
+            raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
+        _require_finite("physics state", self._qpos.sum(axis=1) + self._qvel.sum(axis=1))
+
+    def read(self) -> CarState:
+        """Return position and motion of all cars."""
+        q, v = self._qpos, self._qvel
+        w, x, y, z = q[:, 3], q[:, 4], q[:, 5], q[:, 6]
+        cos_part, sin_part = 1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y)
+        norm = np.hypot(cos_part, sin_part)
+        cos, sin = cos_part / norm, sin_part / norm
+        return CarState(
+            x_m=q[:, 0].copy(),
+            y_m=q[:, 1].copy(),
+            yaw_rad=np.arctan2(sin_part, cos_part),
+            speed_mps=cos * v[:, 0] + sin * v[:, 1],
+            lateral_mps=cos * v[:, 1] - sin * v[:, 0],
+            yaw_rate_radps=v[:, 5].copy(),
+        )
+
+    @property
+    def state(self) -> Floats:
+        """A copy of the full integration state, (N, nstate); parameters set per car are not part of it.
+
+        Assigning a copy makes the cars go on exactly as from where it was taken.
+        """
+        return self._rows.copy()
+
+    @state.setter
+    def state(self, rows: Floats) -> None:
+        if rows.shape != self._rows.shape:
+            raise ValueError(f"state has shape {rows.shape}, these cars need {self._rows.shape}")
+        self._rows[:] = rows
+
+    def set_tyre_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
+        """Give cars their own tyre friction coefficient, (n,), before the floor's factor."""
+        rows = np.asarray(ids, np.intp)
+        friction = np.broadcast_to(np.asarray(values, np.float64) * self._floor_friction, rows.shape)
+        self._batch.expand("geom_friction")[rows[:, None], self._wheel_geoms, 0] = friction[:, None]
+
+    def set_mass_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+        """Multiply cars' masses and inertias by scale, (n,), relative to the configured ones."""
+        rows = np.asarray(ids, np.intp)
+        factor = np.broadcast_to(np.asarray(scale, np.float64), rows.shape)
+        self._batch.expand("body_mass")[rows] = factor[:, None] * self.model.body_mass
+        self._batch.expand("body_inertia")[rows] = factor[:, None, None] * self.model.body_inertia
+        self._batch.set_const(np.sort(rows))
+
+    def set_motor_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+        """Multiply cars' motor gain and torque limit by scale, (n,), relative to the configured ones."""
+        for field in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
+            self._scale(field, ids, self._motors, scale)
+
+    def set_servo_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+        """Multiply cars' servo gain by scale, (n,), relative to the configured one.
+
+        The damping stays, so that the steering's time constant is divided by scale.
+        """
+        self._scale("actuator_gainprm", ids, self._servos, scale)
+        # An affine bias is (constant, per angle, per speed): the gain stands a second time in the middle.
+        self._scale("actuator_biasprm", ids, self._servos, scale, column=1)
+
+    def _scale(
+        self, field: str, ids: ArrayLike, actuators: Ids, scale: ArrayLike, column: int | None = None
+    ) -> None:
+        """Set a field's columns (all, or one) of some cars' actuators to the model's times scale."""
+        rows = np.asarray(ids, np.intp)
+        factor = np.broadcast_to(np.asarray(scale, np.float64), rows.shape)[:, None, None]
+        columns = slice(None) if column is None else slice(column, column + 1)
+        own = getattr(self.model, field)[actuators, columns]
+        self._batch.expand(field)[rows[:, None], actuators, columns] = factor * own
+
+    def _settle(self) -> tuple[Floats, Floats]:
+        """Let one car come to rest on its wheels at the world's origin; return its state row and pose."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_step(self.model, data, nstep=_SETTLE_PERIODS * self.car.substeps)
+        pose = data.qpos.copy()
+        # Height and pitch are what settling finds; the rest is zero up to rounding.
+        pose[:2] = 0.0
+        pose[4] = pose[6] = 0.0
+        pose[3:7] /= np.linalg.norm(pose[3:7])
+        pose[7:] = 0.0
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:] = pose
+        row = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION))
+        mujoco.mj_getState(self.model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
+        return row, pose
+
+
+def _require_finite(what: str, sums: Floats) -> None:
+    """Raise RunFailed for the first car whose sum of numbers is NaN or infinite."""
+    finite = np.isfinite(sums)
+    if not finite.all():
+        raise RunFailed(f"car {int(np.argmin(finite))}: {what} is not finite")

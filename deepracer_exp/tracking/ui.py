@@ -1,0 +1,197 @@
+"""MLflow's web page for the project's runs, on this machine only."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import IO, Any
+
+from deepracer_exp.errors import BadInput, RunFailed
+
+from .names import VIEW
+from .store import Store, resolve_store
+
+_HOST = "127.0.0.1"
+_START_S = 90.0
+_STOP_S = 10.0
+_ANSWER_S = 10.0
+# A proxy named by the environment does not know this machine's loopback.
+_DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+
+def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str], None]) -> None:
+    """Serve the UI until Ctrl-C, SIGTERM or SIGHUP; `announce` gets its address once it answers.
+
+    A store that is a server has its own UI: its address is announced and nothing is started.
+
+    Raises:
+        BadInput: no run was recorded yet, or the port is taken.
+        RunFailed: the server did not start, or ended by itself.
+    """
+    store = existing_store(runs_dir, uri)
+    if store.is_server:
+        announce(store.shown)
+        return
+    with _ending_by_exception(), running_ui(store, port) as (url, server):
+        announce(runs_page(url))
+        try:
+            code = server.wait()
+        except KeyboardInterrupt:
+            return
+    raise RunFailed(f"MLflow's server at {url} ended by itself (exit code {code})")
+
+
+def existing_store(runs_dir: Path, uri: str | None) -> Store:
+    """Return the store if runs can be looked at in it.
+
+    Raises:
+        BadInput: `uri` is unusable, or names an SQLite file that does not exist.
+    """
+    default = runs_dir / "mlflow.db"
+    if uri is None and not default.exists():  # asked first: a look at nothing must not create runs_dir
+        raise BadInput(
+            f"{default}: no runs recorded yet; run `deepracer-exp train` first, or give tracking.uri="
+        )
+    store = resolve_store(uri, runs_dir)
+    if store.sqlite_file is not None and not store.sqlite_file.exists():
+        raise BadInput(f"tracking.uri={store.shown}: no such file; train with this tracking.uri first")
+    return store
+
+
+@contextmanager
+def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Run MLflow's server on `port` of 127.0.0.1 and yield its address and process once it answers.
+
+    Raises:
+        BadInput: the port is taken.
+        RunFailed: the server did not start.
+    """
+    if not _is_free(port):
+        free = next((other for other in range(port + 1, 65536) if _is_free(other)), None)
+        raise BadInput(f"port={port}: already in use on {_HOST}" + (f"; {free} is free" if free else ""))
+    with store.creation_lock():
+        pass  # a first training may be creating the tables at this moment
+    command = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "server",
+        "--host",
+        _HOST,
+        "--port",
+        str(port),
+        "--workers",
+        "1",
+    ]
+    # The files of a run are read from where its experiment keeps them, nothing is uploaded through the UI.
+    command += ["--no-serve-artifacts"]
+    if store.artifact_location:
+        command += ["--default-artifact-root", store.artifact_location]
+    environment = {
+        **os.environ,
+        "MLFLOW_BACKEND_STORE_URI": store.uri,  # not on the command line, where `ps` shows the password
+        "MLFLOW_DISABLE_TELEMETRY": "true",
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # six more processes, for judging chats
+    }
+    with tempfile.TemporaryFile() as output:
+        # A session of its own: Ctrl-C reaches this process alone, which then ends the whole group.
+        server = subprocess.Popen(
+            command, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+            start_new_session=True,
+        )  # fmt: skip
+        try:
+            url = f"http://{_HOST}:{port}"
+            _wait_until_it_answers(url, server, output)
+            yield url, server
+        finally:
+            _end_group(server)
+
+
+def runs_page(url: str) -> str:
+    """Return the address of the runs table that holds the newest run, with its racing columns."""
+    experiments = _ask(f"{url}/api/2.0/mlflow/experiments/search?max_results=1000")["experiments"]
+    newest = _ask(
+        f"{url}/api/2.0/mlflow/runs/search",
+        {
+            "experiment_ids": [experiment["experiment_id"] for experiment in experiments],
+            "max_results": 1,
+            "order_by": ["attributes.start_time DESC"],
+        },
+    ).get("runs")
+    # MLflow's UI opens for language models unless told otherwise.
+    if not newest:
+        return f"{url}/#/experiments?workflowType=machine_learning"
+    experiment_id = newest[0]["info"]["experiment_id"]
+    page = f"{url}/#/experiments/{experiment_id}/runs?workflowType=machine_learning"
+    tags = next(each for each in experiments if each["experiment_id"] == experiment_id).get("tags", ())
+    has_view = any(tag["key"] == f"mlflow.sharedViewState.{VIEW}" for tag in tags)
+    return f"{page}&viewStateShareKey={VIEW}" if has_view else page
+
+
+def _ask(url: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    data = None if body is None else json.dumps(body).encode()
+    request = urllib.request.Request(url, data, {"Content-Type": "application/json"})
+    with _DIRECTLY.open(request, timeout=_ANSWER_S) as answer:
+        return json.load(answer)
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        # As the server does: a port whose last connections still linger counts as free.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((_HOST, port))
+        except OSError:
+            return False
+    return True
+
+
+def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO[bytes]) -> None:
+    deadline = time.monotonic() + _START_S
+    while time.monotonic() < deadline and server.poll() is None:
+        try:
+            with _DIRECTLY.open(f"{url}/health", timeout=_ANSWER_S):
+                return
+        except (urllib.error.URLError, OSError):
+            time.sleep(0.2)
+    output.seek(0)
+    lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]
+    raise RunFailed(f"MLflow's server did not start at {url}: {lines[-1]}")
+
+
+def _end_group(server: subprocess.Popen[bytes]) -> None:
+    for how in (signal.SIGTERM, signal.SIGKILL):
+        try:
+            os.killpg(server.pid, how)
+        except ProcessLookupError:
+            break
+        try:
+            server.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            continue
+    server.wait()
+
+
+@contextmanager
+def _ending_by_exception() -> Iterator[None]:
+    """Turn SIGTERM and SIGHUP, which end Python without a clean-up, into SystemExit(128 + signal)."""
+
+    def leave(signum: int, _: FrameType | None) -> None:
+        raise SystemExit(128 + signum)
+
+    before = {signum: signal.signal(signum, leave) for signum in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

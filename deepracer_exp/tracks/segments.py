@@ -1,0 +1,157 @@
+"""Exact nearest-segment queries on a polyline at a cost that does not grow with its length.
+
+A uniform grid stores for each cell every segment that can be nearest to some point of the cell. Let c be
+the cell's centre and h its half diagonal: no point of the cell is farther than h from c, so the nearest
+segment of any point p of the cell lies within d(c) + 2 h of c, where d(c) is the distance from c to the
+polyline. The stored set is therefore a superset of the answers, and testing it alone is exact.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+CELL_M = 0.1
+"""Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""
+MOST_CELLS = 400_000
+MARGIN_M = 1.0
+"""How far the grid reaches beyond the polyline; points farther out are answered by a full scan."""
+SPLIT = 8
+"""Fine cells to the side of a coarse one, which narrows the search while the grid is built."""
+
+
+class Segments(NamedTuple):
+    """A polyline of n segments with its grid (arrays that compiled code reads)."""
+
+    x: np.ndarray
+    """Vertices (n + 1,) in metres."""
+    y: np.ndarray
+    length_m: np.ndarray
+    """Length of each segment (n,)."""
+    start_m: np.ndarray
+    """Distance of each vertex from the first along the polyline (n + 1,)."""
+    share: np.ndarray
+    """The same as a share of the whole, 0 to 1 (n + 1,)."""
+    heading_rad: np.ndarray
+    """Direction of each segment (n,)."""
+    bucket: np.ndarray
+    """Segment at the start of each of equal shares of the line, so that a look-up needs no search."""
+    low_x: float
+    low_y: float
+    cell_m: float
+    columns: int
+    rows: int
+    first: np.ndarray
+    """Candidates of cell k are `member[first[k]:first[k + 1]]`, ascending."""
+    member: np.ndarray
+
+
+def build_segments(vertices: np.ndarray) -> Segments:
+    """Index a polyline.
+
+    Args:
+        vertices: Points (n + 1, 2) in metres; the first is repeated at the end of a closed line. Segments
+            of no length are left out.
+    """
+    moved = np.r_[True, (np.diff(vertices, axis=0) != 0).any(axis=1)]
+    x, y = np.ascontiguousarray(vertices[moved].T)
+    dx, dy = np.diff(x), np.diff(y)
+    # sqrt of the sum of squares, as GEOS measures, so that sums agree to the last bit.
+    length_m = np.sqrt(dx * dx + dy * dy)
+    start_m = np.r_[0.0, np.cumsum(length_m)]
+    share = start_m / start_m[-1]
+    bucket = np.searchsorted(share, np.arange(2 * len(share)) / (2 * len(share)), side="right") - 1
+    low_x, low_y = float(x.min()) - MARGIN_M, float(y.min()) - MARGIN_M
+    width_m, height_m = x.max() + MARGIN_M - low_x, y.max() + MARGIN_M - low_y
+    cell_m = CELL_M
+    while width_m * height_m > MOST_CELLS * cell_m**2:
+        cell_m *= 2
+    columns, rows = math.ceil(width_m / cell_m), math.ceil(height_m / cell_m)
+    every = np.arange(len(length_m), dtype=np.int32)
+    columns_c, rows_c = -(-columns // SPLIT), -(-rows // SPLIT)
+    whole = (np.array([0, len(every)]), every, 1, SPLIT * max(columns, rows))
+    coarse = _candidates(x, y, low_x, low_y, cell_m * SPLIT, columns_c, rows_c, *whole)
+    first, member = _candidates(x, y, low_x, low_y, cell_m, columns, rows, *coarse, columns_c, SPLIT)
+    return Segments(
+        *(x, y, length_m, start_m, share, np.arctan2(dy, dx), bucket),
+        *(low_x, low_y, cell_m, columns, rows, first, member),
+    )
+
+
+@njit(cache=True, nogil=True)
+def squared_distance(x, y, index, px, py):  # type: ignore[no-untyped-def]
+    """Return the squared distance from (px, py) to segment `index` and the fraction along it."""
+    ax, ay = x[index], y[index]
+    dx, dy = x[index + 1] - ax, y[index + 1] - ay
+    length2 = dx * dx + dy * dy
+    fraction = ((px - ax) * dx + (py - ay) * dy) / length2
+    # At an end the vertex itself is measured: both neighbours then tie exactly and the first one wins,
+    # which is what GEOS does.
+    if fraction <= 0.0:
+        return (px - ax) ** 2 + (py - ay) ** 2, 0.0
+    if fraction >= 1.0:
+        return (px - x[index + 1]) ** 2 + (py - y[index + 1]) ** 2, 1.0
+    cross = (px - ax) * dy - (py - ay) * dx
+    return cross * cross / length2, fraction
+
+
+@njit(cache=True, nogil=True)
+def _candidates(  # type: ignore[no-untyped-def]
+    x, y, low_x, low_y, cell_m, columns, rows, parent_first, parent_member, parent_columns, split
+):
+    reach = math.sqrt(2.0) * cell_m + 1e-9
+    first = np.zeros(columns * rows + 1, np.int64)
+    member = np.empty(4 * columns * rows + len(x), np.int32)
+    distance = np.empty(len(x))
+    used = 0
+    for row in range(rows):
+        for column in range(columns):
+            px, py = low_x + (column + 0.5) * cell_m, low_y + (row + 0.5) * cell_m
+            parent = (row // split) * parent_columns + column // split
+            begin, end = parent_first[parent], parent_first[parent + 1]
+            nearest = np.inf
+            for k in range(begin, end):
+                d = math.sqrt(squared_distance(x, y, parent_member[k], px, py)[0])
+                distance[k - begin] = d
+                nearest = min(nearest, d)
+            for k in range(begin, end):
+                if distance[k - begin] <= nearest + reach:
+                    if used == len(member):
+                        longer = np.empty(2 * used, np.int32)
+                        longer[:used] = member
+                        member = longer
+                    member[used] = parent_member[k]
+                    used += 1
+            first[row * columns + column + 1] = used
+    return first, member[:used].copy()
+
+
+@njit(cache=True, nogil=True)
+def nearest_segment(s, px, py):  # type: ignore[no-untyped-def]
+    """Return index of the segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
+    column = (px - s.low_x) / s.cell_m
+    row = (py - s.low_y) / s.cell_m
+    best, found, fraction = np.inf, 0, np.nan
+    if 0.0 <= column < s.columns and 0.0 <= row < s.rows:
+        cell = int(row) * s.columns + int(column)
+        for k in range(s.first[cell], s.first[cell + 1]):
+            index = s.member[k]
+            d, f = squared_distance(s.x, s.y, index, px, py)
+            if d < best:
+                best, found, fraction = d, index, f
+    else:
+        for index in range(len(s.length_m)):
+            d, f = squared_distance(s.x, s.y, index, px, py)
+            if d < best:
+                best, found, fraction = d, index, f
+    return found, fraction
+
+
+@njit(cache=True, nogil=True)
+def along(s, index, fraction):  # type: ignore[no-untyped-def]
+    """Return the point at `fraction` of segment `index`."""
+    if fraction >= 1.0:
+        return s.x[index + 1], s.y[index + 1]
+    x, y = s.x[index], s.y[index]
+    return x + fraction * (s.x[index + 1] - x), y + fraction * (s.y[index + 1] - y)

@@ -1,0 +1,288 @@
+"""The live view of a training in the terminal, and its plain lines where there is none."""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console, ConsoleOptions, Group, RenderResult
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+Row = Mapping[str, float | int | None]
+"""One line of metrics.jsonl."""
+
+NOTHING = "\N{EN DASH}"
+SPARKS = "▁▂▃▄▅▆▇█"
+REFRESH_S = 0.2
+"""Shortest time between two drawings: more often only costs the training time."""
+LINE_S = 5.0
+"""Shortest time between two plain lines."""
+WIDE = 76
+"""Columns from which the figures stand in two halves side by side."""
+LABEL, VALUE, GAP, RIGHT = 12, 10, 3, 24
+"""Columns of a figure's name, of its value, between the halves, and of the right half."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunHeader:
+    """What is being trained, in the words of its options."""
+
+    name: str
+    track: str
+    reward: str
+    network: str
+    actions: str
+    budget: str
+    """The limits of the run, such as `3,000,000 steps`."""
+    folder: str
+    """Where the results go."""
+
+
+class ProgressDisplay:
+    """Shows a training while it runs; use as a context manager.
+
+    On a terminal one panel is redrawn in place and stays at the end. Elsewhere, lines go to `console`: the
+    first row, then at most one every `LINE_S`, and the last. Give a console on stderr: stdout is for results.
+    """
+
+    def __init__(
+        self, console: Console, header: RunHeader, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._console = console
+        self._clock = clock
+        self._view = _View(header)
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._started_s = 0.0
+        self._shown_s = -math.inf
+        self._pending = False
+
+    def __enter__(self) -> Self:
+        self._started_s = self._clock()
+        if self._live is not None:
+            self._live.start()
+            self._live.update(self._view, refresh=True)
+        else:
+            header = self._view.header
+            self._line(f"{header.name}: {_join(header)} · {header.budget}")
+            self._line(f"results in {header.folder}")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._pending:
+            self._show()
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, row: Row, fraction: float, eta_s: float | None) -> None:
+        """Show one iteration.
+
+        Args:
+            row: as in metrics.jsonl: completion is in per cent (0 to 100), lap_share a fraction; values that
+                are None, NaN or missing show as a dash.
+            fraction: share of the budget used, 0 to 1.
+            eta_s: seconds left, or None where nobody knows.
+        """
+        now_s = self._clock()
+        self._view.add(row, fraction, eta_s, now_s - self._started_s)
+        self._pending = True
+        if now_s - self._shown_s >= (LINE_S if self._live is None else REFRESH_S):
+            self._shown_s = now_s
+            self._show()
+
+    def message(self, text: str) -> None:
+        """Print a line above the view."""
+        self._line(text)
+
+    def _show(self) -> None:
+        self._pending = False
+        if self._live is not None:
+            self._live.update(self._view, refresh=True)
+        else:
+            self._line(self._view.line())
+
+    def _line(self, text: str) -> None:
+        # Names and paths may hold square brackets, and a log line is not folded at 80 columns.
+        self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
+
+
+class _View:
+    """The panel: state on one side, rich's protocol to draw it at any width on the other."""
+
+    def __init__(self, header: RunHeader) -> None:
+        self.header = header
+        self._row: Row = {}
+        self._fraction = 0.0
+        self._eta_s: float | None = None
+        self._elapsed_s = 0.0
+        self._history: dict[str, list[float]] = {"completion": [], "mean_return": [], "entropy": []}
+
+    def add(self, row: Row, fraction: float, eta_s: float | None, elapsed_s: float) -> None:
+        self._row, self._eta_s, self._elapsed_s = row, eta_s, elapsed_s
+        self._fraction = min(max(fraction, 0.0), 1.0)
+        for key, values in self._history.items():
+            value = _value(row, key)
+            if value is not None:
+                values.append(value)
+
+    def line(self) -> str:
+        row = self._row
+        parts = [
+            f"{100 * self._fraction:3.0f} %",
+            f"iteration {_format(row, 'iteration', ',.0f')}",
+            _format(row, "env_steps", ",.0f", " steps"),
+            _format(row, "env_steps_per_s", ",.0f", "/s"),
+            f"return {_format(row, 'mean_return', ',.2f')}",
+            f"completion {_format(row, 'completion', '.1f', ' %')}",
+            f"laps {_format(row, 'laps', ',.0f')} ({_share(row)} of last 50)",
+            f"best lap {_format(row, 'best_lap_time_s', '.2f', ' s')}",
+            f"entropy {_format(row, 'entropy', '.3f')}",
+            f"lr {_format(row, 'lr', '.2g')}",
+            _left(self._eta_s),
+        ]
+        return " · ".join(parts)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        # On a very wide terminal the eye would have to travel between the halves.
+        width = min(options.max_width, 100)
+        # Less the border and two columns of padding on each side.
+        inner = width - 6
+        yield Panel(
+            Group(
+                Text(_join(self.header), style="dim", overflow="ellipsis", no_wrap=True),
+                Text(""),
+                self._bar(inner, width >= WIDE),
+                Text(""),
+                *self._figures(inner, width >= WIDE),
+            ),
+            title=Text(self.header.name, style="bold"),
+            title_align="left",
+            subtitle=Text(_tail(self.header.folder, inner - 2), style="dim"),
+            subtitle_align="left",
+            border_style="bright_black",
+            padding=(1, 2),
+            width=width,
+        )
+
+    def _bar(self, width: int, wide: bool) -> Table:
+        spent = Text.assemble((f"{100 * self._fraction:.0f} %", "bold"))
+        if wide:
+            spent.append(f" of {self.header.budget}", style="dim")
+        row = Table.grid(padding=(0, 2), expand=True)
+        row.width = width
+        row.add_column(ratio=1, min_width=10)
+        row.add_column(justify="right", no_wrap=True)
+        row.add_column(justify="right", no_wrap=True)
+        row.add_row(
+            ProgressBar(
+                total=1.0,
+                completed=self._fraction,
+                style="grey23",
+                complete_style="cyan",
+                finished_style="cyan",
+            ),
+            spent,
+            f"{_clock(self._elapsed_s)} · {_left(self._eta_s)}",
+        )
+        return row
+
+    def _figures(self, width: int, wide: bool) -> list[Text]:
+        row = self._row
+        left = width - GAP - RIGHT if wide else width
+        right = RIGHT if wide else width
+
+        def curve(key: str, style: str, bounds: tuple[float, float] | None = None) -> Text:
+            return Text(sparkline(self._history[key], left - LABEL - VALUE, bounds), style=style)
+
+        def cell(label: str, value: str, note: Text | str = "", room: int = left) -> Text:
+            text = Text.assemble((label.ljust(LABEL), "dim"), (value.ljust(VALUE), "bold"), note)
+            text.truncate(room, overflow="ellipsis", pad=True)
+            return text
+
+        learning = [
+            cell(
+                "completion", _format(row, "completion", ".1f", " %"), curve("completion", "green", (0, 100))
+            ),
+            cell("return", _format(row, "mean_return", ",.2f"), curve("mean_return", "cyan")),
+            cell("entropy", _format(row, "entropy", ".3f"), curve("entropy", "magenta")),
+            cell("learn rate", _format(row, "lr", ".2g")),
+        ]
+        laps = [
+            cell("laps", _format(row, "laps", ",.0f"), room=right),
+            cell("of last 50", _share(row), room=right),
+            cell("best lap", _format(row, "best_lap_time_s", ".2f", " s"), room=right),
+            cell("mean lap", _format(row, "mean_lap_time_s", ".2f", " s"), room=right),
+        ]
+        work = [
+            cell("env steps", _format(row, "env_steps", ",.0f")),
+            cell("speed", _format(row, "env_steps_per_s", ",.0f", " steps/s")),
+        ]
+        counts = [
+            cell("iteration", _format(row, "iteration", ",.0f"), room=right),
+            cell("episodes", _format(row, "episodes", ",.0f"), room=right),
+        ]
+        if not wide:
+            return [*learning, Text(""), *laps, Text(""), *work, *counts]
+        halves = [*zip(learning, laps, strict=True), (Text(""), Text("")), *zip(work, counts, strict=True)]
+        return [one + " " * GAP + other for one, other in halves]
+
+
+def sparkline(values: list[float], width: int, bounds: tuple[float, float] | None = None) -> str:
+    """Draw values as at most `width` bars, each the mean of its share of them.
+
+    Args:
+        values: finite numbers, oldest first.
+        width: most characters.
+        bounds: values of the lowest and the highest bar; without them, those of the bars themselves.
+    """
+    count = min(width, len(values))
+    edges = [place * len(values) // count for place in range(count + 1)] if count else []
+    means = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]
+    if not means:
+        return ""
+    low, high = bounds or (min(means), max(means))
+    span = (high - low) or 1.0
+    top = len(SPARKS) - 1
+    return "".join(SPARKS[min(max(round((mean - low) / span * top), 0), top)] for mean in means)
+
+
+def _value(row: Row, key: str) -> float | None:
+    value = row.get(key)
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def _format(row: Row, key: str, spec: str, unit: str = "") -> str:
+    value = _value(row, key)
+    return NOTHING if value is None else format(value, spec) + unit
+
+
+def _share(row: Row) -> str:
+    share = _value(row, "lap_share")
+    return NOTHING if share is None else f"{100 * share:.0f} %"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _left(eta_s: float | None) -> str:
+    return f"{NOTHING} left" if eta_s is None or not math.isfinite(eta_s) else f"{_clock(eta_s)} left"
+
+
+def _join(header: RunHeader) -> str:
+    return " · ".join((header.track, header.reward, header.network, header.actions))
+
+
+def _tail(text: str, width: int) -> str:
+    """Keep the end of a path: it tells runs apart."""
+    return text if len(text) <= width else "…" + text[len(text) - width + 1 :]

@@ -1,0 +1,90 @@
+"""Finished episodes, counted from the trace."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..env.race import CONTROL_PERIOD_S
+from ..formats.trace import PACKED, STATUS_CODE
+
+
+@dataclass(frozen=True)
+class Finished:
+    """Episodes that ended, in the order of their ends; arrays of one length."""
+
+    returns: np.ndarray
+    """Sum of rewards."""
+    progress: np.ndarray
+    """Per cent of the lap at the end."""
+    lap: np.ndarray
+    """Whether the lap was completed."""
+    time_s: np.ndarray
+    """Seconds of driving, the prepare step not counted: the lap time where the lap was completed."""
+
+
+class EpisodeBook:
+    """Numbers the episodes of a run and remembers how the last ones ended."""
+
+    def __init__(self, n_cars: int, remembered: int):
+        """Open the book.
+
+        Args:
+            n_cars: cars over all processes.
+            remembered: how many of the last finished episodes `lap_share` looks at.
+        """
+        self._number = np.full(n_cars, -1)
+        self._next_number = 0
+        self._laps_of_last: deque[bool] = deque(maxlen=remembered)
+        self.finished = 0
+        self.laps = 0
+        self.best_lap_s: float | None = None
+
+    @property
+    def lap_share(self) -> float | None:
+        """Share of complete laps among the last episodes, None before as many as are remembered have ended."""
+        last = self._laps_of_last
+        return sum(last) / len(last) if len(last) == last.maxlen else None
+
+    def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
+        """Note a batch of driving.
+
+        Args:
+            trace: rows of `formats.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
+
+        Returns:
+            The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and
+            the episodes that ended in them.
+        """
+        trace = trace.copy()
+        cars = trace[:, 0, PACKED["car"]].astype(np.int64)
+        begins = trace[:, :, PACKED["steps"]] == 1
+        # Episodes are numbered in the order in which they begin, cars that begin together by their number.
+        order = np.argwhere(begins.T)
+        numbers = np.full(begins.shape, -1)
+        numbers[order[:, 1], order[:, 0]] = self._next_number + np.arange(len(order))
+        self._next_number += len(order)
+        numbers[:, 0] = np.maximum(numbers[:, 0], self._number[cars])
+        numbers = np.maximum.accumulate(numbers, axis=1)
+        self._number[cars] = numbers[:, -1]
+        trace[:, :, PACKED["episode"]] = numbers
+        finished = self._close(trace)
+        rows = trace.reshape(-1, trace.shape[-1])
+        return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
+
+    def _close(self, trace: np.ndarray) -> Finished:
+        in_time = trace.transpose(1, 0, 2)
+        ends = in_time[in_time[:, :, PACKED["done"]] == 1]
+        finished = Finished(
+            returns=ends[:, PACKED["episode_return"]],
+            progress=ends[:, PACKED["progress"]],
+            lap=ends[:, PACKED["episode_status"]] == STATUS_CODE["lap_complete"],
+            time_s=(ends[:, PACKED["steps"]] - 1) * CONTROL_PERIOD_S,
+        )
+        self.finished += len(ends)
+        self.laps += int(finished.lap.sum())
+        self._laps_of_last.extend(finished.lap.tolist())
+        if finished.lap.any():
+            fastest = float(finished.time_s[finished.lap].min())
+            self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
+        return finished

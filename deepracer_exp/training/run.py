@@ -1,0 +1,366 @@
+"""One experiment, from its configuration to a folder of results."""
+
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+from rich.console import Console
+from tensordict import TensorDictBase
+
+from ..agents.actor_critic import build_actor_critic
+from ..agents.ppo import PPO, UpdateMetrics
+from ..agents.schedules import Schedule
+from ..config.compose import Composition
+from ..config.experiment import Experiment
+from ..config.learning import AlgorithmConfig
+from ..config.running import ReliableStopping
+from ..env.observation import feature_names
+from ..env.setup import build_setup
+from ..errors import RunFailed
+from ..formats.trace import TraceWriter, to_table
+from ..tracking.names import run_params, run_tags
+from ..tracking.recorder import open_tracker
+from .budget import Budget
+from .checkpoints import CheckpointStore
+from .collection import Collection, worker_count
+from .display import ProgressDisplay, RunHeader
+from .episodes import EpisodeBook, Finished
+from .faults import write_fault
+from .report import write_report
+from .run_folder import RunFolder
+from .signals import Interruption
+
+logger = logging.getLogger("deepracer_exp")
+
+TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
+"""Columns of metrics.jsonl that differ between two runs of the same seed."""
+_LAST_EVERY = 10  # iterations between two checkpoints `last`: one costs about 10 ms
+_FEWEST_EPISODES = 10  # below this the mean completion of an iteration says little about the policy
+_CHUNK_STEPS = 32  # steps a car drives between two looks at how many episodes have ended
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    status: str
+    """`finished`, `interrupted` or `failed`."""
+    reason: str
+    exit_code: int
+    folder: Path
+    summary: dict[str, Any]
+
+
+class Training:
+    """A run in progress: what the loop reads and writes."""
+
+    def __init__(self, experiment: Experiment, composition: Composition, console: Console):
+        """Read the experiment's files, make its folder and begin to record.
+
+        Raises:
+            BadInput: a file or the run folder cannot be used, or values contradict.
+        """
+        self.experiment = experiment
+        self.setup = build_setup(experiment)
+        self._tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
+        self.names = _names(composition, self.setup.track.name, self.setup.reward.name)
+        label = f"{self.names['track']}-{self.names['reward']}-seed{experiment.seed}"
+        self.folder = RunFolder(experiment.runs_dir, experiment.name, label)
+        commit = self.folder.describe(composition, self.setup.reward, experiment.seed)
+        self._log_file = _log_to(self.folder.path / "log.txt")
+        self._tracker.start(
+            self.folder.name,
+            experiment.name,
+            run_params(self.names, composition.mapping),
+            run_tags(self.names, commit, self.setup.reward.sha256, self.folder.path.resolve()),
+        )
+        self.budget = Budget(experiment.budget)
+        stopping = experiment.stopping
+        cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+        self.book = EpisodeBook(cars, stopping.episodes if isinstance(stopping, ReliableStopping) else 50)
+        self.checkpoints = CheckpointStore(self.folder.path)
+        self.trace = TraceWriter(self.folder.path / "trace")
+        self.display = ProgressDisplay(console, self._header())
+        generator = torch.Generator().manual_seed(experiment.seed)
+        actor_critic = build_actor_critic(
+            experiment.network, len(feature_names(experiment.observation)), self.setup.actions.n, generator
+        )
+        self.policy = actor_critic.policy
+        self.agent = PPO(
+            actor_critic, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed
+        )
+        self.env_steps = 0
+        self.iteration = 0
+        self._began = time.monotonic()
+        # The clock of a racer starts with the command, not with the loop.
+        self._process_began = psutil.Process().create_time()
+        self._first_lap: dict[str, float] | None = None
+        self._row: dict[str, Any] = {}
+
+    def loop(self, collection: Collection, interruption: Interruption) -> str:
+        """Collect, learn and record until there is a reason to stop; return it."""
+        algorithm = self.experiment.algorithm
+        for batch, collect_s in _iterations(collection, algorithm, self.experiment.collector.mode == "async"):
+            rows, finished = self.book.enter(batch["next", "trace"].numpy())
+            self.env_steps += batch.numel()
+            rank = self._rank(finished)
+            if self.checkpoints.is_better(rank):  # these weights drove; the update makes others
+                self.checkpoints.save(self.agent, self._counters(), rank)
+            began = time.monotonic()
+            update = self._learn(batch)
+            collection.publish_policy()
+            self.iteration += 1
+            self._record(rows, finished, update, batch.numel(), collect_s, time.monotonic() - began)
+            if self.iteration % _LAST_EVERY == 0:
+                self.checkpoints.save(self.agent, self._counters(), None)
+            reason = self._reason_to_stop(interruption)
+            if reason is not None:
+                return reason
+        raise RunFailed("the collector ended without a reason")
+
+    def close(self, status: str, reason: str, exit_code: int) -> Outcome:
+        """Write what remains to be written and let go of the tracker."""
+        if self.iteration and status != "failed":
+            self.checkpoints.save(self.agent, self._counters(), None)
+        summary = {
+            "status": status,
+            "reason": reason,
+            **self._counters(),
+            "seed": self.experiment.seed,
+            "wall_clock_s": round(time.monotonic() - self._began, 3),
+            "lap_share": self.book.lap_share,
+            "best_lap_time_s": self.book.best_lap_s,
+            "first_lap": self._first_lap,
+            "last": self._row,
+        }
+        path = self.folder.path
+        if status != "failed":
+            write_report(path, self.setup.track)
+        self.folder.write("summary.json", json.dumps(summary, indent=2) + "\n")
+        for name in ("config.yaml", "overrides.yaml", "provenance.json", "reward_function.py"):
+            self._tracker.log_artifact(path / name)
+        for name in ("summary.json", "metrics.jsonl", "log.txt", "best_lap.png", "learning.png", "faults"):
+            if (path / name).exists():
+                self._tracker.log_artifact(path / name, "faults" if name == "faults" else None)
+        for name in ("best", "last"):
+            if (self.checkpoints.folder / name).exists():
+                self._tracker.log_artifact((self.checkpoints.folder / name).resolve(), f"checkpoints/{name}")
+        self._tracker.set_tag("end", f"{status}: {reason}")
+        self._tracker.finish({"finished": "FINISHED", "failed": "FAILED"}.get(status, "KILLED"))  # type: ignore[arg-type]
+        logger.removeHandler(self._log_file)
+        self._log_file.close()
+        return Outcome(status, reason, exit_code, path, summary)
+
+    def _learn(self, batch: TensorDictBase) -> UpdateMetrics:
+        _, fraction = self._spent()
+        try:
+            return self.agent.update(batch, self.iteration, min(fraction, 1.0))
+        except RunFailed as error:
+            error.arrays = {  # type: ignore[attr-defined]
+                "observation": batch["observation"].numpy(),
+                "action": batch["action"].numpy(),
+                "reward": batch["next", "reward"].numpy(),
+            }
+            raise
+
+    def _record(
+        self,
+        rows: np.ndarray,
+        finished: Finished,
+        update: UpdateMetrics,
+        frames: int,
+        collect_s: float,
+        update_s: float,
+    ) -> None:
+        book = self.book
+        if self._first_lap is None and book.laps:
+            self._first_lap = {
+                "env_steps": self.env_steps,
+                "since_process_start_s": round(time.time() - self._process_began, 3),
+            }
+        self._row = {
+            **self._counters(),
+            "mean_return": _mean(finished.returns),
+            "completion": _mean(finished.progress),
+            "lap_share": book.lap_share,
+            "best_lap_time_s": book.best_lap_s,
+            "mean_lap_time_s": _mean(finished.time_s[finished.lap]),
+            **{name: float(value) for name, value in vars(update).items()},
+            "wall_clock_s": round(time.monotonic() - self._began, 3),
+            "collect_s": round(collect_s, 4),
+            "update_s": round(update_s, 4),
+            "env_steps_per_s": round(frames / (collect_s + update_s), 1),
+        }
+        self.folder.append_metrics(self._row)
+        self.trace.write(self.iteration - 1, to_table(rows, iteration=self.iteration - 1))
+        self._tracker.log(
+            {key: value for key, value in self._row.items() if key != "env_steps"}, step=self.env_steps
+        )
+        _, fraction = self._spent()
+        wall_clock_s = self._row["wall_clock_s"]
+        self.display.update(
+            self._row, min(fraction, 1.0), wall_clock_s * (1 / fraction - 1) if fraction else None
+        )
+
+    def _reason_to_stop(self, interruption: Interruption) -> str | None:
+        if interruption.signum is not None:
+            return "interrupted"
+        stopping = self.experiment.stopping
+        share = self.book.lap_share
+        if isinstance(stopping, ReliableStopping) and share is not None and share >= stopping.lap_share:
+            return f"reliable: {share:.0%} of the last {stopping.episodes} episodes completed the lap"
+        limit, fraction = self._spent()
+        return f"budget reached: {limit}" if fraction >= 1 else None
+
+    def _spent(self) -> tuple[str, float]:
+        return self.budget.used(self.env_steps, self.iteration, time.monotonic() - self._began)
+
+    def _rank(self, finished: Finished) -> tuple[float, float] | None:
+        if len(finished.progress) < _FEWEST_EPISODES:
+            return None
+        lap_times = finished.time_s[finished.lap]
+        return float(finished.progress.mean()), -float(lap_times.mean()) if len(lap_times) else -np.inf
+
+    def _counters(self) -> dict[str, int]:
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "episodes": self.book.finished,
+            "laps": self.book.laps,
+        }
+
+    def _header(self) -> RunHeader:
+        return RunHeader(
+            name=self.folder.name,
+            track=self.setup.track.title,
+            reward=self.names["reward"],
+            network=self.names["network"],
+            actions=self.names["action_space"],
+            budget=str(self.budget),
+            folder=str(self.folder.path),
+        )
+
+
+def train(experiment: Experiment, composition: Composition, console: Console) -> Outcome:
+    """Train the experiment.
+
+    Args:
+        experiment: validated.
+        composition: where it came from.
+        console: for the view of the progress.
+
+    Returns:
+        How it ended; a failed run's line is its `reason`.
+
+    Raises:
+        BadInput: before anything was started.
+    """
+    training = Training(experiment, composition, console)
+    with Interruption() as interruption:
+        try:
+            with contextlib.ExitStack() as stack:
+                collection = stack.enter_context(
+                    Collection(
+                        experiment.collector,
+                        training.setup,
+                        training.policy,
+                        _frames_per_batch(experiment),
+                        training.folder.path,
+                    )
+                )
+                stack.enter_context(training.display)
+                reason = training.loop(collection, interruption)
+        except RunFailed as error:
+            write_fault(training.folder.path, error, None)
+            return training.close("failed", str(error), RunFailed.exit_code)
+        except OSError as error:
+            reason = f"{error.filename or training.folder.path}: {error.strerror}"
+            return _close_without_disk(training, reason)
+        except KeyboardInterrupt:
+            return training.close(
+                "interrupted", "ended at once by a second signal", interruption.exit_code or 130
+            )
+    code = interruption.exit_code
+    if code is not None:
+        return training.close("interrupted", reason, code)
+    return training.close("finished", reason, 0)
+
+
+def _close_without_disk(training: Training, reason: str) -> Outcome:
+    """End a run whose folder takes no more: there may be no room for the summary either."""
+    try:
+        return training.close("failed", reason, RunFailed.exit_code)
+    except OSError:
+        return Outcome("failed", reason, RunFailed.exit_code, training.folder.path, {})
+
+
+def _iterations(
+    collection: Collection, algorithm: AlgorithmConfig, separate: bool
+) -> Iterator[tuple[TensorDictBase, float]]:
+    """Yield what an update learns from, and the seconds it took to collect.
+
+    Args:
+        collection: the source of batches.
+        algorithm: says how many frames or episodes an iteration has.
+        separate: batches come from different cars and cannot be joined along time.
+    """
+    chunks: list[TensorDictBase] = []
+    frames = episodes = 0
+    began = time.monotonic()
+    for chunk in collection:
+        frames += chunk.numel()
+        episodes += int(chunk["next", "done"].sum())
+        wanted = algorithm.episodes_per_iteration
+        enough = frames >= (algorithm.frames_per_iteration or 0) if wanted is None else episodes >= wanted
+        if enough and not chunks:
+            yield chunk, time.monotonic() - began
+        elif enough:
+            whole = torch.cat([*chunks, chunk], dim=0 if separate else 1)
+            yield whole, time.monotonic() - began
+        else:
+            chunks.append(chunk.clone())
+            continue
+        chunks, frames, episodes = [], 0, 0
+        began = time.monotonic()
+
+
+def _frames_per_batch(experiment: Experiment) -> int:
+    collector = experiment.collector
+    workers = max(1, worker_count(collector))
+    frames = experiment.algorithm.frames_per_iteration
+    if frames is None:
+        return workers * collector.cars * _CHUNK_STEPS
+    return -(-frames // workers) if collector.mode == "async" else frames
+
+
+def _names(composition: Composition, track: str, reward: str) -> dict[str, str]:
+    """Return what a racer calls the run's choices: an option's name, or a file's stem."""
+    choices, mapping = composition.choices, composition.mapping
+    actions_file = mapping["action_space"].get("file")
+    return {
+        "track": track,
+        "reward": reward,
+        "action_space": Path(actions_file).stem if actions_file else choices["action_space"],
+        "network": choices["network"],
+        "lr_schedule": choices["lr_schedule"],
+    }
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def _log_to(path: Path) -> logging.FileHandler:
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    return handler

@@ -1,0 +1,33 @@
+"""Ctrl-C and SIGTERM, heard at the end of an iteration."""
+
+import signal
+from types import FrameType, TracebackType
+
+
+class Interruption:
+    """Notes a request to end; the second Ctrl-C ends at once."""
+
+    def __init__(self) -> None:
+        self.signum: int | None = None
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> "Interruption":
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            self._before[signum] = signal.signal(signum, self._hear)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for signum, handler in self._before.items():
+            signal.signal(signum, handler)  # type: ignore[arg-type]
+
+    @property
+    def exit_code(self) -> int | None:
+        """Return 128 + the signal's number, None if none came."""
+        return None if self.signum is None else 128 + self.signum
+
+    def _hear(self, signum: int, _: FrameType | None) -> None:
+        if self.signum is not None:
+            raise KeyboardInterrupt
+        self.signum = signum

@@ -1,0 +1,86 @@
+"""Notices a worker process that hangs, and ends it."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+_LOOK_EVERY_S = 0.5
+# Imports of torch and torchrl on a loaded machine; a hang before the first step has no other sign.
+_START_TIMEOUT_S = 60.0
+
+
+class Watchdog:
+    """Watches the workers' step counters while the training process waits for them.
+
+    A worker that should be stepping and has not for `timeout_s` is killed, which the collector then reports as a
+    lost process; `verdict` says that it hung.
+    """
+
+    def __init__(self, heartbeat: Path, workers: int, timeout_s: float, lockstep: bool):
+        """Create the counters' file and start watching.
+
+        Args:
+            heartbeat: file to create, one int64 per worker.
+            workers: number of workers.
+            timeout_s: seconds without a step that count as hanging.
+            lockstep: every worker takes the same number of steps per batch, so that one which has done its part
+                may rest (synchronous collection).
+        """
+        self._file = heartbeat
+        np.full(workers, -1, np.int64).tofile(heartbeat)
+        self._beats = np.memmap(heartbeat, np.int64, "r")
+        self._timeout_s = timeout_s
+        self._lockstep = lockstep
+        self._due = 0
+        self._pids: Sequence[int] = ()
+        self._waiting = threading.Event()
+        self._waiting.set()
+        self._over = threading.Event()
+        self.verdict: dict[int, str] = {}
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._thread.start()
+
+    def workers_started(self, pids: Sequence[int]) -> None:
+        """Tell whom to end."""
+        self._pids = pids
+
+    def expect(self, steps: int) -> None:
+        """Note that each worker has been asked to reach `steps` control steps, and that we wait for it."""
+        self._due = steps
+        self._waiting.set()
+
+    def rest(self) -> None:
+        """Note that nothing is waited for."""
+        self._waiting.clear()
+
+    def close(self) -> None:
+        """Stop watching and remove the counters."""
+        self._over.set()
+        self._thread.join()
+        self._file.unlink(missing_ok=True)
+
+    def _watch(self) -> None:
+        seen = np.array(self._beats)
+        idle_s = np.zeros(len(seen))
+        looked = time.monotonic()
+        while not self._over.wait(_LOOK_EVERY_S):
+            now = time.monotonic()
+            beats = np.array(self._beats)
+            resting = self._lockstep and self._due > 0
+            owes = (beats < self._due) if resting else np.ones(len(beats), bool)
+            idle_s += (now - looked) if self._waiting.is_set() else 0.0
+            idle_s[(beats != seen) | ~owes] = 0.0
+            seen, looked = beats, now
+            for worker in np.flatnonzero(idle_s > np.where(beats > 0, self._timeout_s, _START_TIMEOUT_S)):
+                self._end(int(worker), float(idle_s[worker]), int(beats[worker]))
+
+    def _end(self, worker: int, idle_s: float, steps: int) -> None:
+        if worker in self.verdict or worker >= len(self._pids):
+            return
+        self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {steps} steps) and was ended"
+        os.kill(self._pids[worker], signal.SIGKILL)

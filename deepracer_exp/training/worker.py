@@ -1,0 +1,100 @@
+"""What happens inside a collector's process."""
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..env.prints import RewardPrints
+from ..env.race import Race
+from ..env.race_env import RaceEnv
+from ..env.setup import RaceSetup
+from ..errors import RunFailed
+from .faults import write_fault
+
+PRINTS_FILE = "reward_prints.log"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvFactory:
+    """Builds the cars of one process; sent to it and called there.
+
+    `heartbeat` is a file of one int64 per worker, mapped by all of them: control steps done so far, -1 before the
+    first. A file needs no clean-up protocol: it lies in the run folder and never outlives it.
+    """
+
+    setup: RaceSetup
+    worker: int
+    n_cars: int
+    threads: int
+    run_dir: Path
+    heartbeat: Path | None
+    """None: the environment lives in the training process."""
+
+    def __call__(self) -> RaceEnv:
+        """Return the environment, with the process around it made ready."""
+        # Sampling of actions is a worker's own stream, whatever the other workers do.
+        torch.manual_seed(int(np.random.SeedSequence([self.setup.seed, self.worker]).generate_state(1)[0]))
+        race = Race(
+            self.setup,
+            self.n_cars,
+            threads=self.threads,
+            first_car=self.worker * self.n_cars,
+            prints=RewardPrints(self.run_dir / PRINTS_FILE),
+        )
+        if self.heartbeat is None:
+            return RaceEnv(race)
+        _obey_parent_only()
+        return _WorkerEnv(race, self._beat(), self.run_dir, self.worker)
+
+    def _beat(self) -> Callable[[], None]:
+        beats = np.memmap(self.heartbeat, np.int64, "r+")
+        worker = self.worker
+        beats[worker] = 0
+
+        def beat() -> None:
+            beats[worker] += 1
+
+        return beat
+
+
+class _WorkerEnv(RaceEnv):
+    """A RaceEnv whose failure is put on disk for the training process to find; then the worker is gone."""
+
+    def __init__(self, race: Race, beat: Callable[[], None], run_dir: Path, worker: int):
+        super().__init__(race, on_step=beat)
+        self._run_dir = run_dir
+        self._worker = worker
+
+    def _step(self, tensordict):  # type: ignore[no-untyped-def]
+        try:
+            return super()._step(tensordict)
+        except RunFailed as error:
+            write_fault(self._run_dir, error, self.race, worker=self._worker)
+            sys.stderr.flush()
+            # No traceback from here: the training process prints the one line and holds the exit code.
+            os._exit(RunFailed.exit_code)
+
+
+def _obey_parent_only() -> None:
+    """Leave Ctrl-C to the training process, and never outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform == "linux":
+        PR_SET_PDEATHSIG = 1
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        parent = os.getppid()
+
+        def watch() -> None:
+            while os.getppid() == parent:
+                threading.Event().wait(1.0)
+            os._exit(RunFailed.exit_code)
+
+        threading.Thread(target=watch, daemon=True).start()

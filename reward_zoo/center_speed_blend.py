@@ -1,0 +1,30 @@
+"""Teaches a compromise: near the centre line and fast, each with a weight of its own.
+
+A step on from following the centre line once that works; raise SPEED_WEIGHT from one training to the next.
+Fails when one weight drowns the other: too much speed runs wide, too little crawls. The sum may also pay for
+speed at the very border; `prevent_zig_zag` or `racing_line` are stricter.
+"""
+
+import numpy as np
+
+CENTER_WEIGHT = 1.0
+SPEED_WEIGHT = 1.0
+TOP_SPEED_MPS = 4.0  # pays SPEED_WEIGHT
+FLOOR = 0.001  # pay with a wheel off the road
+
+
+def reward_function(params: dict) -> float:
+    """Pay for nearness to the centre line and for speed."""
+    if not params["all_wheels_on_track"]:
+        return FLOOR
+    share = min(1.0, params["distance_from_center"] / (0.5 * params["track_width"]))
+    speed = params["speed"] / TOP_SPEED_MPS
+    return FLOOR + CENTER_WEIGHT * (1.0 - share * share) + SPEED_WEIGHT * speed
+
+
+def reward_batch(params: dict) -> np.ndarray:
+    """Apply the same formula to many cars."""
+    share = np.minimum(1.0, params["distance_from_center"] / (0.5 * params["track_width"]))
+    speed = params["speed"] / TOP_SPEED_MPS
+    pay = FLOOR + CENTER_WEIGHT * (1.0 - share * share) + SPEED_WEIGHT * speed
+    return np.where(params["all_wheels_on_track"], pay, FLOOR)

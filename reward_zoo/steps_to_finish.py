@@ -1,0 +1,31 @@
+"""Teaches the car to finish within a number of steps: pays for being ahead of an even schedule for the lap.
+
+Sets a goal in the unit in which lap times are counted, and pays a bonus at the finish that grows the sooner
+it comes. Fails when TARGET_STEPS is far from what the car can do: always late pays the floor, always early
+pays for anything. Set it per track, a little below the best lap so far.
+"""
+
+import numpy as np
+
+TARGET_STEPS = 300.0  # steps of a lap on schedule (15 a second)
+SCHEDULE_WEIGHT = 5.0  # extra pay for being a whole lap ahead
+FINISH_BONUS = 20.0  # pay for a finish on schedule
+FLOOR = 0.001
+
+
+def reward_function(params: dict) -> float:
+    """Pay for being ahead of schedule, and for the finish."""
+    steps = max(1.0, params["steps"])
+    ahead = params["progress"] / 100.0 - steps / TARGET_STEPS
+    pay = max(FLOOR, 1.0 + SCHEDULE_WEIGHT * ahead) if params["all_wheels_on_track"] else FLOOR
+    if params["progress"] >= 100.0:
+        pay += FINISH_BONUS * TARGET_STEPS / steps
+    return pay
+
+
+def reward_batch(params: dict) -> np.ndarray:
+    """Apply the same formula to many cars."""
+    steps = np.maximum(1.0, params["steps"])
+    ahead = params["progress"] / 100.0 - steps / TARGET_STEPS
+    pay = np.where(params["all_wheels_on_track"], np.maximum(FLOOR, 1.0 + SCHEDULE_WEIGHT * ahead), FLOOR)
+    return pay + np.where(params["progress"] >= 100.0, FINISH_BONUS * TARGET_STEPS / steps, 0.0)

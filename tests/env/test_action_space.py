@@ -1,0 +1,190 @@
+"""Laws of action spaces."""
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from deepracer_exp.config.driving import (
+    ActionSpaceConfig,
+    ContinuousActionSpace,
+    DiscreteAction,
+    DiscreteActionSpace,
+    GridActionSpace,
+    SpeedRange,
+    SteeringRange,
+)
+from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions, build_action_space
+from deepracer_exp.errors import BadInput
+
+CONF = Path(__file__).parents[2] / "conf" / "action_space"
+
+
+def option(name: str) -> ActionSpaceConfig:
+    adapter: TypeAdapter[Any] = TypeAdapter(ActionSpaceConfig)
+    return adapter.validate_python(yaml.safe_load((CONF / f"{name}.yaml").read_text(encoding="utf-8")))
+
+
+def grid(
+    steering: tuple[float, float], steering_levels: int, speed: tuple[float, float], speed_levels: int
+) -> Any:
+    return GridActionSpace(
+        kind="grid",
+        steering_angle=SteeringRange(low=steering[0], high=steering[1]),
+        steering_levels=steering_levels,
+        speed=SpeedRange(low=speed[0], high=speed[1]),
+        speed_levels=speed_levels,
+        file=None,
+    )
+
+
+def continuous(steering: tuple[float, float], speed: tuple[float, float]) -> ContinuousActionSpace:
+    return ContinuousActionSpace(
+        kind="continuous",
+        steering_angle=SteeringRange(low=steering[0], high=steering[1]),
+        speed=SpeedRange(low=speed[0], high=speed[1]),
+        file=None,
+    )
+
+
+def test_every_option_can_steer_both_ways_alike_and_stays_within_the_cars_limits() -> None:
+    names = sorted(path.stem for path in CONF.glob("*.yaml"))
+    assert {"discrete", "discrete_fast", "deepracer", "grid", "continuous"} <= set(names)
+    for name in names:
+        space = build_action_space(option(name))
+        assert space.low[0] == -space.high[0] >= -30, name
+        assert 0.1 <= space.low[1] <= space.high[1] <= 4, name
+        if isinstance(space, DiscreteActions):
+            choices = set(zip(space.steering_deg.tolist(), space.speed_mps.tolist(), strict=True))
+            assert len(choices) == space.n, name
+            assert choices == {(-steering, speed) for steering, speed in choices}, name
+
+
+def test_every_line_of_an_option_is_explained_by_a_comment_above_it() -> None:
+    for path in CONF.glob("*.yaml"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        for above, line in itertools.pairwise(lines):
+            if line[0] not in "# ":
+                assert above.startswith("#"), f"{path}: {line}"
+
+
+def test_an_action_number_is_its_place_in_the_list() -> None:
+    config = DiscreteActionSpace(
+        kind="discrete",
+        actions=(DiscreteAction(steering_angle=-5, speed=1), DiscreteAction(steering_angle=20, speed=2)),
+        file=None,
+    )
+    space = build_action_space(config)
+    assert space.n == 2
+    steering_deg, speed_mps = space.commands(np.array([1, 0, 1]))
+    np.testing.assert_array_equal(steering_deg, [20, -5, 20])
+    np.testing.assert_array_equal(speed_mps, [2, 1, 2])
+
+
+def test_a_grid_counts_speeds_within_angles() -> None:
+    space = build_action_space(grid((-30, 30), 3, (1, 2), 2))
+    assert isinstance(space, DiscreteActions)
+    np.testing.assert_array_equal(space.steering_deg, [-30, -30, 0, 0, 30, 30])
+    np.testing.assert_array_equal(space.speed_mps, [1, 2, 1, 2, 1, 2])
+
+
+@given(steering_levels=st.integers(2, 12), speed_levels=st.integers(2, 6))
+def test_a_grid_has_every_pair_of_levels_once_and_reaches_all_four_corners(
+    steering_levels: int, speed_levels: int
+) -> None:
+    space = build_action_space(grid((-25, 30), steering_levels, (0.7, 3.1), speed_levels))
+    assert isinstance(space, DiscreteActions)
+    pairs = set(zip(space.steering_deg.tolist(), space.speed_mps.tolist(), strict=True))
+    assert len(pairs) == space.n == steering_levels * speed_levels
+    assert {(-25, 0.7), (-25, 3.1), (30, 0.7), (30, 3.1)} <= pairs
+
+
+def test_one_level_is_a_constant() -> None:
+    space = build_action_space(grid((-30, 30), 3, (1.5, 1.5), 1))
+    assert isinstance(space, DiscreteActions)
+    assert set(space.speed_mps) == {1.5}
+
+
+BOUNDS = st.tuples(st.floats(-60, 60), st.floats(-60, 60)).map(sorted)
+
+
+@given(BOUNDS, st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=1, max_size=8))
+def test_continuous_commands_never_leave_the_ranges_and_grow_with_the_action(
+    bounds: list[float], actions: list[tuple[float, float]]
+) -> None:
+    space = build_action_space(continuous((bounds[0], bounds[1]), (1.0, 3.0)))
+    assert space.n is None
+    steering_deg, speed_mps = space.commands(np.array(sorted(actions), dtype=np.float32))
+    assert steering_deg.shape == speed_mps.shape == (len(actions),)
+    assert np.all((steering_deg >= bounds[0] - 1e-9) & (steering_deg <= bounds[1] + 1e-9))
+    assert np.all((speed_mps >= 1.0) & (speed_mps <= 3.0))
+    assert np.all(np.diff(steering_deg) >= -1e-9)
+
+
+def test_minus_one_zero_and_one_are_low_middle_and_high_exactly() -> None:
+    space = build_action_space(continuous((-30, 20), (0.7, 3.3)))
+    steering_deg, speed_mps = space.commands(np.array([[-1, 1], [0, 0], [1, -1], [9, -9]], dtype=np.float32))
+    np.testing.assert_array_equal(steering_deg, [-30, -5, 20, 20])
+    np.testing.assert_array_equal(speed_mps, [3.3, 2.0, 0.7, 0.7])
+
+
+def test_an_action_that_is_not_a_number_is_not_hidden() -> None:
+    steering_deg, speed_mps = build_action_space(continuous((-30, 30), (1, 3))).commands(
+        np.array([[np.nan, 0]])
+    )
+    assert np.isnan(steering_deg[0])
+    assert speed_mps[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("config", "numbers"),
+    [
+        (continuous((10, -10), (1, 2)), ("steering_angle", "10", "-10")),
+        (continuous((-10, 10), (2, 1.5)), ("speed", "2", "1.5")),
+        (grid((30, -30), 5, (1, 2), 2), ("steering_angle", "30", "-30")),
+        (grid((-30, 30), 1, (1, 2), 2), ("steering_levels", "1", "-30", "30")),
+        (grid((-30, 30), 5, (1, 2), 1), ("speed_levels", "1", "2")),
+        (grid((-30, 30), 5, (2, 2), 3), ("speed_levels", "3", "2")),
+        (DiscreteActionSpace(kind="discrete", actions=(), file=None), ("actions", "[]")),
+    ],
+)
+def test_a_contradiction_is_named_with_its_key_and_both_numbers(
+    config: ActionSpaceConfig, numbers: tuple[str, ...]
+) -> None:
+    with pytest.raises(BadInput) as caught:
+        build_action_space(config)
+    assert "\n" not in str(caught.value)
+    for word in numbers:
+        assert word in str(caught.value)
+
+
+def with_file(config: ActionSpaceConfig, path: Path) -> ActionSpaceConfig:
+    return type(config)(**{**vars(config), "file": str(path)})
+
+
+@pytest.mark.parametrize("name", ["discrete", "grid", "continuous"])
+def test_a_file_takes_the_place_of_every_kind_of_group(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "model_metadata.json"
+    path.write_text(json.dumps({"action_space": [{"steering_angle": "12", "speed": "4.5"}]}))
+    space = build_action_space(with_file(option(name), path))
+    assert isinstance(space, DiscreteActions)
+    # Beyond the car's 4 m/s: the simulator clips, the action space does not.
+    assert (space.steering_deg.tolist(), space.speed_mps.tolist()) == ([12.0], [4.5])
+
+    ranges = {"steering_angle": {"low": -12, "high": 20}, "speed": {"low": 1, "high": 2}}
+    path.write_text(json.dumps({"action_space": ranges, "action_space_type": "continuous", "version": "5"}))
+    space = build_action_space(with_file(option(name), path))
+    assert isinstance(space, ContinuousActions)
+    assert (space.low.tolist(), space.high.tolist()) == ([-12, 1], [20, 2])
+
+
+def test_a_missing_file_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"none\.json"):
+        build_action_space(with_file(option("discrete"), tmp_path / "none.json"))

@@ -1,0 +1,352 @@
+import ast
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from deepracer_exp.config.driving import RewardConfig
+from deepracer_exp.env.reward import RewardFunction
+from deepracer_exp.env.reward_source import load_reward_source, zoo_names
+
+CONF = Path(__file__).parents[2] / "conf" / "reward"
+STATELESS = [name for name in zoo_names() if name != "progress_delta"]
+WIDTH_M = 1.0
+Params = dict[str, Any]
+Reward = Callable[[Params], float]
+
+
+def closed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    points = np.column_stack([x, y])
+    return np.vstack([points, points[:1]])
+
+
+T = np.linspace(0.0, 2.0 * np.pi, 90, endpoint=False)
+S = np.linspace(0.0, 10.0, 60)
+CORNER = [(x, 0.0) for x in np.arange(0, 6, 0.25)] + [(6.0, y) for y in np.arange(0.25, 6, 0.25)]
+ROADS = {
+    "oval": closed(5.0 * np.cos(T), 2.5 * np.sin(T)),
+    "oval_reversed": closed(5.0 * np.cos(T), 2.5 * np.sin(T))[::-1],
+    "wavy": closed((4.0 + 0.8 * np.cos(3 * T)) * np.cos(T), (4.0 + 0.8 * np.cos(3 * T)) * np.sin(T)),
+    "circle": closed(2.0 * np.cos(T), 2.0 * np.sin(T)),
+    "open": np.column_stack([S, np.sin(S)]),
+    "corner": np.array(CORNER + [(x, 6.0) for x in np.arange(6, -0.1, -0.25)]),
+}
+
+
+def drive(
+    road: str, index: np.ndarray, off: np.ndarray, heading_error: np.ndarray, **given: np.ndarray | float
+) -> tuple[dict[str, np.ndarray], Params]:
+    """Return columns and constants of cars half way after waypoint `index`, `off` metres left of the line."""
+    points = ROADS[road]
+    n = len(index)
+    step = points[index + 1] - points[index]
+    heading = np.degrees(np.arctan2(step[:, 1], step[:, 0]))
+    left = np.column_stack([-step[:, 1], step[:, 0]]) / np.hypot(*step.T)[:, None]
+    place = points[index] + 0.5 * step + off[:, None] * left
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    columns: dict[str, Any] = {
+        "x": place[:, 0],
+        "y": place[:, 1],
+        "heading": (heading + heading_error + 180.0) % 360.0 - 180.0,
+        "distance_from_center": np.abs(off),
+        "projection_distance": 0.5 * (lengths[index] + lengths[index + 1]),
+        "progress": 100.0 * lengths[index] / lengths[-1],
+        "steps": 50.0,
+        "speed": 2.0,
+        "steering_angle": 0.0,
+        "track_width": WIDTH_M,
+        "sim_time": 3.0,
+        "all_wheels_on_track": np.abs(off) < 0.5 * WIDTH_M - 0.1,
+        "is_left_of_center": off > 0,
+        "is_offtrack": np.abs(off) > 0.5 * WIDTH_M + 0.1,
+        "closest_waypoints": np.column_stack([index, index + 1]),
+    }
+    columns.update(given)
+    columns = {k: np.broadcast_to(v, (n, 2) if k == "closest_waypoints" else n) for k, v in columns.items()}
+    constants = {
+        "track_length": float(lengths[-1]),
+        "waypoints": [tuple(point) for point in points.tolist()],
+        "is_reversed": road.endswith("reversed"),
+    }
+    return columns, constants
+
+
+def anywhere(road: str, n: int) -> tuple[dict[str, np.ndarray], Params]:
+    """Return n cars in all states a car can be in, and some beyond."""
+    random = np.random.default_rng(sum(map(ord, road)))
+    index = random.integers(0, len(ROADS[road]) - 1, n)
+    off = random.choice([0.0, 0.2, 0.45, 0.5, 3.0], n) * random.uniform(-1.0, 1.0, n)
+    columns, constants = drive(
+        road,
+        index,
+        off,
+        random.uniform(-180.0, 180.0, n) * random.choice([0.0, 0.1, 1.0], n),
+        speed=random.choice([0.0, 1.0, 4.0, 5.0], n),
+        steering_angle=random.uniform(-30.0, 30.0, n),
+        steps=random.integers(1, 400, n),
+        progress=random.choice([-0.5, 0.0, 100.0, 37.0, 80.0], n),
+        track_width=random.uniform(0.5, 1.4, n),
+        all_wheels_on_track=random.random(n) < 0.7,
+    )
+    # The last place on the line, where the service gives the closing point and its repetition.
+    pairs = columns["closest_waypoints"].copy()
+    pairs[:3] = len(ROADS[road]) - 1, 0
+    return {**columns, "closest_waypoints": pairs}, constants
+
+
+def config(name: str, **constants: float) -> RewardConfig:
+    return RewardConfig(name=name, file=None, constants=constants, time_limit_s=30.0)
+
+
+def zoo(name: str, n_cars: int, scalar: bool = False, **constants: float) -> RewardFunction:
+    source = load_reward_source(config(name, **constants))
+    if scalar:
+        text = source.text.replace("def reward_batch(", "def not_called(")
+        source = dataclasses.replace(source, text=text)
+    return RewardFunction(source, n_cars, 30.0, None)
+
+
+def pay(
+    name: str, road: str = "oval", *, at: int = 10, off: float = 0.0, turned: float = 0.0, **given: float
+) -> float:
+    """Return what one car gets."""
+    columns, constants = drive(road, np.array([at]), np.array([off]), np.array([turned]), **given)
+    return float(zoo(name, 1, scalar=True)(columns, constants, None)[0])
+
+
+@pytest.mark.parametrize("road", ROADS)
+@pytest.mark.parametrize("name", zoo_names())
+def test_every_reward_is_finite_in_every_state(name: str, road: str) -> None:
+    columns, constants = anywhere(road, 200)
+    rewards = zoo(name, 200)(columns, constants, None)
+    assert np.abs(rewards).max() < 1e4
+
+
+@pytest.mark.parametrize("road", ROADS)
+@pytest.mark.parametrize("name", STATELESS)
+def test_the_batch_formula_is_the_scalar_formula(name: str, road: str) -> None:
+    n = 4 if name == "racing_line" else 200  # each car's module works the line out anew
+    columns, constants = anywhere(road, n)
+    scalar = zoo(name, n, scalar=True)(columns, constants, None)
+    np.testing.assert_allclose(zoo(name, n)(columns, constants, None), scalar, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", STATELESS)
+def test_every_reward_but_one_has_a_batch_and_no_memory(name: str) -> None:
+    columns, constants = anywhere("oval", 8)
+    reward = zoo(name, 8)
+    assert "def reward_batch(" in reward.source.text
+    first = reward(columns, constants, None)
+    reward(anywhere("wavy", 8)[0], constants, None)
+    np.testing.assert_array_equal(reward(columns, constants, None), first)
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_every_reward_passes_the_rules_of_the_console(name: str) -> None:
+    text = load_reward_source(config(name)).text
+    words = [
+        "__import__",
+        "load",
+        "fromfile",
+        "genfromtxt",
+        "loadtxt",
+        "tofile",
+        "savez",
+        "save",
+        "savetxt",
+        "memmap",
+    ]
+    assert [word for word in words if word in text] == []
+    assert 1 <= len(text) <= 140_000
+    tree = ast.parse(text)
+    nodes = list(ast.walk(tree))
+    imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+    assert all(node in tree.body for node in imports)
+    modules = [a.name for node in imports if isinstance(node, ast.Import) for a in node.names] + [
+        str(node.module) for node in imports if isinstance(node, ast.ImportFrom)
+    ]
+    assert {module.split(".")[0] for module in modules} <= {"math", "random", "numpy", "scipy", "shapely"}
+    names = {node.id for node in nodes if isinstance(node, ast.Name)}
+    assert not names & {"open", "exec", "eval", "compile", "input", "print"}
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_every_reward_says_what_it_teaches_and_when_it_fails(name: str) -> None:
+    docstring = ast.get_docstring(ast.parse(load_reward_source(config(name)).text))
+    assert docstring is not None
+    assert docstring.startswith("Teaches ")
+    assert re.search(r"\bFails\b", docstring)
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_every_constant_has_an_effect(name: str) -> None:
+    columns, constants = anywhere("corner", 200)
+    # Two calls in a row, for the one that compares with the call before.
+    calls = [{**columns, "steps": np.full(200, i), "progress": columns["progress"] * i} for i in (1, 2)]
+
+    def rewards(**changed: float) -> list[np.ndarray]:
+        reward = zoo(name, 200, **changed)
+        return [reward(call, constants, None) for call in calls]
+
+    before = rewards()
+    for constant, value in load_reward_source(config(name)).constants.items():
+        assert not np.array_equal(rewards(**{constant: value * 0.75}), before), constant
+
+
+def test_every_reward_of_the_zoo_has_its_option_file() -> None:
+    assert sorted(file.stem for file in CONF.glob("*.yaml")) == zoo_names()
+    for name in zoo_names():
+        values = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+        assert RewardConfig(**values) == RewardConfig(name=name, file=None, constants={}, time_limit_s=5.0)
+
+
+def test_follow_center_line_pays_more_nearer_to_the_line() -> None:
+    assert (
+        pay("follow_center_line", off=0.0)
+        > pay("follow_center_line", off=-0.2)
+        > pay("follow_center_line", off=0.4)
+    )
+
+
+def test_stay_inside_borders_pays_for_the_margin_and_nothing_else() -> None:
+    inside = pay("stay_inside_borders", off=0.0)
+    assert inside == pay("stay_inside_borders", off=0.35, speed=4.0, turned=30.0)
+    assert inside > pay("stay_inside_borders", off=0.47, all_wheels_on_track=True)
+    assert inside > pay("stay_inside_borders", off=0.0, all_wheels_on_track=False)
+
+
+def test_prevent_zig_zag_pays_less_for_hard_steering_to_either_side() -> None:
+    calm = pay("prevent_zig_zag", steering_angle=10.0)
+    assert calm == pay("prevent_zig_zag", steering_angle=-10.0)
+    assert calm > pay("prevent_zig_zag", steering_angle=20.0) > pay("prevent_zig_zag", steering_angle=-30.0)
+
+
+def test_follow_waypoint_heading_pays_for_pointing_along_the_road() -> None:
+    along = pay("follow_waypoint_heading", turned=0.0)
+    assert along == pytest.approx(1.0)
+    assert along > pay("follow_waypoint_heading", turned=20.0) > pay("follow_waypoint_heading", turned=-50.0)
+    assert pay("follow_waypoint_heading", turned=180.0) < 0.01
+
+
+def test_speed_on_track_pays_for_speed_on_the_road_only() -> None:
+    assert (
+        pay("speed_on_track", speed=3.0) > pay("speed_on_track", speed=2.0) > pay("speed_on_track", speed=0.0)
+    )
+    assert pay("speed_on_track", speed=3.0, off=0.6) < 0.01
+
+
+def test_progress_per_step_pays_for_the_same_progress_in_fewer_steps() -> None:
+    assert pay("progress_per_step", steps=40) > pay("progress_per_step", steps=60)
+    assert pay("progress_per_step", progress=40) > pay("progress_per_step", progress=20)
+
+
+@pytest.mark.parametrize("road", ROADS)
+@pytest.mark.parametrize("off", [0.0, 0.38, 0.45, 0.7])
+def test_progress_gain_pays_strictly_more_for_being_faster_along_the_road(road: str, off: float) -> None:
+    for turned in (-80.0, 0.0, 45.0):
+        rewards = [pay("progress_gain", road, off=off, turned=turned, speed=v) for v in (0.0, 0.5, 1.0, 4.0)]
+        assert rewards == sorted(set(rewards))
+    assert pay("progress_gain", road, off=off, turned=5.0) > pay("progress_gain", road, off=off, turned=40.0)
+
+
+def test_progress_gain_takes_for_driving_back_and_for_the_border() -> None:
+    assert pay("progress_gain", turned=180.0) == pytest.approx(-2.0)
+    assert pay("progress_gain", off=0.2) == pytest.approx(2.0)
+    steps = [pay("progress_gain", off=off) for off in (0.3, 0.38, 0.45, 0.7)]
+    assert steps == sorted(steps, reverse=True)
+    assert steps[-1] < 0.0 < steps[-2]
+
+
+def test_steps_to_finish_pays_for_being_ahead_and_for_an_early_finish() -> None:
+    rewards = [pay("steps_to_finish", progress=50.0, steps=steps) for steps in (100, 150, 200)]
+    assert rewards == sorted(rewards, reverse=True)
+    assert rewards[1] == pytest.approx(1.0)
+    finish = [pay("steps_to_finish", progress=100.0, steps=steps) for steps in (200, 300, 400)]
+    assert finish == sorted(finish, reverse=True)
+    assert finish[-1] > max(rewards)
+
+
+def test_self_motivator_pays_for_pace_and_speed_on_the_road() -> None:
+    assert pay("self_motivator", speed=3.0) > pay("self_motivator", speed=2.0)
+    assert pay("self_motivator", steps=40) > pay("self_motivator", steps=60)
+    assert pay("self_motivator", off=0.6) < 0.01
+
+
+def test_center_speed_blend_pays_for_both() -> None:
+    assert pay("center_speed_blend", speed=3.0) > pay("center_speed_blend", speed=2.0)
+    assert pay("center_speed_blend", off=0.1) > pay("center_speed_blend", off=0.3)
+
+
+def test_progress_delta_adds_up_to_the_lap_less_the_time() -> None:
+    reward = zoo("progress_delta", 1)
+    for progress in (np.linspace(0.5, 100.0, 40), np.linspace(0.5, 60.0, 20)):  # two episodes
+        total = 0.0
+        for step, done in enumerate(progress):
+            columns, constants = drive(
+                "oval", np.array([5]), np.zeros(1), np.zeros(1), progress=done, steps=step + 2.0
+            )
+            total += float(reward(columns, constants, None)[0])
+        assert total == pytest.approx(progress[-1] - progress[0] - 0.05 * len(progress))
+
+
+def test_look_ahead_pays_most_for_the_arc_of_the_road() -> None:
+    # The circle's radius is 2 m: the arc needs atan(wheelbase / radius), to the left.
+    angles = np.arange(-30.0, 31.0)
+    rewards = [pay("look_ahead", "circle", steering_angle=angle) for angle in angles]
+    assert angles[int(np.argmax(rewards))] == pytest.approx(math.degrees(math.atan(0.164 / 2.0)), abs=1.0)
+    assert pay("look_ahead", off=0.3, steering_angle=-15.0) > pay("look_ahead", off=0.3, steering_angle=15.0)
+
+
+def test_slow_in_fast_out_pays_for_slow_before_a_corner_and_fast_after_it() -> None:
+    before, after = 20, 26  # waypoint 24 is the corner
+    assert pay("slow_in_fast_out", "corner", at=before, speed=1.2) > pay(
+        "slow_in_fast_out", "corner", at=before, speed=4.0
+    )
+    assert pay("slow_in_fast_out", "corner", at=after, speed=4.0) > pay(
+        "slow_in_fast_out", "corner", at=after, speed=1.2
+    )
+
+
+def racing_line(road: str) -> tuple[np.ndarray, ...]:
+    namespace: dict[str, Any] = {}
+    exec(load_reward_source(config("racing_line")).text, namespace)
+    return namespace["_work_out"](ROADS[road])
+
+
+@pytest.mark.parametrize("road", ROADS)
+def test_the_racing_line_stays_in_its_room(road: str) -> None:
+    x, y, direction, speed = racing_line(road)
+    dense = np.column_stack(
+        [np.interp(np.linspace(0, 1, 5000), np.linspace(0, 1, len(ROADS[road])), c) for c in ROADS[road].T]
+    )
+    distance = np.hypot(dense[:, 0, None] - x, dense[:, 1, None] - y).min(axis=0)
+    assert distance.max() < 0.31
+    np.testing.assert_allclose(np.hypot(*direction.T), 1.0)
+    assert speed.min() > 0.5
+    assert speed.max() <= 4.0
+
+
+def test_the_racing_line_is_slower_in_corners_and_brakes_before_them() -> None:
+    x, y, _, speed = racing_line("corner")
+    slowest = int(speed[: len(speed) // 2].argmin())
+    assert math.hypot(x[slowest] - 6.0, y[slowest]) < 1.5
+    gaps = np.hypot(np.diff(x), np.diff(y))
+    braking = (speed[:-1] ** 2 - speed[1:] ** 2) / (2.0 * gaps)
+    assert braking.max() < 3.0 * 1.3  # pace is measured over two points, not one
+
+
+def test_racing_line_pays_for_the_inside_of_a_corner_at_its_speed() -> None:
+    x, y, _, speed = racing_line("oval")
+    target = float(speed[np.hypot(x - 4.7, y).argmin()])
+    off = np.array([0.25, -0.25, 0.25, 0.25])
+    speeds = target + np.array([0.0, 0.0, -1.0, 1.0])
+    # Waypoint 0 is the tip of the oval, where it turns left most.
+    columns, constants = drive("oval", np.zeros(4, int), off, np.zeros(4), speed=speeds)
+    best, *others = zoo("racing_line", 4)(columns, constants, None)
+    assert best > max(others)

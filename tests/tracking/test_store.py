@@ -1,0 +1,77 @@
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepracer_exp.config.running import MLflowTracking
+from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.recorder import open_tracker
+from deepracer_exp.tracking.store import redact, resolve_store
+
+
+@pytest.mark.parametrize(
+    ("uri", "said"),
+    [
+        ("sqllite:///x.db", "did you mean sqlite?"),
+        ("ftp://host", "accepted: http(s)://host:port"),
+        ("./mlruns", "accepted: http(s)://host:port"),
+        ("file:///tmp/mlruns", "accepted: http(s)://host:port"),
+        ("http://", "no host"),
+        ("http://host:port", "accepted: http://host:port"),
+        ("sqlite://", "names no file"),
+        ("sqlite:///", "names no file"),
+        ("sqlite:///:memory:", "names no file"),
+        ("sqlite:////proc/none/mlflow.db", "folder /proc/none cannot be made"),
+        ("sqlite:////proc", "is a folder"),
+    ],
+)
+def test_a_uri_that_can_never_work_is_one_line_before_anything_starts(uri, said, tmp_path):
+    with pytest.raises(BadInput) as error:
+        open_tracker(MLflowTracking(kind="mlflow", uri=uri), tmp_path)
+    assert "tracking.uri=" in str(error.value)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_runs_dir_that_is_a_file_is_bad_input(tmp_path):
+    (tmp_path / "runs").write_text("")
+    with pytest.raises(BadInput, match="runs_dir"):
+        resolve_store(None, tmp_path / "runs")
+
+
+def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
+    with pytest.raises(BadInput, match=r"path with '\?'"):
+        resolve_store(None, tmp_path / "why?")
+
+
+def test_checking_a_uri_does_not_import_mlflow(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from deepracer_exp.tracking.recorder import *\n"
+        f"resolve_store(None, Path({str(tmp_path)!r}))\n"
+        "assert not {name for name in sys.modules if name.startswith(('mlflow', 'torch'))}"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+secret = st.text("abcXYZ0123%:!$", min_size=3).map(lambda text: f"s3cr3t{text}")
+
+
+@given(secret, st.sampled_from(["http://me:{}@host:5000/x", "postgresql://me:{}@host/db", "x://{}@h"]))
+def test_no_password_of_a_uri_is_shown(password, uri):
+    shown = redact(f"call of {uri.format(password)} failed")
+    assert password not in shown
+    assert "***@h" in shown
+
+
+def test_passwords_in_parameters_are_not_shown(tmp_path):
+    store = resolve_store("postgresql:///db?user=me&password=s3cr3t&host=/run/pg", tmp_path)
+    assert "s3cr3t" in store.uri
+    assert "s3cr3t" not in f"{store} {store!r} {store.shown}"
+    assert store.shown.endswith("&host=/run/pg")
+
+
+def test_a_relative_sqlite_file_means_the_same_after_a_change_of_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert resolve_store("sqlite:///a/b.db", tmp_path).sqlite_file == tmp_path / "a" / "b.db"

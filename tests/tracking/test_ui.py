@@ -1,0 +1,97 @@
+import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from mlflow import MlflowClient
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.names import METRICS, VIEW, run_params, run_tags
+from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.ui import existing_store, running_ui, runs_page, serve_ui
+
+NAMES = {
+    "track": "reinvent_base",
+    "reward": "progress_per_step",
+    "network": "mlp_small",
+    "action_space": "discrete_15",
+    "lr_schedule": "linear",
+}
+
+
+def record(store, runs_dir: Path, seed: int) -> str:
+    tracker = MLflowTracker(store)
+    tracker.start(
+        f"progress_per_step s{seed}",
+        "race",
+        run_params(NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}),
+        run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed)),
+    )
+    tracker.log({key: float(seed) for key in reversed(METRICS)}, 8192)
+    (runs_dir / "summary.json").write_text('{"seed": 1}')
+    tracker.log_artifact(runs_dir / "summary.json", "reports")
+    assert tracker.finish("FINISHED") == 0
+    assert tracker.run_id is not None
+    return tracker.run_id
+
+
+def test_a_port_in_use_is_bad_input_that_names_a_free_one(store, free_port):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", free_port))
+        taken.listen()
+        with pytest.raises(BadInput, match=rf"port={free_port}: already in use .*\d+ is free"):
+            running_ui(store, free_port).__enter__()
+
+
+def test_a_look_at_no_runs_says_to_train_first_and_creates_nothing(tmp_path):
+    with pytest.raises(BadInput, match="run `deepracer-exp train` first"):
+        existing_store(tmp_path / "runs", None)
+    with pytest.raises(BadInput, match=r"nothing\.db: no such file"):
+        existing_store(tmp_path / "runs", f"sqlite:///{tmp_path}/nothing.db")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_server_has_its_own_page(tmp_path):
+    announced: list[str] = []
+    serve_ui(tmp_path, "http://me:s3cr3t@tracking.example:5000", 5000, announced.append)
+    assert announced == ["http://***@tracking.example:5000"]
+
+
+@pytest.mark.slow
+def test_the_ui_shows_runs_by_name_and_opens_their_files(store, tmp_path, free_port):
+    run_ids = [record(store, tmp_path, seed) for seed in (1, 2)]
+    with running_ui(existing_store(tmp_path, None), free_port) as (url, _):
+        client = MlflowClient(tracking_uri=url)
+        experiment = client.get_experiment_by_name("race")
+        page = f"{url}/#/experiments/{experiment.experiment_id}/runs"
+        assert runs_page(url) == f"{page}?workflowType=machine_learning&viewStateShareKey={VIEW}"
+        runs = {run.info.run_id: run for run in client.search_runs([experiment.experiment_id])}
+        assert runs.keys() == set(run_ids)
+        for seed, run_id in enumerate(run_ids, start=1):
+            data = runs[run_id].data
+            assert data.metrics == dict.fromkeys(METRICS, float(seed))
+            assert data.params.items() >= {**NAMES, "seed": str(seed), "algorithm.lr": "0.0003"}.items()
+            assert data.tags.items() >= {**NAMES, "git_commit": "0123abc"}.items()
+            file = f"{url}/get-artifact?run_id={run_id}&path=reports/summary.json"
+            assert urllib.request.urlopen(file).read() == b'{"seed": 1}'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_the_ui_ends_with_its_command_and_leaves_no_process(store, tmp_path, free_port, signum, code):
+    script = (
+        "from pathlib import Path; from deepracer_exp.tracking.ui import serve_ui\n"
+        f"serve_ui(Path({str(tmp_path)!r}), None, {free_port}, lambda url: print(url, flush=True))"
+    )
+    command = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert command.stdout is not None
+    assert command.stdout.readline().startswith(f"http://127.0.0.1:{free_port}/")
+    (server,) = Path(f"/proc/{command.pid}/task/{command.pid}/children").read_text().split()
+    command.send_signal(signum)
+    assert command.wait(30) == code
+    with pytest.raises(ProcessLookupError):
+        os.killpg(int(server), 0)

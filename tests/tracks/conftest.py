@@ -1,0 +1,48 @@
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from pydantic import TypeAdapter
+
+from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.tracks.track import Track
+
+ROOT = Path(__file__).parents[2]
+
+
+@cache
+def compose_track(name: str, *overrides: str) -> TrackConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        composed = compose(overrides=[f"+track={name}", *overrides])
+    return TypeAdapter(TrackConfig).validate_python(OmegaConf.to_container(composed.track))
+
+
+@pytest.fixture(scope="session")
+def track_config() -> Callable[..., TrackConfig]:
+    return compose_track
+
+
+@pytest.fixture(scope="session")
+def catalogue_track() -> Callable[..., Track]:
+    return cache(lambda name, *overrides: Track.from_config(compose_track(name, *overrides)))
+
+
+@pytest.fixture(scope="session")
+def reference() -> Path:
+    path = ROOT / "../shared/reference"
+    if not path.is_dir():
+        pytest.skip("the recordings of the real service are not on this machine")
+    return path
+
+
+@pytest.fixture
+def ring() -> np.ndarray:
+    """Route rows of a 1 m wide circular course, counter-clockwise, centre radius 3 m, closed exactly."""
+    angle = np.linspace(0, 2 * np.pi, 61)[:-1]
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    rows = np.column_stack([3.0 * around, 2.5 * around, 3.5 * around])
+    return np.concatenate([rows, rows[:1]])
