@@ -45,7 +45,13 @@ SETTINGS: tuple[dict[str, Any], ...] = (
     *({"contact_time_s": 0.04, "substeps": n} for n in (4, 5)),
     # MuJoCo's own contact stiffness needs a step of at most 10 ms.
     *(
-        {"friction_cone": "pyramidal", "contact_time_s": 0.02, "contact_impedance": 0.9, "substeps": 10, **more}
+        {
+            "friction_cone": "pyramidal",
+            "contact_time_s": 0.02,
+            "contact_impedance": 0.9,
+            "substeps": 10,
+            **more,
+        }
         for more in ({}, {"solver_iterations": 8})
     ),
     {"wheel_contact": "ellipsoid"},
@@ -133,7 +139,9 @@ def measure(n_cars: int, rounds: int) -> list[dict[str, Any]]:
         rows.append(row)
         if driven is not None:
             timed.append((row, car))
-    for (row, _), cost in zip(timed, costs_us([car for _, car in timed], speed, steering, rounds), strict=True):
+    for (row, _), cost in zip(
+        timed, costs_us([car for _, car in timed], speed, steering, rounds), strict=True
+    ):
         row["us_per_step"] = cost
     return rows
 
@@ -150,7 +158,12 @@ PHYSICS_KEYS = (
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the rows as a Markdown table."""
-    head = ("setting (otherwise default)", "after 1 s: median, p90 (mm)", "after 10 s: median, p90 (mm)", "µs")
+    head = (
+        "setting (otherwise default)",
+        "after 1 s: median, p90 (mm)",
+        "after 10 s: median, p90 (mm)",
+        "µs",
+    )
     lines = [head, ("---", "---:", "---:", "---:")]
     for row in rows:
         errors = [
@@ -175,7 +188,9 @@ def main() -> None:
     rows = measure(options.cars, options.rounds)
     if not options.markdown:
         cores = len(os.sched_getaffinity(0))
-        sys.stdout.write(f"{options.cars} cars, {SECONDS} s; cost per control step and car, one of {cores} cores\n")
+        sys.stdout.write(
+            f"{options.cars} cars, {SECONDS} s; cost per control step and car, one of {cores} cores\n"
+        )
     sys.stdout.write(table(rows) + "\n")
     if options.json:
         options.json.write_text(json.dumps({"settings": rows}, indent=2) + "\n")

@@ -1,6 +1,7 @@
 """The command line; each command imports what it needs, so that `--help` answers at once."""
 
 import argparse
+import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -135,7 +136,14 @@ def _start_workers_early(wanted: bool) -> None:
 
     multiprocessing.set_start_method("forkserver", force=True)
     multiprocessing.set_forkserver_preload(["deepracer_exp.training.worker"])
+    # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
     forkserver.ensure_running()
+    if before is None:
+        del os.environ["OMP_NUM_THREADS"]
+    else:
+        os.environ["OMP_NUM_THREADS"] = before
 
 
 def _tell(outcome: "Outcome", ui: bool) -> None:

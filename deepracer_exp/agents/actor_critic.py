@@ -3,7 +3,12 @@
 import math
 
 import torch
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictModuleBase
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    InteractionType,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
 from torch import nn
 from torch.distributions import Categorical
 from torchrl.modules import MLP, ActorValueOperator, IndependentNormal, ProbabilisticActor, ValueOperator
@@ -41,6 +46,7 @@ class ActorCritic(nn.Module):
     def policy(self) -> TensorDictModuleBase:
         """What collectors carry: `observation` -> `action` and `action_log_prob`, on these very parameters.
 
+        It samples; `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action.
         A discrete action is an int64 index of shape [...], a continuous one two unbounded float32 numbers,
         which the environment clips to -1..1. The distribution's parameters are written beside them
         (`logits`, or `loc` and `scale`).
@@ -112,6 +118,8 @@ def _policy(in_key: str, layers: nn.Module, continuous: bool, initial_std: float
         # about 40 us of a 1 ms gradient step.
         distribution_kwargs={"validate_args": False},
         return_log_prob=True,
+        # The library's default is the mode: a policy called outside a collector would not explore.
+        default_interaction_type=InteractionType.RANDOM,
     )
 
 

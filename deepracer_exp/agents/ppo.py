@@ -120,7 +120,7 @@ class PPO:
             for _ in range(self._config.epochs)
             for minibatch in steps[self._shuffled(count)[: minibatches * size]].split(size)
         ]
-        # One transfer for the whole update: .item() per minibatch would wait for the device each time.
+        # One transfer for all metrics; only the test for finite numbers waits for each gradient step.
         table = torch.stack(results)
         policy_loss, value_loss, entropy, clip_fraction, _, grad_norm = table.mean(0).tolist()
         kl = table[-minibatches:, 4].mean().item()

@@ -17,7 +17,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from ..errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, nearest
+
 from .experiment import Experiment
 
 # Keys of these mappings are the user's own, so an override may add to them.

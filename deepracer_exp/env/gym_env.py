@@ -77,7 +77,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
     episode ended, `final_obs` with the mask `_final_obs`.
     """
 
-    metadata = {**_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata = {**_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's protocol
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         return race.observation, reward, terminated, truncated, infos
 
 
-def _spaces(race: Race) -> tuple[spaces.Box, spaces.Space[Any]]:
+def _spaces(race: Race) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     observation = spaces.Box(-np.inf, np.inf, (race.observation.shape[1],), np.float32)
     n_actions = race.setup.actions.n
     if n_actions is None:

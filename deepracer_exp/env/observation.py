@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..config.driving import ObservationConfig
+from deepracer_exp.config.driving import ObservationConfig
 
 
 def feature_names(config: ObservationConfig) -> tuple[str, ...]:

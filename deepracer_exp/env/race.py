@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from ..errors import RunFailed
-from ..formats.trace import PACKED, STATUS_CODE
-from ..sim.batch import CarBatch
-from ..tracks.progress import progress
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.formats.trace import PACKED, STATUS_CODE
+from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.tracks.progress import progress
+
 from .observation import Features
 from .prints import RewardPrints
 from .reward import RewardFunction
@@ -170,8 +171,8 @@ class Race:
     def _judge(self) -> None:
         self._progress, self._previous = progress(self._projection.ndist, self._start_ndist, self._previous)
         wheels_on = self._wheels_on_road()
-        self._all_wheels_on = wheels_on.all(axis=1)
-        self._off_track = ~wheels_on.any(axis=1)
+        self._all_wheels_on: np.ndarray = np.asarray(wheels_on.all(axis=1))
+        self._off_track: np.ndarray = np.asarray(~wheels_on.any(axis=1))
         moved_m = np.hypot(*(self._front - self._last_front).T)
         status = self._rules.judge(self._steps, self._progress, self._last_progress, moved_m, self._off_track)
         self._last_progress = self._progress
@@ -190,7 +191,7 @@ class Race:
 
     def _pay(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
         projection = self._projection
-        params = {
+        params: dict[str, np.ndarray] = {
             "all_wheels_on_track": self._all_wheels_on,
             "x": self._front[:, 0],
             "y": self._front[:, 1],

@@ -8,7 +8,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ..formats.trace import PACKED
+from deepracer_exp.formats.trace import PACKED
+
 from .race import Race
 
 

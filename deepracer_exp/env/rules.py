@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..config.driving import EpisodeConfig
-from ..formats.trace import STATUS_CODE
+from deepracer_exp.config.driving import EpisodeConfig
+from deepracer_exp.formats.trace import STATUS_CODE
 
 
 class EpisodeRules:

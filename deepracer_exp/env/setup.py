@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
-from ..config.car import CarConfig
-from ..config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
-from ..config.experiment import Experiment
-from ..tracks.track import Track
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.tracks.track import Track
+
 from .action_space import ActionSpace, build_action_space
 from .reward_source import RewardSource, load_reward_source
 

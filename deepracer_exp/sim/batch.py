@@ -104,7 +104,7 @@ class CarBatch:
         speed = np.clip(speed_mps, self.car.min_speed_mps, self.car.max_speed_mps)
         steering = np.clip(steering_rad, -self._max_steering_rad, self._max_steering_rad)
         # MuJoCo replaces a control that is not finite by zero, for all actuators of that car.
-        _require_finite("command", speed + steering)
+        _require_finite("command", np.isfinite(speed) & np.isfinite(steering))
         if moving is not None:
             speed, steering = speed * moving, steering * moving
         self._ctrl[:, self._servos] = steering[:, None]
@@ -113,7 +113,8 @@ class CarBatch:
             self._batch.step(nstep=self.car.substeps)
         except mujoco.batch.SimulationError as error:
             raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
-        _require_finite("physics state", self._qpos.sum(axis=1) + self._qvel.sum(axis=1))
+        finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
+        _require_finite("physics state", finite)
 
     def read(self) -> CarState:
         """Return position and motion of all cars."""
@@ -200,8 +201,7 @@ class CarBatch:
         return row, pose
 
 
-def _require_finite(what: str, sums: Floats) -> None:
-    """Raise RunFailed for the first car whose sum of numbers is NaN or infinite."""
-    finite = np.isfinite(sums)
+def _require_finite(what: str, finite: NDArray[np.bool_]) -> None:
+    """Raise RunFailed for the first car that is not finite."""
     if not finite.all():
         raise RunFailed(f"car {int(np.argmin(finite))}: {what} is not finite")

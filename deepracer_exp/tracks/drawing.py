@@ -107,7 +107,9 @@ def draw_picture(track: Track, path: str | Path) -> None:
     axes.scatter(dots_x, dots_y, s=(2.2 * border_pt) ** 2, color=line, zorder=4)
     border = _roomier_border(track)[tenth]
     aside = border - track.waypoints[tenth]
-    labels = border + LABEL_PT / points_per_m * aside / np.linalg.norm(aside, axis=1, keepdims=True).clip(1e-9)
+    labels = border + LABEL_PT / points_per_m * aside / np.linalg.norm(aside, axis=1, keepdims=True).clip(
+        1e-9
+    )
     for index, (x, y) in zip(tenth, labels, strict=True):
         axes.text(x, y, str(index), color=line, fontsize=8, ha="center", va="center")
 

@@ -7,6 +7,8 @@ from deepracer_exp.errors import BadInput
 
 SPACING_M = 0.15
 """Distance between two rows, as in AWS's worlds of 2018 and 2019."""
+MOST_ROWS = 4000
+"""Rows a course has at most; a course longer than 600 m gets them farther apart."""
 LONGEST_FOLD = 8.0
 """Length of a border's fold, in road widths, up to which it counts as the inside of a tight bend."""
 
@@ -42,7 +44,7 @@ def rows_from_knots(knots: np.ndarray, width_m: np.ndarray, closed: bool) -> np.
     fine = np.linspace(0.0, at[-1], 100 * len(knots) + 1)
     step_m = np.linalg.norm(np.diff(spline(fine)[:, :2], axis=0), axis=1)
     distance_m = np.r_[0.0, np.cumsum(step_m)]
-    rows = max(8, round(distance_m[-1] / SPACING_M))
+    rows = min(max(8, round(distance_m[-1] / SPACING_M)), MOST_ROWS)
     at_rows = np.interp(np.linspace(0.0, distance_m[-1], rows + 1), distance_m, fine)
 
     center, half_m = spline(at_rows)[:, :2], spline(at_rows)[:, 2:] / 2
@@ -76,8 +78,10 @@ def unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
     """
     border = border.copy()
     last = len(border) - 1
-    while (crossing := _first_crossing(border, closed)) is not None:
+    begin = 0
+    while (crossing := _first_crossing(border, closed, begin)) is not None:
         i, j, point = crossing
+        begin = i
         step_m = np.linalg.norm(np.diff(border, axis=0), axis=1)
         between_m = step_m[i:j].sum()
         if between_m <= longest_m:
@@ -85,6 +89,7 @@ def unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
         elif closed and step_m.sum() - between_m <= longest_m:
             border[j + 1 :] = point
             border[: i + 1] = point
+            begin = 0
         else:
             x, y = point
             raise BadInput(
@@ -96,11 +101,11 @@ def unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
     return border
 
 
-def _first_crossing(border: np.ndarray, closed: bool) -> tuple[int, int, np.ndarray] | None:
-    """Return the first pair of segments that cross inside both, and the crossing point."""
+def _first_crossing(border: np.ndarray, closed: bool, begin: int) -> tuple[int, int, np.ndarray] | None:
+    """Return the first pair of segments from `begin` on that cross inside both, and where they cross."""
     a, d = border[:-1], np.diff(border, axis=0)
     count = len(a)
-    for i in range(count - 2):
+    for i in range(begin, count - 2):
         j = np.arange(i + 2, count - 1 if closed and i == 0 else count)
         gap = a[j] - a[i]
         turn = d[i, 0] * d[j, 1] - d[i, 1] * d[j, 0]

@@ -1,6 +1,6 @@
 """How much of its budget a run has used."""
 
-from ..config.running import BudgetConfig
+from deepracer_exp.config.running import BudgetConfig
 
 
 class Budget:

@@ -1,14 +1,13 @@
 """Checkpoints of a run: the best and the last."""
 
 import contextlib
-import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 from torchrl.checkpoint import Checkpoint
 
-from ..agents.ppo import PPO
+from deepracer_exp.agents.ppo import PPO
 
 
 class CheckpointStore:
@@ -53,10 +52,10 @@ class CheckpointStore:
         with contextlib.suppress(FileNotFoundError):
             aside.unlink()
         aside.symlink_to(name, target_is_directory=True)
-        os.replace(aside, self.folder / label)
+        aside.replace(self.folder / label)
 
     def _prune(self) -> None:
-        kept = {os.readlink(path) for path in self.folder.iterdir() if path.is_symlink()}
+        kept = {str(path.readlink()) for path in self.folder.iterdir() if path.is_symlink()}
         for path in self.folder.iterdir():
             if path.is_dir() and not path.is_symlink() and path.name not in kept:
                 shutil.rmtree(path)

@@ -13,9 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 
-from ..config.running import CollectorConfig
-from ..env.setup import RaceSetup
-from ..errors import RunFailed
+from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed
+
 from .faults import read_fault
 from .watchdog import Watchdog
 from .worker import EnvFactory
@@ -147,7 +148,7 @@ class Collection:
     def _loss(self) -> RunFailed | None:
         """Return what became of the first lost worker, None if all are there."""
         assert self._watchdog is not None
-        for worker, process in enumerate(self._collector.procs):
+        for worker in range(len(self._collector.procs)):
             fault = read_fault(self._run_dir, worker)
             if fault is not None:
                 return RunFailed(fault)

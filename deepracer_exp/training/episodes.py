@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..env.race import CONTROL_PERIOD_S
-from ..formats.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.race import CONTROL_PERIOD_S
+from deepracer_exp.formats.trace import PACKED, STATUS_CODE
 
 
 @dataclass(frozen=True)

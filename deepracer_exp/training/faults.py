@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..env.race import Race
-from ..errors import RunFailed
+from deepracer_exp.env.race import Race
+from deepracer_exp.errors import RunFailed
 
 FAULTS_DIR = "faults"
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ..formats.trace import read_trace
-from ..tracks.track import Track
+from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.tracks.track import Track
 
 
 def write_report(run_dir: Path, track: Track) -> None:
@@ -11,7 +11,7 @@ def write_report(run_dir: Path, track: Track) -> None:
     # Half a second of import that no training waits for.
     import pandas as pd
 
-    from ..analysis.figures import LINE_COLUMNS, driven_line, learning_curves
+    from deepracer_exp.analysis.figures import LINE_COLUMNS, driven_line, learning_curves
 
     metrics_file = run_dir / "metrics.jsonl"
     if not metrics_file.is_file():

@@ -15,19 +15,20 @@ import torch
 from rich.console import Console
 from tensordict import TensorDictBase
 
-from ..agents.actor_critic import build_actor_critic
-from ..agents.ppo import PPO, UpdateMetrics
-from ..agents.schedules import Schedule
-from ..config.compose import Composition
-from ..config.experiment import Experiment
-from ..config.learning import AlgorithmConfig
-from ..config.running import ReliableStopping
-from ..env.observation import feature_names
-from ..env.setup import build_setup
-from ..errors import RunFailed
-from ..formats.trace import TraceWriter, to_table
-from ..tracking.names import run_params, run_tags
-from ..tracking.recorder import open_tracker
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.ppo import PPO, UpdateMetrics
+from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.config.compose import Composition
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import AlgorithmConfig
+from deepracer_exp.config.running import ReliableStopping
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.formats.trace import TraceWriter, to_table
+from deepracer_exp.tracking.names import run_params, run_tags
+from deepracer_exp.tracking.recorder import open_tracker
+
 from .budget import Budget
 from .checkpoints import CheckpointStore
 from .collection import Collection, worker_count
@@ -77,7 +78,8 @@ class Training:
         commit = self.folder.describe(composition, self.setup.reward, experiment.seed)
         self._log_file = _log_to(self.folder.path / "log.txt")
         self._tracker.start(
-            self.folder.name,
+            # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
+            f"{self.names['reward']} s{experiment.seed} {time.strftime('%H:%M:%S')}",
             experiment.name,
             run_params(self.names, composition.mapping),
             run_tags(self.names, commit, self.setup.reward.sha256, self.folder.path.resolve()),
@@ -89,6 +91,9 @@ class Training:
         self.checkpoints = CheckpointStore(self.folder.path)
         self.trace = TraceWriter(self.folder.path / "trace")
         self.display = ProgressDisplay(console, self._header())
+        # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
+        # update took 25 times as long.
+        torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
         actor_critic = build_actor_critic(
             experiment.network, len(feature_names(experiment.observation)), self.setup.actions.n, generator

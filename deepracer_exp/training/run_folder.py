@@ -2,7 +2,6 @@
 
 import datetime
 import json
-import os
 import platform
 import re
 import subprocess
@@ -13,9 +12,10 @@ from typing import Any
 
 import psutil
 
-from ..config.compose import Composition
-from ..env.reward_source import RewardSource, source_with_constants
-from ..errors import BadInput
+from deepracer_exp.config.compose import Composition
+from deepracer_exp.env.reward_source import RewardSource, source_with_constants
+from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.store import redact
 
 _PACKAGES = ("deepracer-exp", "torch", "torchrl", "tensordict", "mujoco", "hydra-core", "mlflow", "numpy")
 
@@ -45,8 +45,9 @@ class RunFolder:
 
     def describe(self, composition: Composition, reward: RewardSource, seed: int) -> str | None:
         """Write the configuration and where code and reward come from; return the git commit if there is one."""
-        self.write("config.yaml", composition.yaml())
-        self.write("overrides.yaml", "".join(f"- {json.dumps(o)}\n" for o in composition.overrides) or "[]\n")
+        self.write("config.yaml", redact(composition.yaml()))
+        overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
+        self.write("overrides.yaml", redact(overrides) or "[]\n")
         self.write("reward_function.py", source_with_constants(reward))
         commit = git_commit()
         provenance = {
@@ -59,7 +60,7 @@ class RunFolder:
                 "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
             },
             "reward": {"name": reward.name, "path": str(reward.path), "sha256": reward.sha256},
-            "command": sys.argv[1:],
+            "command": [redact(argument) for argument in sys.argv[1:]],
         }
         self.write("provenance.json", json.dumps(provenance, indent=2) + "\n")
         return commit
@@ -74,8 +75,7 @@ class RunFolder:
         path = self.path / name
         aside = self.path / f".{name}.tmp"
         aside.write_text(text, encoding="utf-8")
-        os.replace(aside, path)
-        return path
+        return aside.replace(path)
 
 
 def git_commit() -> str | None:

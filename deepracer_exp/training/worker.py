@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..env.prints import RewardPrints
-from ..env.race import Race
-from ..env.race_env import RaceEnv
-from ..env.setup import RaceSetup
-from ..errors import RunFailed
+from deepracer_exp.env.prints import RewardPrints
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed
+
 from .faults import write_fault
 
 PRINTS_FILE = "reward_prints.log"
@@ -52,10 +53,10 @@ class EnvFactory:
         if self.heartbeat is None:
             return RaceEnv(race)
         _obey_parent_only()
-        return _WorkerEnv(race, self._beat(), self.run_dir, self.worker)
+        return _WorkerEnv(race, self._beat(self.heartbeat), self.run_dir, self.worker)
 
-    def _beat(self) -> Callable[[], None]:
-        beats = np.memmap(self.heartbeat, np.int64, "r+")
+    def _beat(self, heartbeat: Path) -> Callable[[], None]:
+        beats = np.memmap(heartbeat, np.int64, "r+")
         worker = self.worker
         beats[worker] = 0
 

@@ -77,6 +77,12 @@ def test_a_new_continuous_policy_is_centred_with_the_initial_std(shared):
     torch.testing.assert_close(driven["scale"], torch.full((100, 2), 0.3))
 
 
+@pytest.mark.parametrize(("shared", "actions"), KINDS)
+def test_the_policy_explores_unless_told_otherwise(shared, actions):
+    policy = build(shared, actions).policy
+    assert not torch.equal(policy(steps(50))["action"], policy(steps(50))["action"])
+
+
 def test_exploitation_takes_the_likeliest_action():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         discrete, continuous = build().policy(steps(50)), build(actions=None).policy(steps(50))

@@ -52,7 +52,8 @@ def drive(networks: ActorCritic, cars: int = 8, length: int = 32, seed: int = 0)
     generator = torch.Generator().manual_seed(seed)
     observation = torch.randn(cars, length + 1, 4, generator=generator)
     batch = TensorDict({"observation": observation[:, :-1]}, [cars, length])
-    torch.manual_seed(seed)
+    # Another seed than the observations': the action noise must not be a copy of them.
+    torch.manual_seed(seed + 1000)
     with torch.no_grad():
         networks.policy(batch)
     if batch["action"].dtype == torch.int64:
@@ -93,11 +94,11 @@ def parameters(networks: ActorCritic) -> torch.Tensor:
 @pytest.mark.parametrize(("shared", "actions"), KINDS)
 def test_it_learns_to_take_the_action_that_pays(shared, actions):
     networks, ppo = make(shared, actions)
-    rewards = train(networks, ppo, 30)
+    rewards = train(networks, ppo, 20)
     if actions:
         assert rewards[0] < 0.5 < 0.7 < sum(rewards[-3:]) / 3
     else:
-        assert sum(rewards[-3:]) / 3 > 0.6 * rewards[0]
+        assert rewards[0] < -1.2 < -0.5 < sum(rewards[-3:]) / 3
 
 
 @pytest.mark.parametrize(("shared", "actions"), KINDS)
