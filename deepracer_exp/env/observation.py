@@ -4,6 +4,8 @@ import numpy as np
 
 from deepracer_exp.config.driving import ObservationConfig
 
+from .measures import Measures
+
 
 def feature_names(config: ObservationConfig) -> tuple[str, ...]:
     """Return the names of the features, in their order."""
@@ -44,45 +46,29 @@ class Features:
         return ndist[:, None] + self._ahead_ndist
 
     def compute(
-        self,
-        front: np.ndarray,
-        yaw_rad: np.ndarray,
-        offset_m: np.ndarray,
-        half_width_m: np.ndarray,
-        heading_error_rad: np.ndarray,
-        speed_mps: np.ndarray,
-        yaw_rate_radps: np.ndarray,
-        steering_deg: np.ndarray,
-        commanded_mps: np.ndarray,
-        road: np.ndarray,
+        self, now: Measures, steering_deg: np.ndarray, commanded_mps: np.ndarray, road: np.ndarray
     ) -> np.ndarray:
         """Return the features, shape (N, size), float32.
 
         Args:
-            front: front points (N, 2) in metres.
-            yaw_rad: yaw of the cars (N,).
-            offset_m: signed distance from the centre line (N,), positive to the left.
-            half_width_m: half the road's width (N,).
-            heading_error_rad: yaw minus the centre line's heading (N,).
-            speed_mps: measured forward speed (N,).
-            yaw_rate_radps: measured yaw rate (N,).
+            now: poses against the track.
             steering_deg: last commanded steering (N,).
             commanded_mps: last commanded speed (N,).
-            road: centre-line points at `ahead(ndist)`, shape (N, K, 2).
+            road: centre-line points at `ahead(now.ndist)`, shape (N, K, 2).
         """
         config = self._config
-        out = np.empty((len(front), self.size), np.float32)
-        out[:, 0] = offset_m / half_width_m
-        out[:, 1] = np.sin(heading_error_rad)
-        out[:, 2] = np.cos(heading_error_rad)
-        out[:, 3] = speed_mps / config.speed_scale_mps
-        out[:, 4] = yaw_rate_radps / config.yaw_rate_scale_radps
+        out = np.empty((len(now.front), self.size), np.float32)
+        out[:, 0] = 2 * now.offset_m / now.track_width_m
+        out[:, 1] = np.sin(now.heading_error_rad)
+        out[:, 2] = np.cos(now.heading_error_rad)
+        out[:, 3] = now.speed_mps / config.speed_scale_mps
+        out[:, 4] = now.yaw_rate_radps / config.yaw_rate_scale_radps
         out[:, 5] = steering_deg / self._steering_max_deg
         out[:, 6] = commanded_mps / self._speed_max_mps
-        dx = road[:, :, 0] - front[:, None, 0]
-        dy = road[:, :, 1] - front[:, None, 1]
-        cos = np.cos(yaw_rad)[:, None] / config.lookahead_scale_m
-        sin = np.sin(yaw_rad)[:, None] / config.lookahead_scale_m
+        dx = road[:, :, 0] - now.front[:, None, 0]
+        dy = road[:, :, 1] - now.front[:, None, 1]
+        cos = np.cos(now.yaw_rad)[:, None] / config.lookahead_scale_m
+        sin = np.sin(now.yaw_rad)[:, None] / config.lookahead_scale_m
         out[:, 7::2] = dx * cos + dy * sin
         out[:, 8::2] = dy * cos - dx * sin
         return out

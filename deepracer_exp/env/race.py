@@ -4,9 +4,10 @@ import numpy as np
 
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.formats.trace import PACKED, STATUS_CODE
-from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.sim.batch import CarBatch, CarState
 from deepracer_exp.tracks.progress import progress
 
+from .measures import Measures
 from .observation import Features
 from .prints import RewardPrints
 from .reward import RewardFunction
@@ -16,8 +17,6 @@ from .streams import CarStreams
 
 CONTROL_PERIOD_S = 1 / 15
 """Seconds between two actions: the camera's rate (deepracer-simapp)."""
-
-_RUNNING = (STATUS_CODE["prepare"], STATUS_CODE["in_progress"])
 
 
 class NonFinite(RunFailed):
@@ -130,8 +129,7 @@ class Race:
         self._rules.reset(ids)
         x, y, yaw = self.setup.track.start_pose(start_ndist)
         self._batch.place(ids, x, y, yaw)
-        self._observe()
-        self._last_front[ids] = self._front[ids]
+        self._observe_started(ids)
 
     def step(self, action: np.ndarray) -> None:
         """Judge the poses, pay the rewards and move the cars on by one control period.
@@ -152,7 +150,7 @@ class Race:
         self._judge()
         self._pay(steering_deg, speed_mps, running)
         self._write_trace(action, steering_deg, speed_mps)
-        self._last_front = self._front
+        self._last_front = self._now.front
         self._drive(steering_deg, speed_mps, running)
         self._observe()
         if not np.isfinite(self.observation).all():
@@ -169,42 +167,44 @@ class Race:
         }
 
     def _judge(self) -> None:
-        self._progress, self._previous = progress(self._projection.ndist, self._start_ndist, self._previous)
+        now = self._now
+        self._progress, self._previous = progress(now.ndist, self._start_ndist, self._previous)
         wheels_on = self._wheels_on_road()
         self._all_wheels_on: np.ndarray = np.asarray(wheels_on.all(axis=1))
         self._off_track: np.ndarray = np.asarray(~wheels_on.any(axis=1))
-        moved_m = np.hypot(*(self._front - self._last_front).T)
+        moved_m = np.hypot(*(now.front - self._last_front).T)
         status = self._rules.judge(self._steps, self._progress, self._last_progress, moved_m, self._off_track)
         self._last_progress = self._progress
         self.truncated = status == STATUS_CODE["time_up"]
-        self.terminated = ~(np.isin(status, _RUNNING) | self.truncated)
+        self.terminated = (status > STATUS_CODE["in_progress"]) & ~self.truncated
         self._status = status
 
     def _wheels_on_road(self) -> np.ndarray:
         """Return which wheel centres are on the road, (N, 4); flat, from x, y and yaw, as the service's log has."""
-        cos, sin = np.cos(self._car.yaw_rad)[:, None], np.sin(self._car.yaw_rad)[:, None]
+        now = self._now
+        cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
         wheel_x, wheel_y = self._wheels.T
         points = np.empty((self.n_cars, len(self._wheels), 2))
-        points[:, :, 0] = self._car.x_m[:, None] + cos * wheel_x - sin * wheel_y
-        points[:, :, 1] = self._car.y_m[:, None] + sin * wheel_x + cos * wheel_y
+        points[:, :, 0] = now.x_m[:, None] + cos * wheel_x - sin * wheel_y
+        points[:, :, 1] = now.y_m[:, None] + sin * wheel_x + cos * wheel_y
         return self.setup.track.on_road(points.reshape(-1, 2)).reshape(self.n_cars, -1)
 
     def _pay(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
-        projection = self._projection
+        now = self._now
         params: dict[str, np.ndarray] = {
             "all_wheels_on_track": self._all_wheels_on,
-            "x": self._front[:, 0],
-            "y": self._front[:, 1],
-            "heading": np.degrees(self._car.yaw_rad),
-            "distance_from_center": projection.distance_m,
-            "projection_distance": projection.ndist * self.setup.track.length_m,
+            "x": now.front[:, 0],
+            "y": now.front[:, 1],
+            "heading": np.degrees(now.yaw_rad),
+            "distance_from_center": now.distance_m,
+            "projection_distance": now.ndist * self.setup.track.length_m,
             "progress": self._progress,
             "steps": self._steps.astype(np.float64),
             "speed": speed_mps,
             "steering_angle": steering_deg,
-            "track_width": self._track_width_m,
-            "closest_waypoints": np.stack([projection.previous, projection.next], axis=1),
-            "is_left_of_center": self._is_left,
+            "track_width": now.track_width_m,
+            "closest_waypoints": now.closest_waypoints,
+            "is_left_of_center": now.is_left,
             "is_offtrack": self._off_track,
             "sim_time": self._clock_steps * CONTROL_PERIOD_S,
         }
@@ -212,17 +212,13 @@ class Race:
         self._return += self.reward
 
     def _write_trace(self, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray) -> None:
-        projection, car = self._projection, self._car
-        row = self.trace
-        waypoints = self.setup.track.waypoints
-        to_previous = np.hypot(*(self._front - waypoints[projection.previous]).T)
-        to_next = np.hypot(*(self._front - waypoints[projection.next]).T)
+        now, row = self._now, self.trace
         for name, values in (
             ("episode", self._episode),
             ("steps", self._steps),
-            ("X", self._front[:, 0]),
-            ("Y", self._front[:, 1]),
-            ("yaw", np.degrees(car.yaw_rad)),
+            ("X", now.front[:, 0]),
+            ("Y", now.front[:, 1]),
+            ("yaw", np.degrees(now.yaw_rad)),
             ("steer", steering_deg),
             ("throttle", speed_mps),
             ("action", action if action.ndim == 1 else np.nan),
@@ -230,16 +226,23 @@ class Race:
             ("done", self.terminated | self.truncated),
             ("all_wheels_on_track", self._all_wheels_on),
             ("progress", self._progress),
-            ("closest_waypoint", np.where(to_next < to_previous, projection.next, projection.previous)),
+            ("closest_waypoint", self._nearer_waypoint()),
             ("tstamp", self._clock_steps * CONTROL_PERIOD_S),
             ("episode_status", self._status),
-            ("speed_mps", car.speed_mps),
-            ("yaw_rate_radps", car.yaw_rate_radps),
-            ("offset_m", projection.offset_m),
-            ("heading_error_rad", self._heading_error_rad),
+            ("speed_mps", now.speed_mps),
+            ("yaw_rate_radps", now.yaw_rate_radps),
+            ("offset_m", now.offset_m),
+            ("heading_error_rad", now.heading_error_rad),
             ("episode_return", self._return),
         ):
             row[:, PACKED[name]] = values
+
+    def _nearer_waypoint(self) -> np.ndarray:
+        """Return the nearer of the two closest waypoints, the one behind where they are equally far."""
+        closest = self._now.closest_waypoints
+        away = self.setup.track.waypoints[closest] - self._now.front[:, None]
+        behind_m, ahead_m = np.hypot(away[..., 0], away[..., 1]).T
+        return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
 
     def _drive(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
         self._steering_deg = np.where(running, steering_deg, 0.0)
@@ -252,28 +255,30 @@ class Race:
         self._batch.drive(sent_mps, np.radians(sent_deg), moving=running)
 
     def _observe(self) -> None:
-        """Read the cars' poses and measure them against the track."""
-        track = self.setup.track
-        self._car = car = self._batch.read()
-        ahead_m = self.setup.car.front_point_m
-        self._front = np.stack(
-            [car.x_m + ahead_m * np.cos(car.yaw_rad), car.y_m + ahead_m * np.sin(car.yaw_rad)], axis=1
-        )
-        self._projection = projection = track.project(self._front)
-        self._track_width_m, self._is_left = track.border_distances(self._front, projection.center)
-        error = car.yaw_rad - projection.heading_rad
-        self._heading_error_rad = np.mod(error + np.pi, 2 * np.pi) - np.pi
-        self.observation = self._features.compute(
-            self._front,
-            car.yaw_rad,
-            projection.offset_m,
-            self._track_width_m / 2,
-            self._heading_error_rad,
-            car.speed_mps,
-            car.yaw_rate_radps,
-            self._steering_deg,
-            self._commanded_mps,
-            track.points_at(self._features.ahead(projection.ndist)),
+        """Measure all cars, and compute what the policy sees of them."""
+        self._now = Measures.of(self._batch.read(), self.setup.car.front_point_m, self.setup.track)
+        self.observation = self._features_of(self._now, self._everyone)
+
+    def _observe_started(self, ids: np.ndarray) -> None:
+        """The same for the cars `ids` alone: at nearly every step some car of many starts an episode."""
+        if len(ids) == self.n_cars:
+            self._observe()
+            self._last_front = self._now.front.copy()
+            return
+        car = CarState(*(values[ids] for values in self._batch.read()))
+        started = Measures.of(car, self.setup.car.front_point_m, self.setup.track)
+        self._now.replace(ids, started)
+        self._last_front[ids] = started.front
+        # The terminal observation has been handed out; it must stay as it was.
+        self.observation = self.observation.copy()
+        self.observation[ids] = self._features_of(started, ids)
+
+    def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
+        return self._features.compute(
+            measures,
+            self._steering_deg[ids],
+            self._commanded_mps[ids],
+            self.setup.track.points_at(self._features.ahead(measures.ndist)),
         )
 
     def _non_finite(self, action: np.ndarray) -> NonFinite:

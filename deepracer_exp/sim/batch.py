@@ -60,6 +60,8 @@ class CarBatch:
         self._rows: Floats = self._batch.state
         self._qpos: Floats = self._batch.bind("qpos")
         self._qvel: Floats = self._batch.bind("qvel")
+        # Position and velocity lie side by side in a row, after the time.
+        self._moving: Floats = self._rows[:, 1 : 1 + self.model.nq + self.model.nv]
         self._ctrl: Floats = self._batch.bind("ctrl")
         self._rest_row, self._rest_qpos = self._settle()
         self._max_steering_rad = np.deg2rad(car.max_steering_deg)
@@ -101,20 +103,18 @@ class CarBatch:
             RunFailed: a command or a car's state is not finite, or MuJoCo gave up on a car; the message
                 names the first such car. `state` still holds what it was then.
         """
-        speed = np.clip(speed_mps, self.car.min_speed_mps, self.car.max_speed_mps)
-        steering = np.clip(steering_rad, -self._max_steering_rad, self._max_steering_rad)
-        # MuJoCo replaces a control that is not finite by zero, for all actuators of that car.
-        _require_finite("command", np.isfinite(speed) & np.isfinite(steering))
-        if moving is not None:
-            speed, steering = speed * moving, steering * moving
+        speed, steering = np.asarray(speed_mps, np.float64), np.asarray(steering_rad, np.float64)
+        # MuJoCo would replace such a control by zero, and with it all controls of that car.
+        _require_finite("command", np.isfinite(np.stack([speed, steering], axis=-1)))
+        speed = np.clip(speed, self.car.min_speed_mps, self.car.max_speed_mps)
+        steering = np.clip(steering, -self._max_steering_rad, self._max_steering_rad)
         self._ctrl[:, self._servos] = steering[:, None]
         self._ctrl[:, self._motors] = (speed / self.car.drive_radius_m)[:, None]
         try:
             self._batch.step(nstep=self.car.substeps)
         except mujoco.batch.SimulationError as error:
             raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
-        finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
-        _require_finite("physics state", finite)
+        _require_finite("physics state", np.isfinite(self._moving))
 
     def read(self) -> CarState:
         """Return position and motion of all cars."""
@@ -202,6 +202,6 @@ class CarBatch:
 
 
 def _require_finite(what: str, finite: NDArray[np.bool_]) -> None:
-    """Raise RunFailed for the first car that is not finite."""
+    """Raise RunFailed for the first car, (N, k), of which a number is not finite."""
     if not finite.all():
-        raise RunFailed(f"car {int(np.argmin(finite))}: {what} is not finite")
+        raise RunFailed(f"car {int(np.argmin(finite.all(axis=1)))}: {what} is not finite")

@@ -1,0 +1,72 @@
+"""Where cars are, measured against the track."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.sim.batch import CarState
+from deepracer_exp.tracks.track import Track
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Measures:
+    """Poses and what the track says of them; arrays with one row per car.
+
+    All geometry is that of the car's front point, as on the service (deepracer-simapp: model origin + 0.14 m).
+    """
+
+    x_m: Floats
+    """Chassis origin."""
+    y_m: Floats
+    yaw_rad: Floats
+    speed_mps: Floats
+    yaw_rate_radps: Floats
+    front: Floats
+    """Front point, (N, 2)."""
+    ndist: Floats
+    """Projection on the centre line over its length."""
+    distance_m: Floats
+    """From the centre line."""
+    offset_m: Floats
+    """The same, positive to the left."""
+    closest_waypoints: NDArray[np.int64]
+    """The one behind and the one ahead, (N, 2)."""
+    heading_error_rad: Floats
+    """Yaw against the centre line's heading, -pi to pi."""
+    track_width_m: Floats
+    is_left: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, car: CarState, front_point_m: float, track: Track) -> "Measures":
+        """Measure cars against `track`; `front_point_m` is how far ahead of the origin the front point is."""
+        front = np.empty((len(car.x_m), 2))
+        front[:, 0] = car.x_m + front_point_m * np.cos(car.yaw_rad)
+        front[:, 1] = car.y_m + front_point_m * np.sin(car.yaw_rad)
+        projection = track.project(front)
+        track_width_m, is_left = track.border_distances(front, projection.center)
+        error = car.yaw_rad - projection.heading_rad
+        closest = np.empty((len(front), 2), np.int64)
+        closest[:, 0], closest[:, 1] = projection.previous, projection.next
+        return cls(
+            x_m=car.x_m,
+            y_m=car.y_m,
+            yaw_rad=car.yaw_rad,
+            speed_mps=car.speed_mps,
+            yaw_rate_radps=car.yaw_rate_radps,
+            front=front,
+            ndist=projection.ndist,
+            distance_m=projection.distance_m,
+            offset_m=projection.offset_m,
+            closest_waypoints=closest,
+            heading_error_rad=np.mod(error + np.pi, 2 * np.pi) - np.pi,
+            track_width_m=track_width_m,
+            is_left=is_left,
+        )
+
+    def replace(self, ids: NDArray[np.intp], those: "Measures") -> None:
+        """Put the rows `those` in the place of the cars `ids`."""
+        for field in fields(self):
+            getattr(self, field.name)[ids] = getattr(those, field.name)

@@ -1,0 +1,230 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.sim.batch import CarBatch
+
+CAR_FILE = Path(__file__).parents[2] / "conf/car/deepracer.yaml"
+CAR = TypeAdapter(CarConfig).validate_python(yaml.safe_load(CAR_FILE.read_text()))
+STILL = dataclasses.replace(CAR, min_speed_mps=0.0)
+
+
+@pytest.fixture(autouse=True)
+def _log_elsewhere(tmp_path, monkeypatch):
+    # MuJoCo leaves MUJOCO_LOG.TXT in the working directory when it warns.
+    monkeypatch.chdir(tmp_path)
+
+
+def random_commands(n_cars: int, steps: int):
+    rng = np.random.default_rng(3)
+    return rng.uniform(0.1, 4.0, (steps, n_cars)), np.deg2rad(rng.uniform(-30, 30, (steps, n_cars)))
+
+
+def drive(cars: CarBatch, speed_mps, steering_deg, steps: int):
+    speed = np.broadcast_to(np.asarray(speed_mps, float), (cars.n_cars,))
+    steering = np.broadcast_to(np.deg2rad(steering_deg), (cars.n_cars,))
+    for _ in range(steps):
+        cars.drive(speed, steering)
+    return cars.read()
+
+
+def test_cars_are_bit_identical_at_any_number_of_threads():
+    speed, steering = random_commands(7, 30)
+    states = []
+    for threads in (1, 2, 5, 0):
+        cars = CarBatch(CAR, 7, threads)
+        for t in range(30):
+            cars.drive(speed[t], steering[t])
+        states.append(cars.state)
+    for state in states[1:]:
+        np.testing.assert_array_equal(state, states[0])
+
+
+def test_cars_are_bit_identical_however_they_are_split():
+    speed, steering = random_commands(5, 30)
+    whole, parts = CarBatch(CAR, 5, 1), [CarBatch(CAR, 2, 1), CarBatch(CAR, 3, 1)]
+    for t in range(30):
+        whole.drive(speed[t], steering[t])
+        parts[0].drive(speed[t, :2], steering[t, :2])
+        parts[1].drive(speed[t, 2:], steering[t, 2:])
+    np.testing.assert_array_equal(whole.state, np.concatenate([part.state for part in parts]))
+
+
+@settings(max_examples=20, deadline=None)
+@given(x=st.floats(-50, 50), y=st.floats(-50, 50), yaw=st.floats(-3.1, 3.1), driven=st.integers(0, 5))
+def test_a_placed_car_is_where_it_was_put_and_stays_there(x, y, yaw, driven):
+    cars = CarBatch(STILL, 2, 1)
+    drive(cars, 2.0, 20.0, driven)
+    cars.place([1], [x], [y], [yaw])
+    for state in (cars.read(), drive(cars, 0.0, 0.0, 15)):
+        assert state.x_m[1] == pytest.approx(x, abs=1e-5)
+        assert state.y_m[1] == pytest.approx(y, abs=1e-5)
+        assert state.yaw_rad[1] == pytest.approx(yaw, abs=1e-5)
+        assert abs(state.speed_mps[1]) < 1e-5
+        assert abs(state.lateral_mps[1]) < 1e-5
+
+
+def test_placing_a_car_leaves_the_others_alone():
+    cars = CarBatch(CAR, 3, 1)
+    drive(cars, 2.0, 10.0, 5)
+    before = cars.state
+    cars.place(np.array([1]), 3.0, 4.0, 1.0)
+    np.testing.assert_array_equal(cars.state[[0, 2]], before[[0, 2]])
+
+
+def test_a_placed_car_drives_the_same_path_whatever_it_did_before():
+    cars = CarBatch(CAR, 2, 1)
+    drive(cars, [0.5, 4.0], [0.0, 30.0], 20)
+    cars.place([0, 1], 0.0, 0.0, 0.5)
+    drive(cars, 2.0, 15.0, 20)
+    np.testing.assert_array_equal(cars.state[0], cars.state[1])
+
+
+def test_driving_does_not_depend_on_place_and_heading():
+    cars = CarBatch(CAR, 2, 1)
+    cars.place([0, 1], [0.0, 7.0], [0.0, -3.0], [0.0, 2.0])
+    state = drive(cars, 1.5, 15.0, 15)
+    dx, dy = state.x_m - [0.0, 7.0], state.y_m - [0.0, -3.0]
+    turned = (np.cos(2) * dx[0] - np.sin(2) * dy[0], np.sin(2) * dx[0] + np.cos(2) * dy[0])
+    # The floor's friction directions are the world's, and the solver stops at a tolerance.
+    np.testing.assert_allclose(turned, (dx[1], dy[1]), atol=2e-3)
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.5, 1.0, 2.0, 3.0, 4.0])
+def test_a_car_steering_straight_goes_straight_at_about_the_speed_it_was_told(speed):
+    state = drive(CarBatch(CAR, 1, 1), speed, 0.0, 60)
+    assert abs(state.y_m[0]) < 1e-3
+    assert abs(state.yaw_rad[0]) < 1e-3
+    assert 0.95 < state.speed_mps[0] / speed < 1.04
+
+
+def test_two_thirds_of_the_speed_are_reached_in_about_a_third_of_a_second():
+    cars = CarBatch(CAR, 1, 1)
+    speeds = [drive(cars, 2.0, 0.0, 1).speed_mps[0] for _ in range(10)]
+    reached = 1 + int(np.argmax(np.array(speeds) > 2.0 * 0.632))
+    assert 4 <= reached <= 6
+    assert speeds == sorted(speeds)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
+def test_positive_steering_turns_left_and_negative_as_much_to_the_right(speed):
+    state = drive(CarBatch(CAR, 2, 1), speed, [15.0, -15.0], 20)
+    assert state.yaw_rate_radps[0] > 0.3
+    assert state.y_m[0] > 0.02
+    assert state.y_m[1] == pytest.approx(-state.y_m[0], abs=2e-3)
+
+
+def test_the_car_gets_round_the_tightest_corner_of_a_course():
+    # 0.7 m radius at 1.5 m/s.
+    cars = CarBatch(CAR, 1, 1)
+    drive(cars, 1.5, 0.0, 15)
+    state = drive(cars, 1.5, 30.0, 30)
+    assert state.speed_mps[0] / state.yaw_rate_radps[0] < 0.7
+
+
+def test_the_wheels_stay_on_the_floor_in_the_wildest_driving():
+    cars = CarBatch(CAR, 16, 0)
+    speed, steering = random_commands(16, 150)
+    for t in range(150):
+        cars.drive(speed[t], steering[t])
+        height_m = cars.state[:, 3]
+        assert np.abs(height_m).max() < 0.015
+
+
+def test_commands_beyond_the_limits_are_cut():
+    cars = CarBatch(CAR, 2, 1)
+    drive(cars, [99.0, CAR.max_speed_mps], [90.0, CAR.max_steering_deg], 10)
+    np.testing.assert_array_equal(cars.state[0], cars.state[1])
+
+
+def test_a_slippery_car_slides_and_the_others_do_not_notice():
+    alike, one_slips = CarBatch(CAR, 3, 1), CarBatch(CAR, 3, 1)
+    one_slips.set_tyre_friction([1], [0.1])
+    grip, slip = drive(alike, 1.5, 20.0, 30), drive(one_slips, 1.5, 20.0, 30)
+    np.testing.assert_array_equal(one_slips.state[[0, 2]], alike.state[[0, 2]])
+    assert abs(slip.yaw_rate_radps[1]) < 0.7 * abs(grip.yaw_rate_radps[1])
+
+
+def test_a_slippery_floor_and_a_slippery_tyre_are_the_same():
+    floor, tyre = CarBatch(CAR, 1, 1, floor_friction=0.4), CarBatch(CAR, 1, 1)
+    tyre.set_tyre_friction([0], [0.4 * CAR.tyre_friction])
+    drive(floor, 1.5, 20.0, 15), drive(tyre, 1.5, 20.0, 15)
+    np.testing.assert_array_equal(floor.state, tyre.state)
+
+
+@pytest.mark.parametrize("setter", ["set_mass_scale", "set_motor_scale", "set_servo_scale"])
+def test_a_scale_of_one_changes_nothing(setter):
+    plain, scaled = CarBatch(CAR, 2, 1), CarBatch(CAR, 2, 1)
+    getattr(scaled, setter)([0, 1], [1.0, 1.0])
+    drive(plain, 2.0, 20.0, 15), drive(scaled, 2.0, 20.0, 15)
+    np.testing.assert_array_equal(plain.state, scaled.state)
+
+
+def test_a_heavy_car_and_a_weak_motor_gain_speed_slowly():
+    cars = CarBatch(CAR, 3, 1)
+    cars.set_mass_scale([1], [2.0])
+    cars.set_motor_scale([2], [0.5])
+    speed = drive(cars, 2.0, 0.0, 4).speed_mps
+    assert speed[1] < 0.7 * speed[0]
+    assert speed[2] < 0.7 * speed[0]
+
+
+def test_a_weak_servo_steers_late():
+    cars = CarBatch(CAR, 2, 1)
+    drive(cars, 1.0, 0.0, 15)
+    cars.set_servo_scale([1], [0.2])
+    rate = drive(cars, 1.0, 20.0, 1).yaw_rate_radps
+    assert 0.0 < rate[1] < 0.7 * rate[0]
+
+
+def test_a_restored_state_goes_on_bit_for_bit():
+    speed, steering = random_commands(3, 20)
+    cars, other = CarBatch(CAR, 3, 1), CarBatch(CAR, 3, 1)
+    for t in range(10):
+        cars.drive(speed[t], steering[t])
+    kept = cars.state
+    other.state = kept
+    for t in range(10, 20):
+        cars.drive(speed[t], steering[t])
+        other.drive(speed[t], steering[t])
+    np.testing.assert_array_equal(cars.state, other.state)
+    assert not np.array_equal(kept, cars.state)
+
+
+def test_a_state_of_another_number_of_cars_is_refused():
+    with pytest.raises(ValueError, match="shape"):
+        CarBatch(CAR, 2, 1).state = CarBatch(CAR, 3, 1).state
+
+
+def test_a_state_that_is_not_finite_ends_the_run_and_names_the_car():
+    cars = CarBatch(CAR, 4, 1)
+    state = cars.state
+    state[2, 1:] = np.nan
+    cars.state = state
+    with pytest.raises(RunFailed, match="car 2"):
+        drive(cars, 1.0, 0.0, 1)
+    # It is still there to be looked at: nothing has put the car back to its start.
+    assert np.isnan(cars.read().x_m[2])
+    assert np.isfinite(cars.read().x_m[[0, 1, 3]]).all()
+
+
+@pytest.mark.parametrize(("speed", "steering"), [(np.nan, 0.0), (np.inf, 0.0), (1.0, np.nan), (1.0, -np.inf)])
+def test_a_command_that_is_not_a_number_ends_the_run_and_names_the_car(speed, steering):
+    cars = CarBatch(CAR, 3, 1)
+    with pytest.raises(RunFailed, match="car 1: command"):
+        cars.drive(np.array([1.0, speed, 1.0]), np.array([0.0, steering, 0.0]))
+
+
+def test_what_was_read_does_not_change_when_the_cars_move_on():
+    cars = CarBatch(CAR, 1, 1)
+    before = cars.read()
+    drive(cars, 1.0, 0.0, 10)
+    assert before.x_m[0] == 0.0
