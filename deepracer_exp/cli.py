@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shutil
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -109,6 +110,8 @@ def _train(args: argparse.Namespace) -> int:
     if args.cfg:
         print("---\n".join(composition.yaml() for _, composition in composed), end="")
         return 0
+    # The imports to come take seconds, and the first start after an installation compiles for longer.
+    print("starting", file=sys.stderr, flush=True)
     _start_workers_early(any(experiment.collector.mode != "in_process" for experiment, _ in composed))
 
     from rich.console import Console
@@ -153,20 +156,19 @@ def _tell(outcome: "Outcome", ui: bool) -> None:
         print(f"  what is known: {outcome.folder}", file=sys.stderr)
         return
     best = summary["best_lap_time_s"]
-    share = summary["lap_share"]
     print(f"\n{outcome.status}: {outcome.reason}")
     print(
         f"  {summary['env_steps']:,} steps, {summary['episodes']:,} episodes, {summary['laps']:,} laps in "
-        f"{summary['wall_clock_s']:.0f} s"
-        + (f"; best lap {best:.2f} s" if best is not None else "; no lap yet")
-        + (f"; {share:.0%} of the last episodes were laps" if share is not None else "")
+        f"{summary['wall_clock_s']:.0f} s" + (f", best lap {best:.2f} s" if best is not None else ", no lap yet")
     )
-    print(f"  results       {outcome.folder}")
-    for name, what in (("best_lap.png", "driven line  "), ("learning.png", "learning     ")):
+    print(f"\n  results       {outcome.folder}")
+    for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):
         if (outcome.folder / name).exists():
-            print(f"  {what} {outcome.folder / name}")
+            print(f"    {name}  {what}")
     if ui:
-        print("  compare runs  deepracer-exp ui")
+        # `make race` calls us by a path that a newcomer's shell does not know.
+        command = "deepracer-exp" if shutil.which("deepracer-exp") else sys.argv[0]
+        print(f"  compare runs  {command} ui")
 
 
 def _tell_all(outcomes: "Sequence[Outcome]") -> None:

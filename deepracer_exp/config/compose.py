@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
@@ -20,9 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from deepracer_exp.errors import BadInput, nearest
 
 from .experiment import Experiment
-
-# Keys of these mappings are the user's own, so an override may add to them.
-OPEN_MAPPINGS = ("reward.constants",)
+from .overrides import line_for_hydra, parse_single, parse_sweep
 
 
 def conf_dir() -> Path:
@@ -71,7 +68,8 @@ def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Compositio
     """Compose `conf/train.yaml` with the overrides and validate the result.
 
     Args:
-        overrides: Hydra override expressions without sweeps, e.g. ``track=Oval_track``.
+        overrides: Hydra override expressions without sweeps, e.g. ``track=Oval_track``; paths and addresses need
+            no quotes.
 
     Raises:
         BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
@@ -86,16 +84,22 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     Raises:
         BadInput: an override cannot be parsed or names something unknown.
     """
-    parsed = [_open(override) for override in _parse(overrides)]
+    parsed = [parse_single(override) for override in overrides]
+    for override in parsed:
+        _check_key(override)
     try:
         with initialize_config_dir(str(conf_dir().resolve()), version_base="1.3"):
-            config = compose(entry, overrides=parsed, return_hydra_config=True)
-        choices = {group: str(option) for group, option in config.hydra.runtime.choices.items()}
+            config = compose(entry, overrides=[line_for_hydra(o) for o in parsed], return_hydra_config=True)
+        choices = {
+            str(group): str(option).removesuffix(".yaml")
+            for group, option in config.hydra.runtime.choices.items()
+            if option is not None
+        }
         with open_dict(config):
             del config["hydra"]
         mapping = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise BadInput(_explain(entry, overrides, error)) from error
+        raise BadInput(_explain(entry, parsed, error)) from error
     assert isinstance(mapping, dict)
     return Composition(
         overrides=tuple(overrides),
@@ -112,7 +116,7 @@ def validate(mapping: dict[str, Any]) -> Experiment:
     """
     try:
         # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
-        experiment = TypeAdapter(Experiment).validate_json(json.dumps(mapping), strict=True)
+        experiment = TypeAdapter(Experiment).validate_json(json.dumps(mapping), strict=True, extra="forbid")
     except ValidationError as error:
         raise BadInput(_first_finding(mapping, error)) from error
     _check_together(experiment)
@@ -126,7 +130,7 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
         BadInput: an override cannot be parsed or asks for a sweep that is no plain grid.
     """
     axes: list[list[str]] = []
-    for override in _parse(overrides):
+    for override in map(parse_sweep, overrides):
         if not override.is_sweep_override():
             axes.append([override.input_line or ""])
         elif override.is_discrete_sweep():
@@ -139,29 +143,15 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     return [list(combination) for combination in itertools.product(*axes)]
 
 
-def _parse(overrides: Sequence[str]) -> list[Override]:
-    try:
-        return OverridesParser.create().parse_overrides(list(overrides))
-    except OverrideParseException as error:
-        reason = str(error).splitlines()[0]
+def _check_key(override: Override) -> None:
+    """Refuse what Hydra would take without a word, or with a traceback."""
+    key, value = override.key_or_group, override.value()
+    if re.match(r"hydra\b", key):
         raise BadInput(
-            f"{error.override}: not an override ({reason}); write GROUP=OPTION or KEY=VALUE"
-        ) from error
-
-
-def _open(override: Override) -> str:
-    line = override.input_line or ""
-    key = override.key_or_group
-    inside = any(key.startswith(f"{mapping}.") for mapping in OPEN_MAPPINGS)
-    if inside and not override.is_add() and not override.is_force_add() and not override.is_delete():
-        return f"++{line}"
-    return line
-
-
-def _known_keys() -> list[str]:
-    with initialize_config_dir(str(conf_dir().resolve()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("train"))
-    return list(_dotted(config))
+            f"{key}: Hydra's own settings have no effect here; runs_dir says where runs are written"
+        )
+    if key in groups() and not override.is_delete() and not isinstance(value, str | list | None):
+        raise BadInput(f"{override.input_line}: no such {key}; options: {', '.join(options(key))}")
 
 
 def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
@@ -171,7 +161,7 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
             yield from _dotted(value, f"{prefix}{key}.")
 
 
-def _explain(entry: str, overrides: Sequence[str], error: Exception) -> str:
+def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
     """Return one line for what Hydra tells in several."""
     text = str(error)
     missing = re.search(r"Could not find '([\w-]+)/([^']*)'", text)
@@ -181,20 +171,30 @@ def _explain(entry: str, overrides: Sequence[str], error: Exception) -> str:
         return f"{group}={option}: no such {group}{nearest(option, known)}; options: {', '.join(known)}"
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
-        key = unknown.group(1)
-        keys = _known_keys()
-        close = nearest(key, keys)
-        if not close:
-            # Perhaps the right key in the wrong group.
-            leaf = key.rsplit(".", 1)[-1]
-            match = difflib.get_close_matches(leaf, [k.rsplit(".", 1)[-1] for k in keys], n=1, cutoff=0.75)
-            close = next((f" (did you mean {k}?)" for k in keys if match and k.endswith(match[0])), "")
-        return f"{key}: no such key{close}; `deepracer-exp train --cfg` prints all of them"
+        chosen = [o.input_line or "" for o in parsed if o.key_or_group in groups()]
+        return _unknown_key(unknown.group(1), compose_entry(entry, chosen))
     loaded = re.search(r"in the defaults list", text)
     if loaded:
-        key = next((o.split("=")[0] for o in overrides if o.split("=")[0].lstrip("+~") in text), overrides[0])
+        key = next((o.key_or_group for o in parsed if o.key_or_group in text), parsed[0].key_or_group)
         return f"{key}: no such group{nearest(key, groups())}; groups: {', '.join(groups())}"
     return f"{entry}: " + " ".join(text.split())
+
+
+def _unknown_key(key: str, chosen: Composition) -> str:
+    """Tell which keys there are where `key` was looked for; `chosen` is the experiment without other overrides."""
+    parent, _, leaf = key.rpartition(".")
+    keys = list(_dotted(chosen.mapping))
+    siblings = [k.rpartition(".")[2] for k in keys if parent and k.rpartition(".")[0] == parent]
+    if siblings:
+        option = f" with {parent}={chosen.choices[parent]}" if parent in chosen.choices else ""
+        return f"{key}: no such key{option}{nearest(leaf, siblings)}; known: {', '.join(siblings)}"
+    close = nearest(key, keys)
+    if not close:
+        # Perhaps the right key without its group, or in another one.
+        leaves = {k.rpartition(".")[2]: k for k in reversed(keys)}
+        match = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.8)
+        close = f" (did you mean {leaves[match[0]]}?)" if match else ""
+    return f"{key}: no such key{close}; `deepracer-exp train --cfg` prints all of them"
 
 
 def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
@@ -208,6 +208,8 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
         parent = _lookup(mapping, key.split(".")[:-1])
         siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
         return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
+    if finding["type"] == "value_error":  # a dataclass that refuses values which contradict each other
+        return f"{key}: {finding['ctx']['error']}{more}"
     value = finding.get("input")
     return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
 

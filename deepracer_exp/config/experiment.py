@@ -21,7 +21,7 @@ class Experiment:
     name: SafeName
     """Folder under `runs_dir` and experiment in MLflow."""
     seed: Annotated[int, Field(ge=0, lt=2**31)]
-    runs_dir: str
+    runs_dir: Annotated[str, Field(min_length=1)]
     debug: bool
     """Show a traceback for errors."""
     track: TrackConfig

@@ -20,10 +20,8 @@ from numpy.typing import NDArray
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.formats.trace import EPISODE_STATUS, PACKED
 
-from .race import CONTROL_PERIOD_S, Race
+from .race import Race
 from .setup import RaceSetup, build_setup
-
-_METADATA: dict[str, Any] = {"render_modes": [], "render_fps": round(1 / CONTROL_PERIOD_S)}
 
 
 class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
@@ -32,8 +30,6 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
     Observation: the features of `Features`, float32. Action: a number of the action space's list, or steering and
     speed in -1..1. `info` holds `progress` in per cent and `episode_status` of the pose that was judged.
     """
-
-    metadata = _METADATA
 
     def __init__(self, overrides: Sequence[str] = ()):
         """Compose an experiment and put its car on the track.
@@ -73,11 +69,12 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
 class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
 
-    `infos` holds arrays `progress` and `episode_status` (codes of `formats.trace.EPISODE_STATUS`), and, where an
-    episode ended, `final_obs` with the mask `_final_obs`.
+    `infos` holds arrays `progress` and `episode_status` (codes of `formats.trace.EPISODE_STATUS`) of the poses that
+    were judged. In a step that ended episodes it also holds, as Gymnasium's own vector environments do, `final_obs`
+    (objects: an observation, or None) with the mask `_final_obs`, and `final_info` with `_final_info`.
     """
 
-    metadata = {**_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's protocol
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's protocol
 
     def __init__(
         self,
@@ -127,9 +124,17 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         }
         ended = terminated | truncated
         if ended.any():
-            infos["final_obs"] = race.observation
-            infos["_final_obs"] = ended
-            race.reset(np.flatnonzero(ended))
+            ids = np.flatnonzero(ended)
+            final = np.full(self.num_envs, None, dtype=object)
+            for car in ids:
+                final[car] = race.observation[car]
+            infos |= {
+                "final_obs": final,
+                "_final_obs": ended,
+                "final_info": infos.copy(),
+                "_final_info": ended,
+            }
+            race.reset(ids)
         return race.observation, reward, terminated, truncated, infos
 
 

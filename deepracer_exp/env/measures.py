@@ -58,7 +58,7 @@ class Measures:
             yaw_rate_radps=car.yaw_rate_radps,
             front=front,
             ndist=projection.ndist,
-            distance_m=projection.distance_m,
+            distance_m=np.abs(projection.offset_m),
             offset_m=projection.offset_m,
             closest_waypoints=closest,
             heading_error_rad=np.mod(error + np.pi, 2 * np.pi) - np.pi,

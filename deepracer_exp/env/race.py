@@ -63,13 +63,14 @@ class Race:
         self.setup = setup
         self.n_cars = n_cars
         self.cars = np.arange(first_car, first_car + n_cars)
+        self._period_s = setup.car.control_period_s
         self._batch = CarBatch(setup.car, n_cars, threads, setup.track.floor.friction)
         self._rules = EpisodeRules(setup.episode, n_cars)
         self._reward_function = RewardFunction(setup.reward, n_cars, setup.reward_time_limit_s, prints)
         low, high = setup.actions.low, setup.actions.high
-        self._features = Features(
-            setup.observation, setup.track.length_m, max(abs(low[0]), abs(high[0])), high[1]
-        )
+        # A space that only drives straight ahead has no largest angle to divide by.
+        steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
+        self._features = Features(setup.observation, setup.track.length_m, steering_max_deg, high[1])
         self._params_of_run: dict[str, object] = {
             "track_length": setup.track.length_m,
             "waypoints": [(float(x), float(y)) for x, y in setup.track.waypoints],
@@ -118,7 +119,7 @@ class Race:
         ids = self._everyone if ids is None else ids
         episode = self.setup.episode
         self._episode[ids] += 1
-        # An open course is driven from its start line: from anywhere else the lap could not be completed.
+        # An open course is driven from its start: from anywhere else it could not be completed.
         turns = self.cars[ids] + self._episode[ids] if self.setup.track.closed else np.zeros(len(ids))
         start_ndist = np.mod(episode.start_offset + episode.start_advance * turns, 1.0)
         self._start_ndist[ids] = start_ndist
@@ -141,20 +142,25 @@ class Race:
 
         Raises:
             RewardFailed: the reward function raised, hung or returned no usable number.
-            NonFinite: an observation (and so the car's state) is NaN or infinite.
+            NonFinite: an action, a car's state or an observation is NaN or infinite.
         """
         steering_deg, speed_mps = self.setup.actions.commands(action)
         self._steps += 1
         self._clock_steps += 1
+        self._require_finite(
+            "action", np.stack([steering_deg, speed_mps], axis=1), ("steering", "speed"), action
+        )
         running = self._steps > 1
         self._judge()
         self._pay(steering_deg, speed_mps, running)
         self._write_trace(action, steering_deg, speed_mps)
         self._last_front = self._now.front
-        self._drive(steering_deg, speed_mps, running)
+        try:
+            self._drive(steering_deg, speed_mps, running)
+        except RunFailed as error:
+            raise self._lost_car(error, action) from error
         self._observe()
-        if not np.isfinite(self.observation).all():
-            raise self._non_finite(action)
+        self._require_finite("observation", self.observation, self.feature_names, action)
 
     def state_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the cars' full physics state and counters, for looking into a fault."""
@@ -206,7 +212,7 @@ class Race:
             "closest_waypoints": now.closest_waypoints,
             "is_left_of_center": now.is_left,
             "is_offtrack": self._off_track,
-            "sim_time": self._clock_steps * CONTROL_PERIOD_S,
+            "sim_time": self._clock_steps * self._period_s,
         }
         self.reward = self._reward_function(params, self._params_of_run, running)
         self._return += self.reward
@@ -227,7 +233,7 @@ class Race:
             ("all_wheels_on_track", self._all_wheels_on),
             ("progress", self._progress),
             ("closest_waypoint", self._nearer_waypoint()),
-            ("tstamp", self._clock_steps * CONTROL_PERIOD_S),
+            ("tstamp", self._clock_steps * self._period_s),
             ("episode_status", self._status),
             ("speed_mps", now.speed_mps),
             ("yaw_rate_radps", now.yaw_rate_radps),
@@ -281,12 +287,24 @@ class Race:
             self.setup.track.points_at(self._features.ahead(measures.ndist)),
         )
 
-    def _non_finite(self, action: np.ndarray) -> NonFinite:
-        row, column = np.argwhere(~np.isfinite(self.observation))[0]
-        car = self.cars[row]
-        value = self.observation[row, column]
-        return NonFinite(
-            f"observation '{self.feature_names[column]}' of car {car} became {value} at step {self._steps[row]} "
-            f"of its episode {self._episode[row]}",
-            {**self.state_arrays(), "action": np.asarray(action)},
-        )
+    def _lost_car(self, error: RunFailed, action: np.ndarray) -> RunFailed:
+        """Say which car and step the physics complains of; it knows only the car's place in this batch."""
+        rows = np.flatnonzero(~np.isfinite(self._batch.state).all(axis=1))
+        if not len(rows):
+            return error
+        return self._non_finite(f"physics state of {self._place(rows[0])} is not finite", action)
+
+    def _require_finite(
+        self, what: str, values: np.ndarray, names: tuple[str, ...], action: np.ndarray
+    ) -> None:
+        finite = np.isfinite(values)
+        if not finite.all():
+            row, column = np.argwhere(~finite)[0]
+            value = f"became {values[row, column]}"
+            raise self._non_finite(f"{what} '{names[column]}' of {self._place(row)} {value}", action)
+
+    def _place(self, row: int) -> str:
+        return f"car {self.cars[row]} at step {self._steps[row]} of its episode {self._episode[row]}"
+
+    def _non_finite(self, message: str, action: np.ndarray) -> NonFinite:
+        return NonFinite(message, {**self.state_arrays(), "action": np.asarray(action)})

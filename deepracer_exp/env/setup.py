@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 
 from .action_space import ActionSpace, build_action_space
@@ -32,8 +33,14 @@ def build_setup(experiment: Experiment) -> RaceSetup:
     Raises:
         BadInput: a route, model_metadata or reward file is missing or malformed, or values contradict.
     """
+    track = Track.from_config(experiment.track)
+    if experiment.episode.start_offset and not track.closed:
+        raise BadInput(
+            f"episode.start_offset={experiment.episode.start_offset:g}: the open course {track.name} can only be "
+            "completed from its start; accepted there: 0"
+        )
     return RaceSetup(
-        track=Track.from_config(experiment.track),
+        track=track,
         car=experiment.car,
         actions=build_action_space(experiment.action_space),
         observation=experiment.observation,

@@ -108,6 +108,8 @@ class CarBatch:
         _require_finite("command", np.isfinite(np.stack([speed, steering], axis=-1)))
         speed = np.clip(speed, self.car.min_speed_mps, self.car.max_speed_mps)
         steering = np.clip(steering, -self._max_steering_rad, self._max_steering_rad)
+        if moving is not None:
+            speed, steering = speed * moving, steering * moving
         self._ctrl[:, self._servos] = steering[:, None]
         self._ctrl[:, self._motors] = (speed / self.car.drive_radius_m)[:, None]
         try:

@@ -20,6 +20,7 @@ class Budget:
         return max(shares, key=lambda share: share[1])
 
     def __str__(self) -> str:
-        """Return the limits in words, e.g. ``3,000,000 env_steps``."""
-        words = [f"{limit:,.0f} {name}" for name, limit in self._limits if limit is not None]
+        """Return the limits in words, e.g. ``3,000,000 steps``."""
+        units = {"env_steps": "steps", "iterations": "iterations", "wall_clock_s": "s"}
+        words = [f"{limit:,.0f} {units[name]}" for name, limit in self._limits if limit is not None]
         return " or ".join(words)

@@ -276,7 +276,7 @@ def _clock(seconds: float) -> str:
 
 
 def _left(eta_s: float | None) -> str:
-    return f"{NOTHING} left" if eta_s is None or not math.isfinite(eta_s) else f"{_clock(eta_s)} left"
+    return f"{NOTHING} left" if eta_s is None or not math.isfinite(eta_s) else f"at most {_clock(eta_s)} left"
 
 
 def _join(header: RunHeader) -> str:

@@ -108,6 +108,7 @@ class Training:
         # The clock of a racer starts with the command, not with the loop.
         self._process_began = psutil.Process().create_time()
         self._first_lap: dict[str, float] | None = None
+        self._reliable: dict[str, float] | None = None
         self._row: dict[str, Any] = {}
 
     def loop(self, collection: Collection, interruption: Interruption) -> str:
@@ -144,6 +145,7 @@ class Training:
             "lap_share": self.book.lap_share,
             "best_lap_time_s": self.book.best_lap_s,
             "first_lap": self._first_lap,
+            "reliable": self._reliable,
             "last": self._row,
         }
         path = self.folder.path
@@ -187,10 +189,9 @@ class Training:
     ) -> None:
         book = self.book
         if self._first_lap is None and book.laps:
-            self._first_lap = {
-                "env_steps": self.env_steps,
-                "since_process_start_s": round(time.time() - self._process_began, 3),
-            }
+            self._first_lap = self._moment()
+        if self._reliable is None and self._reliability() is not None:
+            self._reliable = self._moment()
         self._row = {
             **self._counters(),
             "mean_return": _mean(finished.returns),
@@ -218,12 +219,24 @@ class Training:
     def _reason_to_stop(self, interruption: Interruption) -> str | None:
         if interruption.signum is not None:
             return "interrupted"
-        stopping = self.experiment.stopping
-        share = self.book.lap_share
-        if isinstance(stopping, ReliableStopping) and share is not None and share >= stopping.lap_share:
-            return f"reliable: {share:.0%} of the last {stopping.episodes} episodes completed the lap"
+        reliability = self._reliability()
+        if reliability is not None:
+            return f"reliable: {reliability}"
         limit, fraction = self._spent()
         return f"budget reached: {limit}" if fraction >= 1 else None
+
+    def _reliability(self) -> str | None:
+        """Say what makes the car reliable by the stopping rule, None if it is not or there is no such rule."""
+        stopping, share = self.experiment.stopping, self.book.lap_share
+        if isinstance(stopping, ReliableStopping) and share is not None and share >= stopping.lap_share:
+            return f"{share:.0%} of the last {stopping.episodes} episodes completed the lap"
+        return None
+
+    def _moment(self) -> dict[str, float]:
+        return {
+            "env_steps": self.env_steps,
+            "since_process_start_s": round(time.time() - self._process_began, 3),
+        }
 
     def _spent(self) -> tuple[str, float]:
         return self.budget.used(self.env_steps, self.iteration, time.monotonic() - self._began)
@@ -272,6 +285,7 @@ def train(experiment: Experiment, composition: Composition, console: Console) ->
     with Interruption() as interruption:
         try:
             with contextlib.ExitStack() as stack:
+                stack.enter_context(training.display)
                 collection = stack.enter_context(
                     Collection(
                         experiment.collector,
@@ -281,7 +295,6 @@ def train(experiment: Experiment, composition: Composition, console: Console) ->
                         training.folder.path,
                     )
                 )
-                stack.enter_context(training.display)
                 reason = training.loop(collection, interruption)
         except RunFailed as error:
             write_fault(training.folder.path, error, None)

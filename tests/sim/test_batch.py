@@ -223,6 +223,15 @@ def test_a_command_that_is_not_a_number_ends_the_run_and_names_the_car(speed, st
         cars.drive(np.array([1.0, speed, 1.0]), np.array([0.0, steering, 0.0]))
 
 
+def test_a_held_car_stays_at_its_place_whatever_it_is_told():
+    cars = CarBatch(CAR, 2, 1)
+    for _ in range(15):
+        cars.drive([2.0, 2.0], [0.5, 0.5], moving=np.array([False, True]))
+    state = cars.read()
+    assert np.hypot(state.x_m, state.y_m)[0] < 1e-5
+    assert np.hypot(state.x_m, state.y_m)[1] > 0.5
+
+
 def test_what_was_read_does_not_change_when_the_cars_move_on():
     cars = CarBatch(CAR, 1, 1)
     before = cars.read()

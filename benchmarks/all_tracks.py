@@ -1,0 +1,98 @@
+"""What a default training needs on every track of the catalogue.
+
+    python -m benchmarks.all_tracks [--jobs 1] [--markdown] [--json FILE] [TRACK...] [OVERRIDE...]
+
+For each track, `deepracer-exp train track=TRACK` runs as a process of its own in an empty folder until 90 per cent of
+the last 50 training episodes completed the lap, or until the budget's end. Read from its summary.json: control steps
+over all cars and wall seconds since the start of the process until then (null where the budget ended the run), the
+share of laps among the last 50 episodes, and the fastest lap of the whole training, in simulated seconds.
+
+Seconds mean something with one job only; several share the cores.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.config.compose import compose_experiment, options
+from deepracer_exp.tracks.track import Track
+
+from .command import read_summary, train
+from .report import number, table, write_json
+
+
+def measure(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Train on one track."""
+    chosen = [f"track={name}", *overrides]
+    track = Track.from_config(compose_experiment(chosen)[0].track)
+    with tempfile.TemporaryDirectory() as folder:
+        summary = read_summary(train(chosen, Path(folder)))
+    reliable = summary["reliable"] or {}
+    return {
+        "track": name,
+        "title": track.title,
+        "length_m": round(track.length_m, 2),
+        "reliable_steps": reliable.get("env_steps"),
+        "reliable_s": reliable.get("since_process_start_s"),
+        "best_lap_time_s": summary["best_lap_time_s"],
+        "lap_share": summary["lap_share"],
+        "laps": summary["laps"],
+        "env_steps": summary["env_steps"],
+    }
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the table."""
+    head = ("track", "name", "length (m)", "steps to 90 %", "seconds to 90 %", "best lap (s)")
+    lines = []
+    for row in rows:
+        share = 0.0 if row["lap_share"] is None else row["lap_share"]
+        unreached = f"not in {row['env_steps']:,} ({share:.0%})"
+        steps = number(row["reliable_steps"]) if row["reliable_steps"] is not None else unreached
+        lines.append(
+            (
+                f"`{row['track']}`",
+                row["title"],
+                number(row["length_m"], 2),
+                steps,
+                number(row["reliable_s"]),
+                number(row["best_lap_time_s"], 2),
+            )
+        )
+    return table(head, lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="benchmarks.all_tracks",
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at the same time")
+    parser.add_argument("--markdown", action="store_true", help="print nothing but the table")
+    parser.add_argument("--json", type=Path, help="also write the rows as JSON to this file")
+    parser.add_argument(
+        "chosen", nargs="*", metavar="TRACK | OVERRIDE", help="tracks (default: all), and KEY=VALUE for train"
+    )
+    args = parser.parse_args(arguments)
+    overrides = [word for word in args.chosen if "=" in word]
+    names = [word for word in args.chosen if "=" not in word] or options("track")
+
+    def one(name: str) -> dict[str, Any]:
+        row = measure(name, overrides)
+        if not args.markdown:
+            print(f"{name}: {row}", flush=True)
+        return row
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        rows = list(pool.map(one, names))
+    print(markdown(rows))
+    write_json(args.json, {"tracks": rows, "jobs": args.jobs, "overrides": overrides})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""Stable-Baselines3's PPO on the same cars: what `benchmarks.throughput` holds the training against.
+
+    python -m benchmarks.sb3_peer --iterations 20 [--torch-threads 1] [OVERRIDE...]
+
+As many cars as the experiment has over all its processes are driven through `DeepRacerVectorEnv`, with one physics
+thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights are the
+experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock starts;
+then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.gym_env import DeepRacerVectorEnv
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.training.collection import worker_count
+
+_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
+
+
+class SB3Cars(VecEnv):
+    """A `DeepRacerVectorEnv` in Stable-Baselines3's interface, with as little in between as it allows."""
+
+    def __init__(self, cars: DeepRacerVectorEnv):
+        self.cars = cars
+        self._truncated: NDArray[Any] = np.zeros(cars.num_envs, bool)
+        super().__init__(cars.num_envs, cars.single_observation_space, cars.single_action_space)
+
+    def reset(self) -> NDArray[np.float32]:
+        return self.cars.reset()[0]
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
+        observation, reward, terminated, truncated, infos = self.cars.step(self._actions)
+        ended = terminated | truncated
+        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for car in np.flatnonzero(ended):
+            told[car] = {
+                "terminal_observation": infos["final_obs"][car],
+                "TimeLimit.truncated": bool(truncated[car]),
+            }
+        return observation, reward, ended, told
+
+    def close(self) -> None:
+        self.cars.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self.cars, attr_name, None)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+def build(experiment: Experiment) -> PPO:
+    """Return the peer with the experiment's hyperparameters."""
+    algorithm, network = experiment.algorithm, experiment.network
+    assert algorithm.frames_per_iteration is not None
+    n_cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+    hidden = list(network.hidden)
+    return PPO(
+        "MlpPolicy",
+        SB3Cars(DeepRacerVectorEnv(n_cars, threads=0, setup=build_setup(experiment))),
+        learning_rate=algorithm.lr,
+        n_steps=-(-algorithm.frames_per_iteration // n_cars),
+        batch_size=algorithm.batch_size,
+        n_epochs=algorithm.epochs,
+        gamma=algorithm.discount,
+        gae_lambda=algorithm.gae_lambda,
+        clip_range=algorithm.clip_epsilon,
+        ent_coef=algorithm.entropy_coeff,
+        vf_coef=algorithm.critic_coeff,
+        max_grad_norm=algorithm.max_grad_norm or float("inf"),
+        policy_kwargs={
+            "net_arch": {"pi": hidden, "vf": hidden},
+            "activation_fn": _ACTIVATIONS[network.activation],
+        },
+        seed=experiment.seed,
+        device="cpu",
+    )
+
+
+def measure(experiment: Experiment, iterations: int, torch_threads: int) -> dict[str, float]:
+    """Train for one iteration, then for `iterations` with the clock running."""
+    torch.set_num_threads(torch_threads)
+    peer = build(experiment)
+    frames = peer.n_steps * peer.n_envs
+    peer.learn(frames, log_interval=None)
+    began = time.perf_counter()
+    peer.learn(iterations * frames, log_interval=None, reset_num_timesteps=False)
+    seconds = time.perf_counter() - began
+    return {
+        "env_steps": iterations * frames,
+        "seconds": seconds,
+        "steps_per_s": iterations * frames / seconds,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sb3_peer"
+    )
+    parser.add_argument("--iterations", type=int, required=True)
+    parser.add_argument("--torch-threads", type=int, default=1)
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
+    args = parser.parse_args(arguments)
+    experiment, _ = compose_experiment(args.overrides)
+    print(json.dumps(measure(experiment, args.iterations, args.torch_threads)))
+
+
+if __name__ == "__main__":
+    main()

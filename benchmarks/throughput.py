@@ -1,0 +1,223 @@
+"""Control steps per second, from bare physics to a whole training, each beside what it is held against.
+
+    python -m benchmarks.throughput [--seconds 3] [--rounds 7] [--cars 256] [--json FILE] [OVERRIDE...]
+
+A step is one control step (1/15 s) of one car. Everything is the default experiment unless overridden.
+
+- `physics_steps_per_s`: `mujoco.batch.Batch.step(nstep=substeps)` alone, one thread, 256 cars. The batch is given the
+  very commands and starts of the next figure's driving and is checked to end in the same state; only the time inside
+  the call counts.
+- `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
+  experiment's without its `reward_batch`), episodes begun anew as they end.
+- `collect_steps_per_s`: batches of an iteration's frames through `Collection` in sync mode with 1 and 2 worker
+  processes, the experiment's cars per process, its network sampling actions with its first weights.
+- `train_steps_per_s`: `deepracer-exp train` as a process of its own without MLflow: collection, update, trace, metrics,
+  checkpoints. Start-up and the first iteration are left out: env_steps over wall_clock_s between the first and the
+  last line of metrics.jsonl.
+- `peer_sb3_train_steps_per_s`: see `benchmarks.sb3_peer`; the same number of iterations from the same start, with one
+  torch thread and with one per core, the faster of which counts.
+
+What is compared is measured in turns, `--rounds` times, each for at least `--seconds` (a training for as many
+iterations as collection alone would do in that time). Figures are medians over the rounds; a ratio is the median of
+the rounds' ratios.
+"""
+
+import argparse
+import dataclasses
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.cli import _start_workers_early
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.training.collection import Collection, cores
+
+from .command import read_metrics, train
+from .driving import SameDriving
+from .report import machine, number, table, write_json
+
+Rates = dict[str, list[float]]
+"""Steps per second of each round, by figure."""
+
+RATIOS = (
+    ("env_to_physics", "env", "physics", 0.75),
+    ("collect_2_to_1", "collect 2", "collect 1", 1.6),
+    ("train_to_peer", "train", "peer", 1.5),
+)
+"""Name, numerator, denominator and the least wanted."""
+PEER = "peer, torch threads "
+
+
+def in_turns(rounds: int, seconds: float, passes: dict[str, Callable[[], tuple[float, float]]]) -> Rates:
+    """Run each pass in every round for `seconds`; a pass returns its steps and seconds."""
+    rates: Rates = {name: [] for name in passes}
+    for _ in range(rounds):
+        for name, one_pass in passes.items():
+            steps = spent = 0.0
+            while spent < seconds or not steps:
+                more_steps, more_spent = one_pass()
+                steps, spent = steps + more_steps, spent + more_spent
+            rates[name].append(steps / spent)
+    return rates
+
+
+def driving(experiment: Experiment, n_cars: int, rounds: int, seconds: float) -> Rates:
+    """Measure physics and environment."""
+    same = SameDriving(experiment, n_cars)
+    return in_turns(
+        rounds,
+        seconds,
+        {
+            "physics": lambda: (same.car_steps, same.physics_pass_s()),
+            "env": lambda: (same.car_steps, same.env_pass_s()),
+        },
+    )
+
+
+def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path) -> Rates:
+    """Measure collection with one and two processes, whose workers wait while it is not their turn."""
+    frames = experiment.algorithm.frames_per_iteration
+    assert frames is not None, "an iteration must be counted in frames"
+    setup = build_setup(experiment)
+    generator = torch.Generator().manual_seed(experiment.seed)
+    features = len(feature_names(experiment.observation))
+    policy = build_actor_critic(experiment.network, features, setup.actions.n, generator).policy
+
+    def start(processes: int) -> Collection:
+        config = dataclasses.replace(experiment.collector, mode="sync", processes=processes)
+        run_dir = folder / f"collect_{processes}"
+        run_dir.mkdir()
+        return Collection(config, setup, policy, frames, run_dir)
+
+    with start(1) as one, start(2) as two:
+        passes: dict[str, Callable[[], tuple[float, float]]] = {}
+        for name, collection in (("collect 1", one), ("collect 2", two)):
+            batches = iter(collection)
+            next(batches)  # imports, compilation and the first episodes' common start
+
+            def one_batch(batches: Any = batches) -> tuple[float, float]:
+                began = time.perf_counter()
+                steps = next(batches).numel()
+                return steps, time.perf_counter() - began
+
+            passes[name] = one_batch
+        return in_turns(rounds, seconds, passes)
+
+
+def training(overrides: Sequence[str], iterations: int, rounds: int, folder: Path) -> Rates:
+    """Measure training and peer."""
+    fixed = ["stopping=none", "tracking=off", "budget.env_steps=null", "budget.wall_clock_s=null"]
+
+    def ours() -> tuple[float, float]:
+        rows = read_metrics(train([*overrides, *fixed, f"budget.iterations={iterations + 1}"], folder))
+        first, last = rows[0], rows[-1]
+        return last["env_steps"] - first["env_steps"], last["wall_clock_s"] - first["wall_clock_s"]
+
+    def peer(torch_threads: int) -> tuple[float, float]:
+        command = [sys.executable, "-m", "benchmarks.sb3_peer", *overrides]
+        command += ["--iterations", str(iterations), "--torch-threads", str(torch_threads)]
+        root = Path(__file__).parents[1]
+        done = subprocess.run(command, cwd=root, check=True, stdout=subprocess.PIPE, text=True)
+        result = json.loads(done.stdout)
+        return result["env_steps"], result["seconds"]
+
+    passes: dict[str, Callable[[], tuple[float, float]]] = {"train": ours}
+    for threads in sorted({1, cores()}):
+        passes[f"{PEER}{threads}"] = lambda threads=threads: peer(threads)  # type: ignore[misc]
+    return in_turns(rounds, 0.0, passes)
+
+
+def summarize(rates: Rates) -> dict[str, Any]:
+    """Return the documented figures: medians, ratios, and the rounds they come from."""
+    peer = max(
+        (name for name in rates if name.startswith(PEER)), key=lambda name: statistics.median(rates[name])
+    )
+    rates = {**rates, "peer": rates[peer]}
+    middle = {name: round(statistics.median(values), 1) for name, values in rates.items()}
+    ratios = {}
+    for name, above, below, wanted in RATIOS:
+        by_round = [a / b for a, b in zip(rates[above], rates[below], strict=True)]
+        ratios[name] = {
+            "median": round(statistics.median(by_round), 3),
+            "min": round(min(by_round), 3),
+            "max": round(max(by_round), 3),
+            "wanted": wanted,
+        }
+    return {
+        "physics_steps_per_s": middle["physics"],
+        "env_steps_per_s": middle["env"],
+        "collect_steps_per_s": {"1": middle["collect 1"], "2": middle["collect 2"]},
+        "train_steps_per_s": middle["train"],
+        "peer_sb3_train_steps_per_s": middle["peer"],
+        "peer_torch_threads": int(peer.removeprefix(PEER)),
+        "ratios": ratios,
+        "rounds": {name: [round(rate, 1) for rate in values] for name, values in rates.items()},
+    }
+
+
+def show(summary: dict[str, Any]) -> str:
+    """Return the figures and ratios as two tables."""
+    figures = [
+        (name, number(statistics.median(values)), number(min(values)), number(max(values)))
+        for name, values in summary["rounds"].items()
+        if name != "peer"
+    ]
+    ratios = [
+        (
+            f"{above} / {below}",
+            *(number(summary["ratios"][name][key], 2) for key in ("median", "min", "max", "wanted")),
+        )
+        for name, above, below, _ in RATIOS
+    ]
+    return "\n\n".join(
+        (
+            table(("steps/s", "median", "min", "max"), figures),
+            table(("ratio", "median", "min", "max", "wanted, at least"), ratios),
+        )
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="benchmarks.throughput",
+    )
+    parser.add_argument("--seconds", type=float, default=3.0, help="of each figure in each round")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--cars", type=int, default=256, help="of physics_steps_per_s and env_steps_per_s")
+    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
+    args = parser.parse_args(arguments)
+    experiment, _ = compose_experiment(args.overrides)
+    _start_workers_early(True)  # as the command does
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rates = driving(experiment, args.cars, args.rounds, args.seconds)
+        rates |= collecting(experiment, args.rounds, args.seconds, folder)
+        frames = experiment.algorithm.frames_per_iteration or 0
+        iterations = max(2, round(args.seconds * statistics.median(rates["collect 2"]) / frames))
+        rates |= training(args.overrides, iterations, args.rounds, folder)
+    summary = summarize(rates)
+    print(f"{machine()['cores']} cores, {args.rounds} rounds, {iterations} timed iterations a training\n")
+    print(show(summary))
+    settings = {"cars": args.cars, "seconds": args.seconds, "iterations": iterations}
+    write_json(args.json, {**summary, "settings": settings, "overrides": args.overrides})
+
+
+if __name__ == "__main__":
+    main()

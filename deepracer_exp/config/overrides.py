@@ -1,0 +1,84 @@
+"""Override expressions as people type them, in Hydra's grammar and a little beyond it."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import OverrideParseException
+
+from deepracer_exp.errors import BadInput
+
+# Keys of these mappings are the user's own, so an override may add to them.
+OPEN_MAPPINGS = ("reward.constants",)
+# Values of these keys are taken as they are typed: Hydra's grammar has no umlaut, bracket or second equals sign
+# in a value without quotes, and a comma makes a sweep.
+PLAIN_TEXT = ("track.file", "reward.file", "action_space.file", "runs_dir", "tracking.uri")
+_PLAIN = re.compile(rf"(\+{{0,2}}(?:{'|'.join(map(re.escape, PLAIN_TEXT))})=)(.+)", re.DOTALL)
+
+
+def parse_single(override: str) -> Override:
+    """Parse an override that gives one value.
+
+    Raises:
+        BadInput: it cannot be parsed, or gives several values.
+    """
+    plain = _PLAIN.fullmatch(override)
+    parsed = _parse(plain[1] + _quoted(plain[2]) if plain else override)
+    if parsed.is_sweep_override():
+        raise BadInput(
+            f"{override}: several values for one run; -m runs each of them, and a list is written KEY=[A,B]"
+        )
+    return parsed
+
+
+def parse_sweep(override: str) -> Override:
+    """Parse an override that may give several values, as in ``seed=0,1`` or ``seed=range(3)``.
+
+    Raises:
+        BadInput: it cannot be parsed.
+    """
+    try:
+        return _parse(override)
+    except BadInput:
+        plain = _PLAIN.fullmatch(override)
+        if plain is None:
+            raise
+        return _parse(plain[1] + ",".join(_quoted(part) for part in plain[2].split(",")))
+
+
+def line_for_hydra(override: Override) -> str:
+    """Return the expression that Hydra is to compose."""
+    line = override.input_line or ""
+    inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in OPEN_MAPPINGS)
+    if inside and not override.is_add() and not override.is_force_add() and not override.is_delete():
+        return f"++{line}"
+    return line
+
+
+def _parse(override: str) -> Override:
+    try:
+        parsed: Sequence[Override] = OverridesParser.create().parse_overrides([override])
+    except OverrideParseException as error:
+        reason = str(error).splitlines()[0]
+        key, equals, value = override.partition("=")
+        quotes = f"; a value with special characters needs quotes: \"{key}='{value}'\"" if equals else ""
+        raise BadInput(
+            f"{override or repr('')}: not an override ({reason}); write GROUP=OPTION or KEY=VALUE{quotes}"
+        ) from error
+    if not parsed[0].key_or_group:
+        raise BadInput(f"{override}: no key before the equals sign; write GROUP=OPTION or KEY=VALUE")
+    return parsed[0]
+
+
+def _quoted(value: str) -> str:
+    """Return the value as one piece of text in Hydra's grammar, unless it is in quotes already or null."""
+    if not value or value[0] in "'\"" or value.lower() == "null":
+        return value
+    if value.startswith("~"):
+        # The shell does so at the beginning of a word only.
+        value = str(Path(value).expanduser())
+    # Backslashes count as themselves, except in front of a quote.
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
+    return f"'{escaped}'"
