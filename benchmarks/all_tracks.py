@@ -18,21 +18,20 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.compose import compose_experiment, options
+from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 
 from .command import read_summary, train
 from .report import number, table, write_json
 
 
-def measure(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def measure(option: str, track: Track, overrides: Sequence[str]) -> dict[str, Any]:
     """Train on one track."""
-    chosen = [f"track={name}", *overrides]
-    track = Track.from_config(compose_experiment(chosen)[0].track)
     with tempfile.TemporaryDirectory() as folder:
-        summary = read_summary(train(chosen, Path(folder)))
+        summary = read_summary(train([f"track={option}", *overrides], Path(folder)))
     reliable = summary["reliable"] or {}
     return {
-        "track": name,
+        "track": option,
         "title": track.title,
         "length_m": round(track.length_m, 2),
         "reliable_steps": reliable.get("env_steps"),
@@ -82,14 +81,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     overrides = [word for word in args.chosen if "=" in word]
     names = [word for word in args.chosen if "=" not in word] or options("track")
 
-    def one(name: str) -> dict[str, Any]:
-        row = measure(name, overrides)
+    try:  # all of them before the first training; Hydra is not for several threads
+        tracks = [Track.from_config(compose_experiment([f"track={n}", *overrides])[0].track) for n in names]
+    except BadInput as error:
+        parser.error(str(error))
+
+    def one(name: str, track: Track) -> dict[str, Any]:
+        row = measure(name, track, overrides)
         if not args.markdown:
             print(f"{name}: {row}", flush=True)
         return row
 
     with ThreadPoolExecutor(args.jobs) as pool:
-        rows = list(pool.map(one, names))
+        rows = list(pool.map(one, names, tracks))
     print(markdown(rows))
     write_json(args.json, {"tracks": rows, "jobs": args.jobs, "overrides": overrides})
 

@@ -3,6 +3,7 @@
 import argparse
 import os
 import shutil
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -104,7 +105,7 @@ def _train(args: argparse.Namespace) -> int:
         print("\n".join(options_of(args.options)))
         return 0
     grid = expand_grid(args.overrides) if args.multirun else [list(args.overrides)]
-    # All combinations are checked before the first one runs.
+    # All combinations are checked, and their files read, before the first one runs.
     composed = [compose_experiment(overrides) for overrides in grid]
     args.debug = any(experiment.debug for experiment, _ in composed)
     if args.cfg:
@@ -116,12 +117,17 @@ def _train(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from deepracer_exp.training.run import train
+    from deepracer_exp.training.run import read_files, train
 
+    if len(composed) > 1:
+        for experiment, _ in composed:
+            read_files(experiment)
     outcomes = []
     for experiment, composition in composed:
         outcome = train(experiment, composition, Console(stderr=True))
         outcomes.append(outcome)
+        if experiment.debug and outcome.error is not None:
+            traceback.print_exception(outcome.error)
         _tell(outcome, ui=experiment.tracking.kind == "mlflow")
         if outcome.status == "interrupted":
             break
@@ -142,7 +148,11 @@ def _start_workers_early(wanted: bool) -> None:
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
+    # Signals to the process group are for the training process alone; what is ignored now stays so in the server.
+    handlers = {signum: signal.signal(signum, signal.SIG_IGN) for signum in (signal.SIGINT, signal.SIGTERM)}
     forkserver.ensure_running()
+    for signum, handler in handlers.items():
+        signal.signal(signum, handler)
     if before is None:
         del os.environ["OMP_NUM_THREADS"]
     else:
@@ -159,7 +169,8 @@ def _tell(outcome: "Outcome", ui: bool) -> None:
     print(f"\n{outcome.status}: {outcome.reason}")
     print(
         f"  {summary['env_steps']:,} steps, {summary['episodes']:,} episodes, {summary['laps']:,} laps in "
-        f"{summary['wall_clock_s']:.0f} s" + (f", best lap {best:.2f} s" if best is not None else ", no lap yet")
+        f"{summary['wall_clock_s']:.0f} s"
+        + (f", best lap {best:.2f} s" if best is not None else ", no lap yet")
     )
     print(f"\n  results       {outcome.folder}")
     for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -133,12 +133,12 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     for override in map(parse_sweep, overrides):
         if not override.is_sweep_override():
             axes.append([override.input_line or ""])
-        elif override.is_discrete_sweep():
+        elif override.is_discrete_sweep() and not isinstance(override.value(), Glob):
             key = override.get_key_element()
             axes.append([f"{key}={value}" for value in override.sweep_string_iterator()])
         else:
             raise BadInput(
-                f"{override.input_line}: -m takes lists and ranges (seed=0,1,2 or seed=range(3)), no intervals"
+                f"{override.input_line}: no plain grid; -m takes lists and ranges (seed=0,1,2 or seed=range(3))"
             )
     return [list(combination) for combination in itertools.product(*axes)]
 
@@ -150,6 +150,8 @@ def _check_key(override: Override) -> None:
         raise BadInput(
             f"{key}: Hydra's own settings have no effect here; runs_dir says where runs are written"
         )
+    if override.package is not None:
+        raise BadInput(f"{key}@{override.package}: an option's place is its group's; write {key}=OPTION")
     if key in groups() and not override.is_delete() and not isinstance(value, str | list | None):
         raise BadInput(f"{override.input_line}: no such {key}; options: {', '.join(options(key))}")
 

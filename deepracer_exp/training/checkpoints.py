@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint
+from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
 from deepracer_exp.agents.ppo import PPO
 
@@ -34,8 +34,11 @@ class CheckpointStore:
             Whether it is the new best.
         """
         name = f"{counters['iteration']:06d}"
-        Checkpoint(agent=agent).save(self.folder / name, metadata=counters)
-        best = rank is not None and (self._best_rank is None or rank > self._best_rank)
+        if not (self.folder / name).exists():  # nothing is learned between two updates
+            # Memory-mapped tensors, the default, would end the process by SIGBUS on a full disk.
+            archive = StateDictCheckpointAdapter("archive")
+            Checkpoint().register("agent", agent, adapter=archive).save(self.folder / name, metadata=counters)
+        best = self.is_better(rank)
         if best:
             self._best_rank = rank
             self._link("best", name)

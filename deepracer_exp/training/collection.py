@@ -1,10 +1,14 @@
 """Batches of driving, from cars in this process or in several."""
 
 import contextlib
-import logging
+import functools
+import multiprocessing
 import os
 import signal
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,7 +25,7 @@ from .faults import read_fault
 from .watchdog import Watchdog
 from .worker import EnvFactory
 
-logger = logging.getLogger(__name__)
+_LOOK_EVERY_S = 0.2
 
 
 def cores() -> int:
@@ -61,48 +65,35 @@ class Collection:
         Raises:
             RunFailed: a worker did not start.
         """
-        workers = worker_count(config)
-        self._watchdog: Watchdog | None = None
-        self._stack_axis_is_process = config.mode == "sync"
-        shared: dict[str, Any] = {"total_frames": -1, "use_buffers": True, "trust_policy": True}
-        if workers == 0:
-            factory = self._factory(setup, config, 0, config.threads, run_dir, None)
-            self._steps_per_batch = -(-frames_per_batch // config.cars)
-            self._collector: Any = Collector(
-                factory,
-                policy,
-                frames_per_batch=self._steps_per_batch * config.cars,
-                track_traj_ids=False,
-                **shared,
-            )
-        else:
-            parts = workers if config.mode == "sync" else 1
-            self._steps_per_batch = -(-frames_per_batch // (parts * config.cars))
-            heartbeat = run_dir / ".heartbeat"
-            self._watchdog = Watchdog(
-                heartbeat, workers, config.hang_timeout_s, lockstep=config.mode == "sync"
-            )
-            threads = config.threads or 1
-            factories = [
-                self._factory(setup, config, worker, threads, run_dir, heartbeat) for worker in range(workers)
-            ]
-            kind = MultiSyncCollector if config.mode == "sync" else MultiAsyncCollector
-            threads_before = torch.get_num_threads()
-            try:
-                self._collector = kind(
-                    factories,
-                    policy,
-                    frames_per_batch=self._steps_per_batch * parts * config.cars,
-                    num_threads=threads_before,
-                    **({"cat_results": "stack"} if config.mode == "sync" else {}),
-                    **shared,
-                )
-            except (RuntimeError, OSError) as error:
-                self._watchdog.close()
-                raise RunFailed(f"collector workers did not start: {str(error).splitlines()[0]}") from error
-            self._watchdog.workers_started([process.pid for process in self._collector.procs])
+        self._workers = worker_count(config)
+        self._mode = config.mode
+        self._hang_timeout_s = config.hang_timeout_s
         self._run_dir = run_dir
         self._batches = 0
+        self._watchdog: Watchdog | None = None
+        parts = self._workers if config.mode == "sync" else 1
+        self._steps_per_batch = -(-frames_per_batch // (parts * config.cars))
+        factory = functools.partial(EnvFactory, setup=setup, n_cars=config.cars, run_dir=run_dir)
+        options: dict[str, Any] = {
+            "frames_per_batch": self._steps_per_batch * parts * config.cars,
+            "total_frames": -1,
+            "use_buffers": True,
+            "trust_policy": True,
+        }
+        if self._workers == 0:
+            env = factory(worker=0, threads=config.threads, heartbeat=None)
+            self._collector: Any = Collector(env, policy, track_traj_ids=False, **options)
+        else:
+            heartbeat = run_dir / ".heartbeat"
+            self._watchdog = Watchdog(
+                heartbeat, self._workers, config.hang_timeout_s, lockstep=config.mode == "sync"
+            )
+            envs = [
+                factory(worker=worker, threads=config.threads or 1, heartbeat=heartbeat)
+                for worker in range(self._workers)
+            ]
+            self._collector = self._start(envs, policy, options)
+            self._watchdog.workers_started([process.pid for process in self._collector.procs])
         self._source = iter(self._collector)
 
     def __enter__(self) -> "Collection":
@@ -111,6 +102,10 @@ class Collection:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if error is not None and self._watchdog is not None:
+            # TorchRL asks its workers to end and waits up to 10 s for those that are driving.
+            self._watchdog.close()
+            self._end_all()
         self.close()
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -118,8 +113,28 @@ class Collection:
             yield self._next()
 
     def publish_policy(self) -> None:
-        """Give the workers the policy's weights as they are now."""
-        self._collector.update_policy_weights_()
+        """Give the workers the policy's weights as they are now.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+        if self._watchdog is None:
+            self._collector.update_policy_weights_()
+            return
+        # TorchRL waits for a worker's acknowledgement without end, even if the worker is dead.
+        published: Future[None] = Future()
+        threading.Thread(target=self._publish, args=(published,), name="publish", daemon=True).start()
+        for _ in range(round(self._hang_timeout_s / _LOOK_EVERY_S)):
+            with contextlib.suppress(TimeoutError):
+                return published.result(_LOOK_EVERY_S)
+            loss = self._loss()
+            if loss is not None:
+                self._end_all()
+                raise loss
+        self._end_all()
+        raise RunFailed(
+            f"collector worker {self._receiver} took no new weights for {self._hang_timeout_s:.0f} s and was ended"
+        )
 
     def close(self) -> None:
         """End every worker."""
@@ -128,6 +143,40 @@ class Collection:
         if not self._collector.closed:
             self._collector.shutdown()
 
+    def _start(self, envs: list[EnvFactory], policy: torch.nn.Module, options: dict[str, Any]) -> Any:
+        if self._mode == "sync":
+            kind, more = MultiSyncCollector, {"cat_results": "stack"}
+        else:
+            kind, more = MultiAsyncCollector, {}
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._give_up_starting)
+            try:
+                collector = kind(envs, policy, num_threads=torch.get_num_threads(), **more, **options)
+            except (RuntimeError, ValueError, OSError) as error:
+                verdicts = self._watchdog.verdict.items() if self._watchdog is not None else ()
+                hung = next((f"worker {worker} {verdict}" for worker, verdict in verdicts), None)
+                reason = hung or str(error).split(". ")[0].splitlines()[0]
+                raise RunFailed(f"collector workers did not start: {reason}") from error
+            undo.pop_all()
+        return collector
+
+    def _give_up_starting(self) -> None:
+        assert self._watchdog is not None
+        self._watchdog.close()
+        for process in multiprocessing.active_children():
+            process.kill()
+            process.join()
+
+    def _publish(self, published: "Future[None]") -> None:
+        try:
+            for worker in range(self._workers):
+                self._receiver = worker
+                self._collector.update_policy_weights_(worker_ids=worker)
+        except BaseException as error:  # noqa: BLE001 - handed on to the thread that waits
+            published.set_exception(error)
+        else:
+            published.set_result(None)
+
     def _next(self) -> TensorDictBase:
         self._batches += 1
         if self._watchdog is None:
@@ -135,18 +184,26 @@ class Collection:
         self._watchdog.expect(self._batches * self._steps_per_batch)
         try:
             batch = next(self._source)
-        except RuntimeError as error:
-            loss = self._loss()
+        except (RuntimeError, ValueError, OSError, EOFError) as error:  # what TorchRL and a broken pipe raise
+            loss = self._loss(patience_s=2.0)
             if loss is None:
                 raise
             self._end_all()
             raise loss from error
         finally:
             self._watchdog.rest()
-        return batch.flatten(0, 1) if self._stack_axis_is_process else batch
+        return batch.flatten(0, 1) if self._mode == "sync" else batch
 
-    def _loss(self) -> RunFailed | None:
-        """Return what became of the first lost worker, None if all are there."""
+    def _loss(self, patience_s: float = 0.0) -> RunFailed | None:
+        """Return what became of the first lost worker, None if all are there after `patience_s`."""
+        give_up_at = time.monotonic() + patience_s
+        while True:
+            loss = self._loss_now()
+            if loss is not None or time.monotonic() >= give_up_at:
+                return loss
+            time.sleep(_LOOK_EVERY_S)
+
+    def _loss_now(self) -> RunFailed | None:
         assert self._watchdog is not None
         for worker in range(len(self._collector.procs)):
             fault = read_fault(self._run_dir, worker)
@@ -168,21 +225,3 @@ class Collection:
             with contextlib.suppress(ValueError):  # a handle TorchRL has closed: that worker is gone
                 process.kill()
                 process.join()
-
-    @staticmethod
-    def _factory(
-        setup: RaceSetup,
-        config: CollectorConfig,
-        worker: int,
-        threads: int,
-        run_dir: Path,
-        heartbeat: Path | None,
-    ) -> EnvFactory:
-        return EnvFactory(
-            setup=setup,
-            worker=worker,
-            n_cars=config.cars,
-            threads=threads,
-            run_dir=run_dir,
-            heartbeat=heartbeat,
-        )

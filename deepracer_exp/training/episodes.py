@@ -50,7 +50,9 @@ class EpisodeBook:
         """Note a batch of driving.
 
         Args:
-            trace: rows of `formats.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
+            trace: rows of `formats.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T. A car that
+                stands there twice (of asynchronous collection, where one process was faster than the others)
+                drove the lower row later.
 
         Returns:
             The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and
@@ -58,7 +60,15 @@ class EpisodeBook:
         """
         trace = trace.copy()
         cars = trace[:, 0, PACKED["car"]].astype(np.int64)
-        begins = trace[:, :, PACKED["steps"]] == 1
+        for part in _each_car_once(cars):
+            begins = trace[part, :, PACKED["steps"]] == 1
+            trace[part, :, PACKED["episode"]] = self._numbers(cars[part], begins)
+        finished = self._close(trace)
+        rows = trace.reshape(-1, trace.shape[-1])
+        return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
+
+    def _numbers(self, cars: np.ndarray, begins: np.ndarray) -> np.ndarray:
+        """Return the number of each step's episode, (cars, T), from where episodes begin."""
         # Episodes are numbered in the order in which they begin, cars that begin together by their number.
         order = np.argwhere(begins.T)
         numbers = np.full(begins.shape, -1)
@@ -67,10 +77,7 @@ class EpisodeBook:
         numbers[:, 0] = np.maximum(numbers[:, 0], self._number[cars])
         numbers = np.maximum.accumulate(numbers, axis=1)
         self._number[cars] = numbers[:, -1]
-        trace[:, :, PACKED["episode"]] = numbers
-        finished = self._close(trace)
-        rows = trace.reshape(-1, trace.shape[-1])
-        return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
+        return numbers
 
     def _close(self, trace: np.ndarray) -> Finished:
         in_time = trace.transpose(1, 0, 2)
@@ -88,3 +95,12 @@ class EpisodeBook:
             fastest = float(finished.time_s[finished.lap].min())
             self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
         return finished
+
+
+def _each_car_once(cars: np.ndarray) -> list[np.ndarray]:
+    """Return the rows at which each car stands for the first time, for the second time, and so on."""
+    order = np.argsort(cars, kind="stable")
+    _, first, counts = np.unique(cars[order], return_index=True, return_counts=True)
+    turn = np.empty(len(cars), np.int64)
+    turn[order] = np.arange(len(cars)) - np.repeat(first, counts)
+    return [np.flatnonzero(turn == nth) for nth in range(turn.max() + 1)]

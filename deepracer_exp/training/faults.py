@@ -1,5 +1,6 @@
 """What failed and in which state, on disk."""
 
+import contextlib
 import json
 import math
 from pathlib import Path
@@ -10,39 +11,42 @@ import numpy as np
 from deepracer_exp.env.race import Race
 from deepracer_exp.errors import RunFailed
 
+from .files import write_whole
+
 FAULTS_DIR = "faults"
 
 
-def write_fault(run_dir: Path, error: RunFailed, race: Race | None, worker: int | None = None) -> Path:
-    """Write the error's line, the params of a reward call and the cars' state under `faults/`.
+def keep_state(error: RunFailed, race: Race) -> None:
+    """Give an error that has no `arrays` the cars' state as it is now."""
+    if not hasattr(error, "arrays"):
+        error.arrays = race.state_arrays()  # type: ignore[attr-defined]
+
+
+def write_fault(run_dir: Path, error: BaseException, worker: int | None = None) -> None:
+    """Write the error's line, its `params` and `arrays` where it has them under `faults/`, as JSON and .npz.
+
+    A disk that takes no more is no reason to lose the error: what does not fit is left out.
 
     Args:
         run_dir: folder of the run.
-        error: what happened; its `arrays` and `params` are kept where it has them.
-        race: the cars, None where no car is to blame.
+        error: what happened.
         worker: number of the process, None for the training process.
-
-    Returns:
-        The JSON file; an .npz of arrays stands beside it.
     """
     folder = run_dir / FAULTS_DIR
-    folder.mkdir(exist_ok=True)
     stem = "training" if worker is None else f"worker-{worker}"
-    arrays: dict[str, np.ndarray] = dict(getattr(error, "arrays", {}))
-    if race is not None and not arrays:
-        arrays = race.state_arrays()
-    if arrays:
-        with (folder / f"{stem}.npz").open("wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     report = {
         "error": type(error).__name__,
         "message": str(error),
         "worker": worker,
         "params": _plain(getattr(error, "params", None)),
     }
-    path = folder / f"{stem}.json"
-    path.write_text(json.dumps(report, indent=2), encoding="utf-8")
-    return path
+    with contextlib.suppress(OSError):
+        folder.mkdir(exist_ok=True)
+        write_whole(folder / f"{stem}.json", json.dumps(report, indent=2) + "\n")
+        arrays: dict[str, np.ndarray] = getattr(error, "arrays", {})
+        if arrays:
+            with (folder / f"{stem}.npz").open("wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_fault(run_dir: Path, worker: int) -> str | None:

@@ -1,6 +1,5 @@
 """One experiment, from its configuration to a folder of results."""
 
-import contextlib
 import json
 import logging
 import time
@@ -23,8 +22,9 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import ReliableStopping
 from deepracer_exp.env.observation import feature_names
-from deepracer_exp.env.setup import build_setup
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.env.reward import RewardFunction
+from deepracer_exp.env.setup import RaceSetup, build_setup
+from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.formats.trace import TraceWriter, to_table
 from deepracer_exp.tracking.names import run_params, run_tags
 from deepracer_exp.tracking.recorder import open_tracker
@@ -58,6 +58,8 @@ class Outcome:
     exit_code: int
     folder: Path
     summary: dict[str, Any]
+    error: BaseException | None = None
+    """What a failed run failed of."""
 
 
 class Training:
@@ -67,16 +69,24 @@ class Training:
         """Read the experiment's files, make its folder and begin to record.
 
         Raises:
-            BadInput: a file or the run folder cannot be used, or values contradict.
+            BadInput: a file or the run folder cannot be used, or values contradict; no folder is left.
         """
         self.experiment = experiment
-        self.setup = build_setup(experiment)
+        self.setup = read_files(experiment)
         self._tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
         self.names = _names(composition, self.setup.track.name, self.setup.reward.name)
         label = f"{self.names['track']}-{self.names['reward']}-seed{experiment.seed}"
         self.folder = RunFolder(experiment.runs_dir, experiment.name, label)
-        commit = self.folder.describe(composition, self.setup.reward, experiment.seed)
-        self._log_file = _log_to(self.folder.path / "log.txt")
+        try:
+            commit = self.folder.describe(composition, self.setup.reward, experiment.seed)
+            self._log_file = _log_to(self.folder.path / "log.txt")
+            self.checkpoints = CheckpointStore(self.folder.path)
+        except OSError as error:
+            self.folder.remove()
+            raise BadInput(
+                f"runs_dir={experiment.runs_dir}: cannot write {error.filename}: {error.strerror}; give a folder with "
+                "room"
+            ) from error
         self._tracker.start(
             # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
             f"{self.names['reward']} s{experiment.seed} {time.strftime('%H:%M:%S')}",
@@ -88,7 +98,6 @@ class Training:
         stopping = experiment.stopping
         cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
         self.book = EpisodeBook(cars, stopping.episodes if isinstance(stopping, ReliableStopping) else 50)
-        self.checkpoints = CheckpointStore(self.folder.path)
         self.trace = TraceWriter(self.folder.path / "trace")
         self.display = ProgressDisplay(console, self._header())
         # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
@@ -133,9 +142,28 @@ class Training:
         raise RunFailed("the collector ended without a reason")
 
     def close(self, status: str, reason: str, exit_code: int) -> Outcome:
-        """Write what remains to be written and let go of the tracker."""
-        if self.iteration and status != "failed":
+        """Write what a run has at its end: checkpoint, pictures, summary.
+
+        Raises:
+            OSError, RunFailed: the folder takes no more.
+        """
+        if self.iteration:
             self.checkpoints.save(self.agent, self._counters(), None)
+        write_report(self.folder.path, self.setup.track)
+        return self._end(status, reason, exit_code)
+
+    def fail(self, reason: str, error: BaseException) -> Outcome:
+        """Write what is known of a failure; a disk that takes no more leaves no summary, and keeps no one waiting."""
+        write_fault(self.folder.path, error)
+        return self._end("failed", reason, RunFailed.exit_code, error)
+
+    def break_off(self, exit_code: int) -> Outcome:
+        """End at once: no checkpoint, which might be of a half-made update, and no pictures."""
+        return self._end("interrupted", "ended at once by a second signal", exit_code)
+
+    def _end(self, status: str, reason: str, exit_code: int, error: BaseException | None = None) -> Outcome:
+        """Write the summary and let go of the tracker and the log."""
+        path = self.folder.path
         summary = {
             "status": status,
             "reason": reason,
@@ -148,10 +176,12 @@ class Training:
             "reliable": self._reliable,
             "last": self._row,
         }
-        path = self.folder.path
-        if status != "failed":
-            write_report(path, self.setup.track)
-        self.folder.write("summary.json", json.dumps(summary, indent=2) + "\n")
+        logger.log(logging.ERROR if error else logging.INFO, "%s: %s", status, reason, exc_info=error)
+        try:
+            self.folder.write("summary.json", json.dumps(summary, indent=2) + "\n")
+        except OSError:
+            if status != "failed":
+                raise
         for name in ("config.yaml", "overrides.yaml", "provenance.json", "reward_function.py"):
             self._tracker.log_artifact(path / name)
         for name in ("summary.json", "metrics.jsonl", "log.txt", "best_lap.png", "learning.png", "faults"):
@@ -164,7 +194,7 @@ class Training:
         self._tracker.finish({"finished": "FINISHED", "failed": "FAILED"}.get(status, "KILLED"))  # type: ignore[arg-type]
         logger.removeHandler(self._log_file)
         self._log_file.close()
-        return Outcome(status, reason, exit_code, path, summary)
+        return Outcome(status, reason, exit_code, path, summary, error)
 
     def _learn(self, batch: TensorDictBase) -> UpdateMetrics:
         _, fraction = self._spent()
@@ -281,43 +311,49 @@ def train(experiment: Experiment, composition: Composition, console: Console) ->
     Raises:
         BadInput: before anything was started.
     """
-    training = Training(experiment, composition, console)
+    # From here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption() as interruption:
+        training = Training(experiment, composition, console)
         try:
-            with contextlib.ExitStack() as stack:
-                stack.enter_context(training.display)
-                collection = stack.enter_context(
-                    Collection(
-                        experiment.collector,
-                        training.setup,
-                        training.policy,
-                        _frames_per_batch(experiment),
-                        training.folder.path,
-                    )
-                )
-                reason = training.loop(collection, interruption)
+            reason = _drive_and_learn(training, interruption)
+            code = interruption.exit_code
+            return training.close("finished" if code is None else "interrupted", reason, code or 0)
         except RunFailed as error:
-            write_fault(training.folder.path, error, None)
-            return training.close("failed", str(error), RunFailed.exit_code)
+            return training.fail(str(error), error)
         except OSError as error:
-            reason = f"{error.filename or training.folder.path}: {error.strerror}"
-            return _close_without_disk(training, reason)
-        except KeyboardInterrupt:
-            return training.close(
-                "interrupted", "ended at once by a second signal", interruption.exit_code or 130
+            return training.fail(
+                f"{error.filename or training.folder.path}: {error.strerror or error}", error
             )
-    code = interruption.exit_code
-    if code is not None:
-        return training.close("interrupted", reason, code)
-    return training.close("finished", reason, 0)
+        except KeyboardInterrupt:
+            return training.break_off(interruption.exit_code or 130)
+        except Exception as error:
+            # A fault of ours: told with its traceback, but the run must not look as if it went on.
+            training.fail(f"{type(error).__name__}: {error}", error)
+            raise
 
 
-def _close_without_disk(training: Training, reason: str) -> Outcome:
-    """End a run whose folder takes no more: there may be no room for the summary either."""
-    try:
-        return training.close("failed", reason, RunFailed.exit_code)
-    except OSError:
-        return Outcome("failed", reason, RunFailed.exit_code, training.folder.path, {})
+def read_files(experiment: Experiment) -> RaceSetup:
+    """Read the files an experiment names and run the reward function's module once.
+
+    Raises:
+        BadInput: a file is missing or malformed, or values contradict.
+    """
+    setup = build_setup(experiment)
+    RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
+    return setup
+
+
+def _drive_and_learn(training: Training, interruption: Interruption) -> str:
+    experiment = training.experiment
+    frames = _frames_per_batch(experiment)
+    # The view first: workers take a second or two to start.
+    with (
+        training.display,
+        Collection(
+            experiment.collector, training.setup, training.policy, frames, training.folder.path
+        ) as collection,
+    ):
+        return training.loop(collection, interruption)
 
 
 def _iterations(
@@ -376,8 +412,13 @@ def _mean(values: np.ndarray) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the base class's name
+        """Say nothing: the run's end tells of a full disk, in one line."""
+
+
 def _log_to(path: Path) -> logging.FileHandler:
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -4,6 +4,7 @@ import datetime
 import json
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -16,6 +17,8 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.env.reward_source import RewardSource, source_with_constants
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.store import redact
+
+from .files import write_whole
 
 _PACKAGES = ("deepracer-exp", "torch", "torchrl", "tensordict", "mujoco", "hydra-core", "mlflow", "numpy")
 
@@ -72,10 +75,11 @@ class RunFolder:
 
     def write(self, name: str, text: str) -> Path:
         """Write a file whole or not at all."""
-        path = self.path / name
-        aside = self.path / f".{name}.tmp"
-        aside.write_text(text, encoding="utf-8")
-        return aside.replace(path)
+        return write_whole(self.path / name, text)
+
+    def remove(self) -> None:
+        """Take back a folder in which no run has begun."""
+        shutil.rmtree(self.path, ignore_errors=True)
 
 
 def git_commit() -> str | None:

@@ -1,5 +1,7 @@
 """Notices a worker process that hangs, and ends it."""
 
+import contextlib
+import multiprocessing
 import os
 import signal
 import threading
@@ -10,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 _LOOK_EVERY_S = 0.5
-# Imports of torch and torchrl on a loaded machine; a hang before the first step has no other sign.
-_START_TIMEOUT_S = 60.0
+# Building the cars takes 2 s on a quiet machine; a hang before the first step has no other sign.
+_START_TIMEOUT_S = 25.0
 
 
 class Watchdog:
@@ -35,13 +37,15 @@ class Watchdog:
         np.full(workers, -1, np.int64).tofile(heartbeat)
         self._beats = np.memmap(heartbeat, np.int64, "r")
         self._timeout_s = timeout_s
+        self._start_timeout_s = max(_START_TIMEOUT_S, timeout_s)
         self._lockstep = lockstep
         self._due = 0
-        self._pids: Sequence[int] = ()
+        self._pids: Sequence[int] | None = None
         self._waiting = threading.Event()
         self._waiting.set()
         self._over = threading.Event()
         self.verdict: dict[int, str] = {}
+        """Of each worker that was ended: what it had done."""
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
 
@@ -73,14 +77,24 @@ class Watchdog:
             beats = np.array(self._beats)
             resting = self._lockstep and self._due > 0
             owes = (beats < self._due) if resting else np.ones(len(beats), bool)
-            idle_s += (now - looked) if self._waiting.is_set() else 0.0
+            # A longer pause was ours: the whole run stopped with Ctrl-Z, or the machine asleep.
+            idle_s += min(now - looked, 2 * _LOOK_EVERY_S) if self._waiting.is_set() else 0.0
             idle_s[(beats != seen) | ~owes] = 0.0
             seen, looked = beats, now
-            for worker in np.flatnonzero(idle_s > np.where(beats > 0, self._timeout_s, _START_TIMEOUT_S)):
+            for worker in np.flatnonzero(
+                idle_s > np.where(beats > 0, self._timeout_s, self._start_timeout_s)
+            ):
                 self._end(int(worker), float(idle_s[worker]), int(beats[worker]))
 
     def _end(self, worker: int, idle_s: float, steps: int) -> None:
-        if worker in self.verdict or worker >= len(self._pids):
+        if worker in self.verdict:
             return
-        self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {steps} steps) and was ended"
-        os.kill(self._pids[worker], signal.SIGKILL)
+        self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
+        if self._pids is not None:
+            # It may have died on its own meanwhile.
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pids[worker], signal.SIGKILL)
+        else:
+            # They are still being started, and nothing says yet which is which: none of them can go on alone.
+            for process in multiprocessing.active_children():
+                process.kill()

@@ -1,6 +1,7 @@
 """What happens inside a collector's process."""
 
 import ctypes
+import multiprocessing
 import os
 import signal
 import sys
@@ -18,7 +19,7 @@ from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 
-from .faults import write_fault
+from .faults import keep_state, write_fault
 
 PRINTS_FILE = "reward_prints.log"
 
@@ -41,6 +42,8 @@ class EnvFactory:
 
     def __call__(self) -> RaceEnv:
         """Return the environment, with the process around it made ready."""
+        if self.heartbeat is not None:
+            _obey_parent_only()
         # Sampling of actions is a worker's own stream, whatever the other workers do.
         torch.manual_seed(int(np.random.SeedSequence([self.setup.seed, self.worker]).generate_state(1)[0]))
         race = Race(
@@ -51,8 +54,7 @@ class EnvFactory:
             prints=RewardPrints(self.run_dir / PRINTS_FILE),
         )
         if self.heartbeat is None:
-            return RaceEnv(race)
-        _obey_parent_only()
+            return _StateKeepingEnv(race)
         return _WorkerEnv(race, self._beat(self.heartbeat), self.run_dir, self.worker)
 
     def _beat(self, heartbeat: Path) -> Callable[[], None]:
@@ -66,8 +68,19 @@ class EnvFactory:
         return beat
 
 
-class _WorkerEnv(RaceEnv):
-    """A RaceEnv whose failure is put on disk for the training process to find; then the worker is gone."""
+class _StateKeepingEnv(RaceEnv):
+    """A RaceEnv whose failure carries the cars' state."""
+
+    def _step(self, tensordict):  # type: ignore[no-untyped-def]
+        try:
+            return super()._step(tensordict)
+        except RunFailed as error:
+            keep_state(error, self.race)
+            raise
+
+
+class _WorkerEnv(_StateKeepingEnv):
+    """An environment whose failure is put on disk for the training process to find; then the worker is gone."""
 
     def __init__(self, race: Race, beat: Callable[[], None], run_dir: Path, worker: int):
         super().__init__(race, on_step=beat)
@@ -78,24 +91,30 @@ class _WorkerEnv(RaceEnv):
         try:
             return super()._step(tensordict)
         except RunFailed as error:
-            write_fault(self._run_dir, error, self.race, worker=self._worker)
+            write_fault(self._run_dir, error, worker=self._worker)
             sys.stderr.flush()
             # No traceback from here: the training process prints the one line and holds the exit code.
             os._exit(RunFailed.exit_code)
 
 
 def _obey_parent_only() -> None:
-    """Leave Ctrl-C to the training process, and never outlive it."""
+    """Leave Ctrl-C and SIGTERM to the training process, and never outlive it."""
+    # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes of a run.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
     if sys.platform == "linux":
+        # From the fork server, which ends with the training process. Holds in C code that never returns, too.
         PR_SET_PDEATHSIG = 1
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if not parent.is_alive():
+            os._exit(RunFailed.exit_code)
     else:
-        parent = os.getppid()
 
-        def watch() -> None:
-            while os.getppid() == parent:
-                threading.Event().wait(1.0)
+        def follow() -> None:
+            parent.join()
             os._exit(RunFailed.exit_code)
 
-        threading.Thread(target=watch, daemon=True).start()
+        threading.Thread(target=follow, daemon=True).start()

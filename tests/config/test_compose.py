@@ -1,0 +1,323 @@
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepracer_exp.config.compose import compose_experiment, expand_grid, options_of, validate
+from deepracer_exp.config.overrides import parse_single
+from deepracer_exp.errors import BadInput
+
+
+def refusal(*overrides: str) -> str:
+    with pytest.raises(BadInput) as caught:
+        compose_experiment(overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+# --- What is accepted
+
+
+def test_the_default_experiment_composes():
+    experiment, composition = compose_experiment([])
+    assert experiment.track.name == composition.choices["track"] == "reinvent_base"
+    assert "experiment" not in composition.choices
+
+
+def test_the_last_of_two_overrides_counts():
+    assert compose_experiment(["seed=1", "seed=2"])[0].seed == 2
+
+
+def test_values_override_a_chosen_experiment():
+    experiment, composition = compose_experiment(["experiment=tiny", "budget.env_steps=77"])
+    assert (experiment.name, experiment.budget.env_steps, composition.choices["experiment"]) == (
+        "tiny",
+        77,
+        "tiny",
+    )
+
+
+def test_an_experiment_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        compose_experiment([])[0].seed = 3
+
+
+@pytest.mark.parametrize("prefix", ["", "+", "++"])
+def test_a_constant_of_the_reward_needs_no_plus(prefix):
+    experiment, _ = compose_experiment([f"{prefix}reward.constants.SPEED_WEIGHT=2.5"])
+    assert experiment.reward.constants == {"SPEED_WEIGHT": 2.5}
+
+
+def test_an_option_may_be_named_as_its_file():
+    assert compose_experiment(["track=Oval_track.yaml"])[1].choices["track"] == "Oval_track"
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["experiment=fast_lap", "track=reinvent_wood"],
+        ["track.file=/tmp/ein Weg, (schön) = gut/ü's.npy", "algorithm.lr=1e-5", "reward.constants.A=-3"],
+        ["budget.wall_clock_s=1e3", "runs_dir='2024'", "track.title='yes: no'"],
+    ],
+)
+def test_what_is_printed_can_be_read_back(overrides):
+    experiment, composition = compose_experiment(overrides)
+    assert validate(yaml.safe_load(composition.yaml())) == experiment
+
+
+# --- Paths and addresses are typed as they are
+
+KEYS = ["track.file", "reward.file", "action_space.file", "runs_dir", "tracking.uri"]
+
+
+def value_of(key: str, experiment: object) -> object:
+    for part in key.split("."):
+        experiment = getattr(experiment, part)
+    return experiment
+
+
+def test_every_path_and_address_is_taken_as_typed():
+    experiment, _ = compose_experiment([f"{key}=a b, (ü)=c/{key}" for key in KEYS])
+    assert [value_of(key, experiment) for key in KEYS] == [f"a b, (ü)=c/{key}" for key in KEYS]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/data/my tracks/oval.npy",
+        "Strecken/Nürburg (alt)/größe.npy",
+        "a,b/c=d.npy",
+        "it's/here.py",
+        'say "hi".py',
+        r"C:\cars\new\it's.py",
+        "folder\\",
+        "http://localhost:5000/?a=b&c={d}#e",
+        "[1]",
+        "2024",
+        "true",
+        "日本/鈴鹿.npy",
+        "50%:$x.npy",
+        " leading and trailing ",
+    ],
+)
+def test_a_path_or_address_needs_no_quotes(text):
+    assert compose_experiment([f"reward.file={text}"])[0].reward.file == text
+
+
+@given(
+    text=st.text(
+        st.characters(exclude_categories=["Cs", "Cc"], exclude_characters="$\u2028\u2029"), min_size=1
+    ).filter(lambda text: text[0] not in "'\"~" and text.lower() != "null")
+)
+def test_any_text_is_taken_as_a_path(text):
+    assert parse_single(f"reward.file={text}").value() == text
+
+
+@pytest.mark.parametrize("quote", ["'", '"'])
+def test_hydras_quotes_are_understood(quote):
+    override = f"track.file={quote}a b,(1)=ä.npy{quote}"
+    assert compose_experiment([override])[0].track.file == "a b,(1)=ä.npy"
+
+
+def test_a_path_may_be_taken_back():
+    assert compose_experiment(["track.file=a.npy", "track.file=null"])[0].track.file is None
+
+
+def test_the_home_folder_is_filled_in(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert compose_experiment(["track.file=~/a.npy"])[0].track.file == str(tmp_path / "a.npy")
+
+
+def test_an_environment_variable_is_filled_in(monkeypatch):
+    monkeypatch.setenv("RACES", "/data/ä b")
+    assert compose_experiment(["runs_dir=${oc.env:RACES}/x"])[0].runs_dir == "/data/ä b/x"
+
+
+# --- What is refused
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("track=Ovaltrack", ["track=Ovaltrack", "did you mean Oval_track?", "Monaco"]),
+        ("experiment=tyni", ["experiment=tyni", "did you mean tiny?"]),
+        ("network=3", ["network=3: no such network", "mlp_small"]),
+        ("track={a:1}", ["no such track", "Oval_track"]),
+        ("sed=1", ["sed: no such key (did you mean seed?)"]),
+        ("algoritm=ppo", ["did you mean algorithm?"]),
+        ("lr=1", ["did you mean algorithm.lr?"]),
+        ("algorithm.epoch=1", ["did you mean epochs?"]),
+        ("algorithm.learning_rate=1", ["with algorithm=ppo", "known: lr, batch_size"]),
+        (
+            "lr_schedule.length=3",
+            ["lr_schedule.length: no such key with lr_schedule=constant", "known: kind, by, warmup"],
+        ),
+        ("+foo=1", ["foo: no such key"]),
+        ("+algorithm.foo=1", ["algorithm.foo: no such key", "known: lr"]),
+        ("+track.floor.x=1", ["track.floor.x: no such key", "friction"]),
+        ("++car.weight_kg=1", ["car.weight_kg: no such key"]),
+        ("track@other=Oval_track", ["write track=OPTION"]),
+        ("hydra.run.dir=x", ["hydra.run.dir", "runs_dir"]),
+        ("hydra/launcher=basic", ["hydra/launcher"]),
+        ("~track", ["track: missing"]),
+        ("~reward.constants.X", ["reward.constants.X"]),
+    ],
+)
+def test_an_unknown_name_is_told_the_nearest_known_one(override, parts):
+    message = refusal(override)
+    for part in parts:
+        assert part in message
+
+
+def test_an_unknown_key_is_looked_for_in_the_chosen_option():
+    assert "with tracking=off; known: kind" in refusal("tracking=off", "tracking.uri=x")
+    assert "did you mean length?" in refusal("lr_schedule=step", "lr_schedule.lenght=2")
+
+
+@pytest.mark.parametrize(
+    ("override", "accepted"),
+    [
+        ("seed=a", "valid integer"),
+        ("seed=1.5", "integer"),
+        ("seed=true", "valid integer"),
+        ("seed=-1", "greater than or equal to 0"),
+        ("seed=2147483648", "less than 2147483648"),
+        ("algorithm.lr='3'", "valid number"),
+        ("algorithm.lr=true", "valid number"),
+        ("algorithm.lr=0", "greater than 0"),
+        ("algorithm.lr=nan", "finite"),
+        ("algorithm.lr=inf", "finite"),
+        ("algorithm.discount=1.1", "less than or equal to 1"),
+        ("algorithm.batch_size=0", "greater than or equal to 1"),
+        ("debug=yes", "valid boolean"),
+        ("debug=1", "valid boolean"),
+        ("name=a/b", "pattern"),
+        ("name=..", "pattern"),
+        ("runs_dir=", "at least 1 character"),
+        ("collector.processes=0", "greater than or equal to 1"),
+        ("track.direction=backwards", "'forward' or 'reversed'"),
+        ("track.floor.road_color=red", "pattern"),
+        ("car.solver=foo", "'newton' or 'cg'"),
+        ("episode.start_offset=1", "less than 1"),
+        ("reward.constants.X=abc", "valid number"),
+        ("observation.lookahead_m=[1,-2]", "greater than 0"),
+        ("action_space.actions=[{steering_angle: 99, speed: 1}]", "less than or equal to 60"),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepted):
+    message = refusal(override)
+    assert message.startswith(override.split("=")[0])
+    assert accepted in message
+
+
+@pytest.mark.parametrize(
+    ("overrides", "both"),
+    [
+        (["algorithm.batch_size=9999", "algorithm.frames_per_iteration=4096"], ["9999", "4096"]),
+        (
+            ["algorithm.frames_per_iteration=300", "algorithm.batch_size=1", "collector.cars=301"],
+            ["300", "301"],
+        ),
+        (["algorithm.episodes_per_iteration=3"], ["frames_per_iteration=", "episodes_per_iteration=3"]),
+        (
+            ["algorithm.frames_per_iteration=null"],
+            ["frames_per_iteration=None", "episodes_per_iteration=None"],
+        ),
+        (["collector=in_process", "collector.processes=3"], ["processes=3", "in_process"]),
+        (["track.width_m=[1,2]"], ["2 values", "32"]),
+        (["car.min_speed_mps=5"], ["5.0", "4.0"]),
+        (["car.rear_axle_x_m=1"], ["1.0", "0.082311"]),
+        (["budget.env_steps=null"], ["env_steps", "iterations", "wall_clock_s"]),
+    ],
+)
+def test_values_that_contradict_each_other_are_both_named(overrides, both):
+    message = refusal(*overrides)
+    for part in both:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    "override", ["seed", "", "=3", "seed: 1", "seed=1=2", "--multirun", "name=ü", "seed==1"]
+)
+def test_what_is_no_override_is_told_how_to_write_one(override):
+    assert "GROUP=OPTION or KEY=VALUE" in refusal(override)
+
+
+def test_quotes_are_suggested_where_they_are_needed():
+    assert "\"track.title='Nürburg'\"" in refusal("track.title=Nürburg")
+    assert compose_experiment(["track.title='Nürburg'"])[0].track.title == "Nürburg"
+
+
+@pytest.mark.parametrize(
+    "override", ["seed=1,2", "network=mlp,mlp_small", "seed=range(3)", "seed=choice(1,2)"]
+)
+def test_several_values_without_m_are_told_of_m(override):
+    message = refusal(override)
+    assert message.startswith(override)
+    assert "-m" in message
+
+
+def test_an_unknown_group_is_told_the_groups():
+    with pytest.raises(BadInput, match=r"did you mean track\?.*network"):
+        options_of("trak")
+    assert "Monaco" in options_of("track")
+
+
+# --- Grids
+
+
+def test_a_grid_is_every_combination_the_last_key_fastest():
+    assert expand_grid(["seed=1,2", "experiment=tiny", "network=mlp,mlp_small"]) == [
+        ["seed=1", "experiment=tiny", "network=mlp"],
+        ["seed=1", "experiment=tiny", "network=mlp_small"],
+        ["seed=2", "experiment=tiny", "network=mlp"],
+        ["seed=2", "experiment=tiny", "network=mlp_small"],
+    ]
+
+
+def test_a_grid_of_nothing_is_one_run():
+    assert expand_grid([]) == [[]]
+    assert expand_grid(["seed=3"]) == [["seed=3"]]
+
+
+def test_ranges_and_choices_are_lists():
+    assert expand_grid(["seed=range(1,4)"]) == [["seed=1"], ["seed=2"], ["seed=3"]]
+    assert expand_grid(["seed=choice(5,7)"]) == [["seed=5"], ["seed=7"]]
+
+
+@pytest.mark.parametrize(
+    ("override", "files"),
+    [
+        ("reward.file=a.py,b.py", ["a.py", "b.py"]),
+        ("reward.file=mein Lohn.py,größer (2).py", ["mein Lohn.py", "größer (2).py"]),
+        ("reward.file='a,b.py',c.py", ["a,b.py", "c.py"]),
+        ("reward.file=null,a.py", [None, "a.py"]),
+        ("reward.file=nur ä.py", ["nur ä.py"]),
+    ],
+)
+def test_a_grid_of_paths_gives_each_path(override, files):
+    runs = expand_grid([override])
+    assert [compose_experiment(run)[0].reward.file for run in runs] == files
+
+
+@pytest.mark.parametrize("override", ["algorithm.lr=interval(0,1)", "track=glob(re*)"])
+def test_what_is_no_plain_grid_is_refused(override):
+    with pytest.raises(BadInput, match="lists and ranges"):
+        expand_grid([override])
+
+
+def test_a_grid_of_a_malformed_override_is_refused():
+    with pytest.raises(BadInput, match="GROUP=OPTION or KEY=VALUE"):
+        expand_grid(["seed=1,2", "seed"])
+
+
+def test_the_configuration_stays_usable_after_a_refusal(tmp_path, monkeypatch):
+    refusal("track=Nowhere")
+    monkeypatch.chdir(tmp_path)
+    assert compose_experiment(["track=Monaco"])[0].track.name == "Monaco"
+    assert list(Path(tmp_path).iterdir()) == []

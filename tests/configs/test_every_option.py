@@ -1,0 +1,118 @@
+import dataclasses
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.config.compose import Composition, compose_experiment, conf_dir, groups, options
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.training.budget import Budget
+
+EVERY_OPTION = [(group, name) for group in groups() for name in options(group)]
+EXPERIMENTS = options("experiment")
+DRIVEN = ("track", "car", "action_space", "observation", "randomization", "episode", "reward")
+
+
+@cache
+def composed(group: str, name: str) -> tuple[Experiment, Composition]:
+    return compose_experiment([f"{group}={name}"])
+
+
+def test_the_groups_are_the_fields_of_an_experiment():
+    fields = {field.name for field in dataclasses.fields(Experiment)}
+    assert set(groups()) - {"experiment"} <= fields
+    assert fields - set(groups()) == {"name", "seed", "runs_dir", "debug"}
+
+
+def test_the_entry_point_names_an_option_of_every_group():
+    entry = yaml.safe_load((conf_dir() / "train.yaml").read_text())
+    named = {group for item in entry["defaults"] if isinstance(item, dict) for group in item}
+    assert named == set(groups())
+
+
+@pytest.mark.parametrize(("group", "name"), EVERY_OPTION)
+def test_every_option_composes_into_the_default_experiment(group, name):
+    experiment, composition = composed(group, name)
+    assert composition.choices[group] == name
+    assert isinstance(experiment, Experiment)
+
+
+def keys(value: object) -> object:
+    """Return the tree of keys below a value; a user's own mapping and numbers have none."""
+    if isinstance(value, dict):
+        return {key: keys(item) for key, item in value.items() if key != "constants"}
+    if isinstance(value, list | tuple):
+        return [keys(item) for item in value]
+    return None
+
+
+@pytest.mark.parametrize(("group", "name"), EVERY_OPTION)
+def test_the_yaml_and_the_dataclass_have_the_same_keys(group, name):
+    experiment, composition = composed(group, name)
+    assert keys(dataclasses.asdict(experiment)) == keys(composition.mapping)
+
+
+@pytest.mark.parametrize(("group", "name"), [(g, n) for g, n in EVERY_OPTION if g != "experiment"])
+def test_an_option_file_holds_its_groups_keys_alone_each_explained(group, name):
+    path = conf_dir() / group / f"{name}.yaml"
+    content = yaml.safe_load(path.read_text())
+    fields = {field.name for field in dataclasses.fields(getattr(composed(group, name)[0], group))}
+    assert set(content) - {"defaults"} <= fields
+    if "defaults" not in content:
+        assert set(content) == fields
+    lines = path.read_text().splitlines()
+    for above, line in zip(["", *lines], lines, strict=False):
+        if re.match(r"(?!defaults)\w+:", line):
+            assert above.startswith("#"), f"{path.name}: {line} has no comment above it"
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_is_named_after_its_file(name):
+    assert composed("experiment", name)[0].name == name
+
+
+@pytest.mark.parametrize(("group", "name"), [(g, n) for g, n in EVERY_OPTION if g in (*DRIVEN, "experiment")])
+def test_every_option_puts_cars_on_the_road(group, name):
+    experiment, _ = composed(group, name)
+    race = Race(build_setup(experiment), 2)
+    race.reset()
+    n_actions = race.setup.actions.n
+    for _ in range(4):
+        race.step(np.zeros((2, 2)) if n_actions is None else np.full(2, n_actions // 2))
+    assert np.isfinite(race.observation).all()
+    assert np.isfinite(race.reward).all()
+    assert not race.terminated.any()
+
+
+@pytest.mark.parametrize("name", options("network"))
+def test_every_network_is_built(name):
+    network = composed("network", name)[0].network
+    assert build_actor_critic(network, 19, 5, torch.Generator().manual_seed(0)).policy
+
+
+@pytest.mark.parametrize("name", options("lr_schedule"))
+def test_every_schedule_gives_a_rate(name):
+    schedule = Schedule(composed("lr_schedule", name)[0].lr_schedule)
+    assert 0 <= schedule.factor(0, 0.0) <= 1
+
+
+@pytest.mark.parametrize("name", options("budget"))
+def test_every_budget_ends_a_run(name):
+    budget = Budget(composed("budget", name)[0].budget)
+    assert budget.used(0, 0, 0.0)[1] == 0
+    assert budget.used(10**12, 10**9, 1e12)[1] >= 1
+
+
+def test_every_reward_of_the_zoo_has_an_option_of_its_name():
+    zoo = {path.stem for path in (Path(conf_dir()).parent / "reward_zoo").glob("[!_]*.py")}
+    assert set(options("reward")) == zoo
+    for name in zoo:
+        assert composed("reward", name)[0].reward.name == name

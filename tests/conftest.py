@@ -1,0 +1,240 @@
+"""The command line, called in this process or started as a process of its own."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from deepracer_exp.cli import main
+
+PATIENCE_S = 120.0
+"""For what must happen, on a machine that may be busy."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What a command left behind."""
+
+    code: int
+    stdout: str
+    stderr: str
+    cwd: Path
+
+    @property
+    def folders(self) -> list[Path]:
+        """Return the run folders under `runs/`, oldest first."""
+        return sorted(path.parent for path in self.cwd.glob("runs/*/*/config.yaml"))
+
+    @property
+    def folder(self) -> Path:
+        (folder,) = self.folders
+        return folder
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))
+
+    @property
+    def metrics(self) -> list[dict[str, Any]]:
+        text = (self.folder / "metrics.jsonl").read_text(encoding="utf-8")
+        return [json.loads(line) for line in text.splitlines()]
+
+    @property
+    def complaint(self) -> str:
+        """Return the one line that says what is wrong."""
+        assert "Traceback" not in self.stderr, self.stderr
+        (line,) = [line for line in self.stderr.splitlines() if line.startswith("deepracer-exp: ")]
+        return line
+
+    def assert_bad_input(self, *words: str) -> None:
+        """Refused before anything began."""
+        assert self.code == 2, self.stderr
+        assert not list(self.cwd.glob("runs/*/*")), "a run folder was made"
+        for word in words:
+            assert word in self.complaint
+        assert self.stdout == ""
+
+    def assert_run_failed(self, *words: str) -> None:
+        """Failed with one line, and says so in its folder."""
+        assert self.code == 3, self.stderr
+        assert self.complaint.startswith("deepracer-exp: run failed: ")
+        for word in words:
+            assert word in self.complaint
+        assert f"what is known: {self.folder.relative_to(self.cwd)}" in self.stderr
+        assert self.summary["status"] == "failed"
+        assert self.summary["reason"] in self.complaint
+        assert "finished" not in self.stdout
+        assert not (self.folder / ".heartbeat").exists()
+
+
+class Started:
+    """A command that runs in a session of its own, with everything it has started."""
+
+    def __init__(self, arguments: Sequence[str], cwd: Path, env: dict[str, str] | None = None):
+        self.cwd = cwd
+        self._shm = _shared_memory()
+        self._out, self._err = cwd / "stdout.txt", cwd / "stderr.txt"
+        with self._out.open("w") as out, self._err.open("w") as err:
+            self.popen = subprocess.Popen(
+                command(*arguments),
+                cwd=cwd,
+                stdout=out,
+                stderr=err,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env=os.environ | (env or {}),
+            )
+        self.process = psutil.Process(self.popen.pid)
+
+    def workers(self) -> list[psutil.Process]:
+        """Return the collector's processes, in the order of their start."""
+        found = []
+        for child in _children(self.process):
+            try:
+                if "forkserver" in " ".join(child.cmdline()):
+                    found += [worker for worker in child.children() if worker.status() != "zombie"]
+            except psutil.NoSuchProcess:
+                continue
+        return sorted(found, key=lambda process: (process.create_time(), process.pid))
+
+    def wait_for(self, condition: Callable[[], Any], what: str) -> Any:
+        """Wait until a condition holds and return it."""
+        give_up_at = time.monotonic() + PATIENCE_S
+        while time.monotonic() < give_up_at:
+            value = condition()
+            if value:
+                return value
+            assert self.popen.poll() is None, f"ended before {what}: {self._err.read_text()}"
+            time.sleep(0.02)
+        pytest.fail(f"no {what} within {PATIENCE_S} s: {self._err.read_text()}")
+
+    def wait_for_iterations(self, count: int = 1) -> None:
+        """Wait until as many iterations are recorded."""
+
+        def recorded() -> bool:
+            files = list(self.cwd.glob("runs/*/*/metrics.jsonl"))
+            return bool(files) and files[0].read_text().count("\n") >= count
+
+        self.wait_for(recorded, f"{count} iterations")
+
+    def signal_group(self, signum: signal.Signals) -> None:
+        """Send a signal to all processes of the session, as a terminal does."""
+        os.killpg(self.popen.pid, signum)
+
+    def end(self, timeout_s: float = PATIENCE_S) -> Ended:
+        """Wait for the end and return what is left."""
+        code = self.popen.wait(timeout_s)
+        return Ended(code, self._out.read_text(), self._err.read_text(), self.cwd)
+
+    def assert_nothing_left(self, within_s: float = 5.0) -> None:
+        """No process of the session lives, nothing new lies in shared memory."""
+        give_up_at = time.monotonic() + within_s
+        while True:
+            alive, shm = _session(self.popen.pid), _shared_memory() - self._shm
+            if not alive and not shm:
+                return
+            if time.monotonic() > give_up_at:
+                pytest.fail(f"left behind: {alive} {shm}")
+            time.sleep(0.05)
+
+    def destroy(self) -> None:
+        """End whatever is left of the session."""
+        for process in _session(self.popen.pid):
+            try:
+                process.kill()
+            except psutil.NoSuchProcess:
+                continue
+        self.popen.wait()
+
+
+def command(*arguments: str) -> list[str]:
+    """Return the command line as a racer types it."""
+    script = shutil.which("deepracer-exp", path=str(Path(sys.executable).parent))
+    return [script or "deepracer-exp", *arguments]
+
+
+def _children(process: psutil.Process) -> list[psutil.Process]:
+    try:
+        return process.children()
+    except psutil.NoSuchProcess:
+        return []
+
+
+def _session(leader: int) -> list[psutil.Process]:
+    found = []
+    for pid in psutil.pids():
+        try:
+            if os.getsid(pid) == leader and psutil.Process(pid).status() != "zombie":
+                found.append(psutil.Process(pid))
+        except (ProcessLookupError, psutil.NoSuchProcess):
+            continue
+    return found
+
+
+def _shared_memory() -> set[str]:
+    folder = Path("/dev/shm")
+    # Other sessions of the machine have theirs: only what libraries of ours would make is looked at.
+    names = (path.name for path in folder.iterdir()) if folder.is_dir() else ()
+    return {name for name in names if name.startswith(("torch_", "sem.", "psm_", "wnsm_", "mp-"))}
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Started]]:
+    """Start `deepracer-exp ARGUMENTS` in `tmp_path` as a process of its own."""
+    started: list[Started] = []
+
+    def go(*arguments: str, env: dict[str, str] | None = None) -> Started:
+        started.append(Started(arguments, tmp_path, env))
+        return started[-1]
+
+    yield go
+    for one in started:
+        one.destroy()
+
+
+@pytest.fixture
+def call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Ended]:
+    """Call `deepracer-exp ARGUMENTS` in this process, with `tmp_path` as the working folder."""
+
+    def go(*arguments: str) -> Ended:
+        monkeypatch.chdir(tmp_path)
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit_:
+            main(arguments)
+        out, err = capsys.readouterr()
+        return Ended(exit_.value.code or 0, out, err, tmp_path)
+
+    return go
+
+
+@pytest.fixture
+def train_here(call: Callable[..., Ended]) -> Callable[..., Ended]:
+    """Train the tiny experiment in this process, its cars too."""
+    return lambda *overrides: call(
+        "train", "experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1", *overrides
+    )
+
+
+@pytest.fixture
+def start_training(start: Callable[..., Started]) -> Callable[..., Started]:
+    """Start a training of two workers that would take an hour."""
+    return lambda *overrides: start(
+        "train",
+        "experiment=tiny",
+        "tracking=off",
+        "collector.processes=2",
+        "budget.env_steps=100000000",
+        *overrides,
+    )

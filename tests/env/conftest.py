@@ -1,0 +1,48 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.setup import RaceSetup, build_setup
+from deepracer_exp.formats.trace import PACKED
+
+
+def make_setup(*overrides: str) -> RaceSetup:
+    return build_setup(compose_experiment(overrides)[0])
+
+
+@pytest.fixture
+def setup_of() -> Callable[..., RaceSetup]:
+    return make_setup
+
+
+@pytest.fixture
+def race_of() -> Callable[..., Race]:
+    """Build a race of n cars that stand at their starts."""
+
+    def build(*overrides: str, n_cars: int = 1, **options) -> Race:
+        race = Race(make_setup(*overrides), n_cars, **options)
+        race.reset()
+        return race
+
+    return build
+
+
+@pytest.fixture
+def column() -> Callable[[Race, str], np.ndarray]:
+    return lambda race, name: race.trace[:, PACKED[name]]
+
+
+@pytest.fixture
+def steer_ahead() -> Callable[[Race, float], np.ndarray]:
+    """Return continuous actions that steer towards the road about a metre ahead."""
+
+    def act(race: Race, speed: float = 0.0) -> np.ndarray:
+        at = race.feature_names.index("ahead_x_1")
+        angle_rad = np.arctan2(race.observation[:, at + 1], race.observation[:, at])
+        steering = np.clip(2.5 * angle_rad / np.radians(30), -1, 1)
+        return np.column_stack([steering, np.full(race.n_cars, speed)])
+
+    return act

@@ -1,0 +1,184 @@
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.trace import EPISODE_STATUS
+
+SPACES = ["action_space=discrete", "action_space=continuous"]
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_gymnasiums_checker_finds_nothing(space):
+    env = gym.make("DeepRacer-v0", overrides=[space]).unwrapped
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        check_env(env)
+    # Offsets and look-ahead points have no bounds; made with keywords, and unwrapped, on purpose.
+    known = ("minimum value is -infinity", "maximum value is infinity", "A Box observation space m")
+    assert [str(w.message) for w in found if not any(part in str(w.message) for part in known)] == []
+
+
+def test_a_car_alone_drives_as_in_the_race(race_of):
+    env = gym.make("DeepRacer-v0", overrides=["action_space=continuous", "episode.max_steps=30"])
+    race = race_of("action_space=continuous", "episode.max_steps=30")
+    observation, _ = env.reset()
+    np.testing.assert_array_equal(observation, race.observation[0])
+    for action in np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32):
+        observation, reward, terminated, truncated, info = env.step(action)
+        race.step(action[None])
+        np.testing.assert_array_equal(observation, race.observation[0])
+        assert (reward, terminated, truncated) == (race.reward[0], race.terminated[0], race.truncated[0])
+        assert info["episode_status"] in EPISODE_STATUS
+        if terminated or truncated:
+            race.reset()
+            observation, _ = env.reset()
+            np.testing.assert_array_equal(observation, race.observation[0])
+
+
+def test_a_bad_override_is_bad_input():
+    with pytest.raises(BadInput, match="no such track"):
+        gym.make("DeepRacer-v0", overrides=["track=Nowhere"])
+
+
+def test_the_vector_environment_is_made_by_name():
+    env = gym.make_vec("DeepRacer-v0", num_envs=3, overrides=SPACES[1:])
+    assert isinstance(env.unwrapped, DeepRacerVectorEnv)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    observation, infos = env.reset(seed=1)
+    assert infos == {}
+    assert env.observation_space.contains(observation)
+    assert env.single_observation_space.contains(observation[0])
+    assert env.action_space.contains(env.action_space.sample())
+    assert {values.shape for values in env.step(env.action_space.sample())[1:4]} == {(3,)}
+    env.close()
+
+
+def test_one_batch_of_cars_is_as_good_as_gymnasiums_row_of_single_cars():
+    """What each car gives over 100 steps, the infos of ended episodes included; their starts differ by car."""
+    overrides = ["action_space=continuous", "episode.max_steps=35", "episode.start_advance=0"]
+    ours = DeepRacerVectorEnv(3, overrides)
+    row = SyncVectorEnv([lambda: DeepRacerEnv(overrides)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    np.testing.assert_array_equal(ours.reset()[0], row.reset()[0])
+    assert (ours.single_observation_space, ours.action_space) == (
+        row.single_observation_space,
+        row.action_space,
+    )
+    ended = 0
+    for action in np.random.default_rng(0).uniform(-1, 1, (100, 3, 2)).astype(np.float32):
+        *a, infos = ours.step(action)
+        *b, expected = row.step(action)
+        for mine, theirs in zip(a, b, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+        assert ("final_obs" in infos) == ("final_obs" in expected)
+        if "final_obs" in infos:
+            ended += infos["_final_obs"].sum()
+            np.testing.assert_array_equal(infos["_final_obs"], expected["_final_obs"])
+            np.testing.assert_array_equal(infos["_final_info"], expected["_final_info"])
+            for car in np.flatnonzero(infos["_final_obs"]):
+                np.testing.assert_array_equal(infos["final_obs"][car], expected["final_obs"][car])
+                for key in ("progress", "episode_status"):
+                    mine, theirs = infos["final_info"][key][car], expected["final_info"][key][car]
+                    assert (EPISODE_STATUS[mine] if key == "episode_status" else mine) == theirs
+            for car in np.flatnonzero(~infos["_final_obs"]):
+                assert infos["final_obs"][car] is None
+    assert ended > 5
+
+
+@pytest.mark.parametrize("seed", [4, [4, 9, None]])
+def test_a_seed_begins_the_vector_environment_anew(seed):
+    env = DeepRacerVectorEnv(3, ["randomization=action_noise", "episode.max_steps=20"])
+    actions = np.random.default_rng(0).integers(0, env.single_action_space.n, (40, 3))
+
+    def drive() -> np.ndarray:
+        return np.array([env.reset(seed=seed)[0], *(env.step(action)[0] for action in actions)])
+
+    first = drive()
+    env.reset()
+    np.testing.assert_array_equal(drive(), first)
+    env.reset(seed=5)
+    assert (np.array([env.step(action)[0] for action in actions]) != first[1:]).any()
+
+
+def test_gymnasiums_vector_wrappers_take_it():
+    env = RecordEpisodeStatistics(DeepRacerVectorEnv(2, ["episode.max_steps=10"]))
+    env.reset()
+    for _ in range(10):
+        infos = env.step(np.zeros(2, np.int64))[4]
+    np.testing.assert_array_equal(infos["episode"]["l"], 10)
+    listed = DictInfoToList(DeepRacerVectorEnv(2, ["episode.max_steps=10"]))
+    listed.reset()
+    for _ in range(10):
+        infos = listed.step(np.zeros(2, np.int64))[4]
+    assert infos[1]["final_info"]["episode_status"] == EPISODE_STATUS.index("time_up")
+    assert infos[1]["final_obs"].shape == listed.single_observation_space.shape
+
+
+# --- Stable-Baselines3
+
+
+class SB3Cars(VecEnv):
+    """Our vector environment under Stable-Baselines3's interface."""
+
+    def __init__(self, cars: DeepRacerVectorEnv):
+        self.cars = cars
+        super().__init__(cars.num_envs, cars.single_observation_space, cars.single_action_space)
+
+    def reset(self):
+        return self.cars.reset()[0]
+
+    def step_async(self, actions):
+        self.actions = actions
+
+    def step_wait(self):
+        observation, reward, terminated, truncated, infos = self.cars.step(self.actions)
+        done = terminated | truncated
+        listed = [{} for _ in range(self.num_envs)]
+        for car in np.flatnonzero(done):
+            listed[car] = {
+                "terminal_observation": infos["final_obs"][car],
+                "TimeLimit.truncated": bool(truncated[car]),
+            }
+        return observation, reward.astype(np.float32), done, listed
+
+    def close(self):
+        self.cars.close()
+
+    def get_attr(self, attr_name, indices=None):
+        return [getattr(self.cars, attr_name, None)] * self.num_envs
+
+    def set_attr(self, attr_name, value, indices=None):
+        raise NotImplementedError
+
+    def env_method(self, method_name, *args, indices=None, **kwargs):
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False] * self.num_envs
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_stable_baselines_trains_on_the_vector_environment(space):
+    cars = SB3Cars(DeepRacerVectorEnv(8, [space, "episode.max_steps=40"]))
+    model = PPO("MlpPolicy", cars, n_steps=32, batch_size=64, n_epochs=2, device="cpu", seed=0)
+    before = [p.clone() for p in model.policy.parameters()]
+    model.learn(3 * 8 * 32)
+    assert model.num_timesteps == 768
+    assert all(p.isfinite().all() for p in model.policy.parameters())
+    assert any((p != q).any() for p, q in zip(model.policy.parameters(), before, strict=True))
+
+
+def test_stable_baselines_trains_on_a_single_car():
+    cars = DummyVecEnv([lambda: gym.make("DeepRacer-v0", overrides=["episode.max_steps=40"])])
+    model = PPO("MlpPolicy", cars, n_steps=64, batch_size=32, n_epochs=1, device="cpu", seed=0)
+    model.learn(128)
+    assert model.num_timesteps == 128
+    assert all(p.isfinite().all() for p in model.policy.parameters())

@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import check_env_specs
+
+from deepracer_exp.env.race import NonFinite, Race
+from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.formats.trace import PACKED
+
+SPACES = ["action_space=discrete", "action_space=continuous"]
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_specs_and_rollouts_agree(setup_of, space):
+    check_env_specs(RaceEnv(Race(setup_of(space), 3)))
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_the_short_step_gives_exactly_what_the_generic_one_gives(setup_of, space):
+    """300 steps; episodes end by the limit and off the track, and some steps end none."""
+    setup = setup_of(space, "episode.max_steps=45", "randomization=action_noise")
+    ours, generic = (RaceEnv(Race(setup, 5)) for _ in range(2))
+    assert type(ours).step_and_maybe_reset is not EnvBase.step_and_maybe_reset
+    root, generic_root = ours.reset(), generic.reset()
+    ended = set()
+    for _ in range(300):
+        action = ours.action_spec.rand()
+        stepped, root = ours.step_and_maybe_reset(root.set("action", action))
+        expected, generic_root = generic._step_and_maybe_reset(generic_root.set("action", action.clone()))
+        assert_same(stepped, expected)
+        assert_same(root, generic_root.exclude("action"))
+        ended |= {int(n) for n in stepped["next", "done"].sum(0)}
+        truncated, terminated = stepped["next", "truncated"], stepped["next", "terminated"]
+        assert not (truncated & terminated).any()
+    assert len(ended) > 2
+
+
+def assert_same(a: TensorDict, b: TensorDict) -> None:
+    keys = set(a.keys(True, True))
+    assert keys == set(b.keys(True, True))
+    for key in keys:
+        assert a[key].dtype == b[key].dtype, key
+        assert a[key].shape == b[key].shape, key
+        torch.testing.assert_close(a[key], b[key], rtol=0, atol=0, equal_nan=True, msg=str(key))
+
+
+def test_a_batch_keeps_what_each_step_gave(setup_of):
+    """Nothing that was handed out is written to later."""
+    env = RaceEnv(Race(setup_of("episode.max_steps=10"), 4))
+    root, kept = env.reset(), []
+    for _ in range(30):
+        stepped, root = env.step_and_maybe_reset(root.set("action", env.action_spec.rand()))
+        kept.append((stepped, stepped.clone()))
+    for stepped, copy in kept:
+        assert_same(stepped, copy)
+
+
+def test_the_terminal_observation_stays_with_the_episode_that_ended(setup_of):
+    env = RaceEnv(Race(setup_of("episode.max_steps=8"), 3))
+    root = env.reset()
+    for _ in range(8):
+        stepped, root = env.step_and_maybe_reset(root.set("action", torch.full((3,), 3)))
+    assert stepped["next", "truncated"].all()
+    speed = env.race.feature_names.index("speed")
+    assert (stepped["next", "observation"][:, speed] > 0.1).all()
+    assert not root["observation"][:, speed].any()
+
+
+def test_a_partial_reset_starts_the_marked_cars_alone(setup_of):
+    env = RaceEnv(Race(setup_of(), 3))
+    root = env.rollout(5)[:, -1]["next"]
+    mark = torch.tensor([[False], [True], [False]])
+    again = env.reset(root.clone().set("_reset", mark))
+    np.testing.assert_array_equal((again["observation"] == root["observation"]).all(-1), [True, False, True])
+    np.testing.assert_array_equal(env.race._episode, [0, 1, 0])
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_a_seed_gives_the_same_rollout_whatever_the_threads(setup_of, space):
+    setup = setup_of(space, "randomization=action_noise", "episode.max_steps=25")
+    runs = []
+    for threads in (1, 2):
+        env = RaceEnv(Race(setup, 6, threads=threads))
+        env.set_seed(11)
+        torch.manual_seed(11)  # the actions
+        runs.append(env.rollout(60, break_when_any_done=False))
+    assert_same(*runs)
+    assert runs[0]["next", "done"].any()
+
+
+def test_the_rewards_of_the_trace_are_the_rewards(setup_of):
+    steps = RaceEnv(Race(setup_of(), 3)).rollout(40, break_when_any_done=False)
+    trace = steps["next", "trace"]
+    torch.testing.assert_close(trace[..., PACKED["reward"]].float(), steps["next", "reward"][..., 0])
+    assert ((trace[..., PACKED["done"]] == 1) == steps["next", "done"][..., 0]).all()
+
+
+def test_a_sign_of_life_is_given_after_every_step(setup_of):
+    beats = []
+    env = RaceEnv(Race(setup_of(), 2), on_step=lambda: beats.append(1))
+    env.rollout(7, break_when_any_done=False)
+    assert len(beats) == 7
+
+
+def test_a_fault_in_the_race_reaches_the_caller(setup_of):
+    env = RaceEnv(Race(setup_of("action_space=continuous"), 2))
+    root = env.reset().set("action", torch.full((2, 2), torch.nan))
+    with pytest.raises(NonFinite):
+        env.step_and_maybe_reset(root)

@@ -1,0 +1,146 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepracer_exp.config.driving import EpisodeConfig
+from deepracer_exp.env.rules import EpisodeRules
+from deepracer_exp.formats.trace import EPISODE_STATUS
+
+CONFIG = EpisodeConfig(
+    start_offset=0.0,
+    start_advance=0.05,
+    max_steps=1000,
+    immobilized_steps=15,
+    immobilized_m=0.0003,
+    reversed_steps=15,
+)
+
+
+class OneCar:
+    """Judges one car step by step; a step that does not say otherwise moves forward on the road."""
+
+    def __init__(self, **changes: float):
+        self.rules = EpisodeRules(dataclasses.replace(CONFIG, **changes), 1)
+        self.steps, self.progress = 0, 10.0
+
+    def step(self, progress: float | None = None, moved_m: float = 0.1, off_track: bool = False) -> str:
+        self.steps += 1
+        before = self.progress
+        self.progress = before + 0.01 if progress is None else progress
+        status = self.rules.judge(
+            *(np.array([value]) for value in (self.steps, self.progress, before, moved_m, off_track))
+        )
+        return EPISODE_STATUS[status[0]]
+
+    def steps_until(self, status: str, most: int, **how: float) -> int | None:
+        for count in range(1, most + 1):
+            if self.step(**how) == status:
+                return count
+        return None
+
+
+@pytest.fixture
+def car() -> OneCar:
+    car = OneCar()
+    car.step()
+    return car
+
+
+@given(progress=st.floats(-100, 100), moved_m=st.floats(0, 1), off_track=st.booleans())
+def test_nothing_ends_an_episode_in_its_prepare_step(progress, moved_m, off_track):
+    assert OneCar(max_steps=1).step(progress, moved_m, off_track) == "prepare"
+
+
+def test_a_car_that_drives_is_in_progress(car):
+    assert car.step() == "in_progress"
+
+
+def test_no_wheel_on_the_road_ends_the_episode_at_once(car):
+    assert car.step(off_track=True) == "off_track"
+
+
+def test_full_progress_completes_the_lap(car):
+    assert car.step(progress=99.999) == "in_progress"
+    assert car.step(progress=100.0) == "lap_complete"
+
+
+def test_standing_ends_the_episode_at_the_fifteenth_step_in_a_row(car):
+    assert car.steps_until("immobilized", 14, moved_m=0.0003) is None
+    assert car.step(moved_m=0.000301) == "in_progress"
+    assert car.steps_until("immobilized", 20, moved_m=0.0003) == 15
+
+
+def test_falling_progress_ends_the_episode_at_the_fifteenth_step_in_a_row(car):
+    def fall(most: int) -> int | None:
+        for count in range(1, most + 1):
+            if car.step(progress=car.progress - 0.01) == "reversed":
+                return count
+        return None
+
+    assert fall(14) is None
+    assert car.step(progress=car.progress) == "in_progress"
+    assert fall(20) == 15
+
+
+def test_the_last_allowed_step_is_time_up():
+    car = OneCar(max_steps=20)
+    car.step()
+    assert car.steps_until("time_up", 40) == 19
+
+
+@pytest.mark.parametrize(
+    ("rule", "how"),
+    [
+        ("max_steps", {}),
+        ("immobilized_steps", {"moved_m": 0.0}),
+        ("reversed_steps", {"moved_m": 0.1}),
+    ],
+)
+def test_zero_switches_a_rule_off(rule, how):
+    car = OneCar(**{"max_steps": 0, rule: 0})
+    car.step()
+    for _ in range(2000):
+        falling = {"progress": car.progress - 0.001} if rule == "reversed_steps" else {}
+        assert car.step(**falling, **how) == "in_progress"
+
+
+@given(complete=st.booleans(), off_track=st.booleans(), late=st.booleans(), still=st.booleans())
+def test_time_comes_before_the_lap_and_the_lap_before_the_rest(complete, off_track, late, still):
+    car = OneCar(max_steps=16 if late else 1000)
+    car.step()
+    for _ in range(14):
+        car.step(moved_m=0.0 if still else 0.1)
+    status = car.step(100.0 if complete else None, 0.0 if still else 0.1, off_track)
+    expected = (
+        "time_up"
+        if late
+        else "lap_complete"
+        if complete
+        else "off_track"
+        if off_track
+        else "immobilized"
+        if still
+        else "in_progress"
+    )
+    assert status == expected
+
+
+def test_a_new_episode_counts_from_zero_and_leaves_the_other_cars_alone():
+    rules = EpisodeRules(CONFIG, 3)
+
+    def stand(steps: int) -> np.ndarray:
+        for step in range(steps):
+            progress = np.full(3, 50.0 - 0.1 * step)
+            status = rules.judge(
+                np.full(3, 10 + step), progress, progress + 0.1, np.zeros(3), np.zeros(3, bool)
+            )
+        return status
+
+    stand(10)
+    rules.reset(np.array([1]))
+    np.testing.assert_array_equal(
+        [EPISODE_STATUS[code] for code in stand(5)], ["immobilized", "in_progress", "immobilized"]
+    )

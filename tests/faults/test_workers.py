@@ -1,0 +1,111 @@
+"""Processes that are killed or stopped: the run ends as failed, says whom it lost, and leaves nothing behind."""
+
+import signal
+import time
+
+import pytest
+
+MODES = pytest.mark.parametrize("mode", ["sync", "async"])
+SOON_S = 30.0
+
+
+def _lost(training, *words):
+    began = time.monotonic()
+    ended = training.end()
+    took_s = time.monotonic() - began
+    ended.assert_run_failed(*words)
+    training.assert_nothing_left()
+    assert took_s < SOON_S
+    return ended
+
+
+@MODES
+def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
+    training = start_training(f"collector={mode}")
+    training.wait_for_iterations(2)
+    victim = training.workers()[1]
+    victim.send_signal(signal.SIGKILL)
+    ended = _lost(training, "collector worker 1", f"(process {victim.pid})", "died by signal SIGKILL")
+    assert ended.summary["iteration"] == len(ended.metrics) >= 2
+
+
+@MODES
+def test_a_worker_that_stops_is_ended_and_named(start_training, mode):
+    training = start_training(f"collector={mode}", "collector.hang_timeout_s=2")
+    training.wait_for_iterations(2)
+    training.workers()[0].send_signal(signal.SIGSTOP)
+    _lost(training, "collector worker 0", "took no ")
+
+
+@MODES
+@pytest.mark.slow
+def test_a_worker_killed_while_it_starts_ends_the_run(start_training, mode):
+    training = start_training(f"collector={mode}")
+    training.wait_for(lambda: training.workers(), "worker")
+    training.workers()[0].send_signal(signal.SIGKILL)
+    _lost(training, "orker 0")
+
+
+@pytest.mark.slow
+def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
+    training = start_training("collector.hang_timeout_s=2")
+    training.wait_for(lambda: training.workers(), "worker")
+    training.workers()[0].send_signal(signal.SIGSTOP)
+    ended = training.end()
+    ended.assert_run_failed("worker", "was ended")
+    training.assert_nothing_left()
+
+
+@pytest.mark.slow
+def test_a_worker_killed_while_the_learner_learns_ends_the_run(start_training):
+    """Hardly any driving, much learning: it is learning that the kill interrupts, or the giving out of weights."""
+    training = start_training("algorithm.epochs=100", "algorithm.batch_size=32")
+    training.wait_for_iterations(1)
+    training.workers()[0].send_signal(signal.SIGKILL)
+    _lost(training, "collector worker 0", "died by signal SIGKILL")
+
+
+@pytest.mark.slow
+def test_a_worker_stopped_while_the_learner_learns_ends_the_run(start_training):
+    training = start_training("algorithm.epochs=100", "algorithm.batch_size=32", "collector.hang_timeout_s=2")
+    training.wait_for_iterations(1)
+    training.workers()[0].send_signal(signal.SIGSTOP)
+    _lost(training, "collector worker 0", "took no new weights for 2 s")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["start", "driving"])
+@MODES
+def test_workers_do_not_outlive_a_killed_training(start_training, mode, moment):
+    training = start_training(f"collector={mode}")
+    if moment == "start":
+        training.wait_for(lambda: training.workers(), "worker")
+    else:
+        training.wait_for_iterations(1)
+    training.popen.send_signal(signal.SIGKILL)
+    ended = training.end()
+    assert ended.code == -signal.SIGKILL
+    training.assert_nothing_left(within_s=5.0)
+    assert not (ended.folder / "summary.json").exists()
+
+
+@pytest.mark.slow
+def test_a_fork_server_that_is_killed_ends_the_run(start_training):
+    training = start_training()
+    training.wait_for_iterations(1)
+    training.workers()[0].parent().send_signal(signal.SIGKILL)
+    _lost(training, "collector worker")
+
+
+@pytest.mark.slow
+def test_a_run_stopped_as_a_whole_goes_on_afterwards(start_training):
+    """Ctrl-Z and fg: no worker is to blame for the pause."""
+    training = start_training("collector.hang_timeout_s=2", "budget.env_steps=null", "budget.iterations=40")
+    training.wait_for_iterations(1)
+    training.signal_group(signal.SIGSTOP)
+    time.sleep(6)
+    training.signal_group(signal.SIGCONT)
+    ended = training.end()
+    assert ended.code == 0, ended.stderr
+    assert ended.summary["iteration"] == 40
+    training.assert_nothing_left()
