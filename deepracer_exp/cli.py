@@ -200,8 +200,7 @@ def _tracks(args: argparse.Namespace) -> int:
 
     if args.name is not None:
         is_file = Path(args.name).suffix in (".npy", ".yaml", ".yml")
-        quoted = args.name.replace("\\", "\\\\").replace("'", "\\'")
-        track = load(f"track.file='{quoted}'" if is_file else f"track={args.name}")
+        track = load(f"track.file={args.name}" if is_file else f"track={args.name}")
         output = Path(args.output or f"{track.name}.png")
         try:
             draw_picture(track, output)

@@ -82,7 +82,7 @@ class Started:
 
     def __init__(self, arguments: Sequence[str], cwd: Path, env: dict[str, str] | None = None):
         self.cwd = cwd
-        self._shm = _shared_memory()
+        self._shm: set[Path] = set()
         self._out, self._err = cwd / "stdout.txt", cwd / "stderr.txt"
         with self._out.open("w") as out, self._err.open("w") as err:
             self.popen = subprocess.Popen(
@@ -94,18 +94,23 @@ class Started:
                 start_new_session=True,
                 env=os.environ | (env or {}),
             )
-        self.process = psutil.Process(self.popen.pid)
 
     def workers(self) -> list[psutil.Process]:
         """Return the collector's processes, in the order of their start."""
         found = []
-        for child in _children(self.process):
+        for process in _session(self.popen.pid):
             try:
-                if "forkserver" in " ".join(child.cmdline()):
-                    found += [worker for worker in child.children() if worker.status() != "zombie"]
+                self._shm |= _shared_memory(process)
+                parent = process.parent()
+                if _is_fork(process) and parent is not None and _is_fork(parent):
+                    found.append(process)
             except psutil.NoSuchProcess:
                 continue
         return sorted(found, key=lambda process: (process.create_time(), process.pid))
+
+    def wait_for_worker(self) -> psutil.Process:
+        """Wait until the first worker of the collector is being started and return it."""
+        return self.wait_for(self.workers, "worker")[0]
 
     def wait_for(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait until a condition holds and return it."""
@@ -137,10 +142,10 @@ class Started:
         return Ended(code, self._out.read_text(), self._err.read_text(), self.cwd)
 
     def assert_nothing_left(self, within_s: float = 5.0) -> None:
-        """No process of the session lives, nothing new lies in shared memory."""
+        """No process of the session lives, and nothing of what `workers` saw mapped lies in shared memory."""
         give_up_at = time.monotonic() + within_s
         while True:
-            alive, shm = _session(self.popen.pid), _shared_memory() - self._shm
+            alive, shm = _session(self.popen.pid), [path for path in self._shm if path.exists()]
             if not alive and not shm:
                 return
             if time.monotonic() > give_up_at:
@@ -163,11 +168,9 @@ def command(*arguments: str) -> list[str]:
     return [script or "deepracer-exp", *arguments]
 
 
-def _children(process: psutil.Process) -> list[psutil.Process]:
-    try:
-        return process.children()
-    except psutil.NoSuchProcess:
-        return []
+def _is_fork(process: psutil.Process) -> bool:
+    """Return whether it is the fork server or forked from it."""
+    return "multiprocessing.forkserver" in " ".join(process.cmdline())
 
 
 def _session(leader: int) -> list[psutil.Process]:
@@ -181,11 +184,13 @@ def _session(leader: int) -> list[psutil.Process]:
     return found
 
 
-def _shared_memory() -> set[str]:
-    folder = Path("/dev/shm")
-    # Other sessions of the machine have theirs: only what libraries of ours would make is looked at.
-    names = (path.name for path in folder.iterdir()) if folder.is_dir() else ()
-    return {name for name in names if name.startswith(("torch_", "sem.", "psm_", "wnsm_", "mp-"))}
+def _shared_memory(process: psutil.Process) -> set[Path]:
+    """Return the files in shared memory that a process has mapped and that have a name."""
+    try:
+        mapped = {Path(region.path) for region in process.memory_maps()}
+    except psutil.AccessDenied:
+        return set()
+    return {path for path in mapped if path.is_relative_to("/dev/shm") and path.exists()}
 
 
 @pytest.fixture

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
@@ -61,7 +62,9 @@ class Composition:
 
     def yaml(self) -> str:
         """Return the values as YAML, in the order of the entry point's groups."""
-        return OmegaConf.to_yaml(DictConfig(self.mapping))
+        return yaml.safe_dump(
+            self.mapping, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
+        )
 
 
 def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Composition]:

@@ -1,9 +1,10 @@
 """The whole experiment: one frozen dataclass per group of `conf/`."""
 
+import re
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from .car import CarConfig
 from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
@@ -11,7 +12,17 @@ from .learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
 from .running import BudgetConfig, CollectorConfig, StoppingConfig, TrackingConfig
 from .track import TrackConfig
 
-SafeName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,79}$")]
+
+def _safe(name: str) -> str:
+    """Refuse what would be no plain folder name."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}", name):
+        raise ValueError(
+            "a name has letters, digits, '.', '_' and '-', at most 80, and begins with a letter or digit"
+        )
+    return name
+
+
+SafeName = Annotated[str, AfterValidator(_safe)]
 
 
 @dataclass(frozen=True, kw_only=True)

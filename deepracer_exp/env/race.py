@@ -15,9 +15,6 @@ from .rules import EpisodeRules
 from .setup import RaceSetup
 from .streams import CarStreams
 
-CONTROL_PERIOD_S = 1 / 15
-"""Seconds between two actions: the camera's rate (deepracer-simapp)."""
-
 
 class NonFinite(RunFailed):
     """A value became NaN or infinite; `arrays` holds what is needed to look at it."""

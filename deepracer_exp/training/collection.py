@@ -82,7 +82,9 @@ class Collection:
         }
         if self._workers == 0:
             env = factory(worker=0, threads=config.threads, heartbeat=None)
-            self._collector: Any = Collector(env, policy, track_traj_ids=False, **options)
+            self._collector: Any = Collector(
+                env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
+            )
         else:
             heartbeat = run_dir / ".heartbeat"
             self._watchdog = Watchdog(
@@ -93,7 +95,7 @@ class Collection:
                 for worker in range(self._workers)
             ]
             self._collector = self._start(envs, policy, options)
-            self._watchdog.workers_started([process.pid for process in self._collector.procs])
+            self._watchdog.workers_started(self._collector.procs)
         self._source = iter(self._collector)
 
     def __enter__(self) -> "Collection":
@@ -211,14 +213,14 @@ class Collection:
                 return RunFailed(fault)
             if worker in self._watchdog.verdict:
                 return RunFailed(f"collector worker {worker} {self._watchdog.verdict[worker]}")
-        for worker, process in enumerate(self._collector.procs):
-            # TorchRL closes the handles of the workers that still lived.
-            if process._closed or process.is_alive():
-                continue
-            code = process.exitcode
-            how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-            return RunFailed(f"collector worker {worker} (process {process.pid}) died {how}")
-        return None
+        dead = self._watchdog.first_dead
+        if dead is None:
+            return None
+        process = self._collector.procs[dead]
+        process.join()
+        code = process.exitcode
+        how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        return RunFailed(f"collector worker {dead} (process {process.pid}) died {how}")
 
     def _end_all(self) -> None:
         for process in self._collector.procs:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepracer_exp.env.race import CONTROL_PERIOD_S
 from deepracer_exp.formats.trace import PACKED, STATUS_CODE
 
 
@@ -26,15 +25,17 @@ class Finished:
 class EpisodeBook:
     """Numbers the episodes of a run and remembers how the last ones ended."""
 
-    def __init__(self, n_cars: int, remembered: int):
+    def __init__(self, n_cars: int, remembered: int, step_s: float):
         """Open the book.
 
         Args:
             n_cars: cars over all processes.
+            step_s: simulated seconds of a control step.
             remembered: how many of the last finished episodes `lap_share` looks at.
         """
         self._number = np.full(n_cars, -1)
         self._next_number = 0
+        self._step_s = step_s
         self._laps_of_last: deque[bool] = deque(maxlen=remembered)
         self.finished = 0
         self.laps = 0
@@ -86,7 +87,7 @@ class EpisodeBook:
             returns=ends[:, PACKED["episode_return"]],
             progress=ends[:, PACKED["progress"]],
             lap=ends[:, PACKED["episode_status"]] == STATUS_CODE["lap_complete"],
-            time_s=(ends[:, PACKED["steps"]] - 1) * CONTROL_PERIOD_S,
+            time_s=(ends[:, PACKED["steps"]] - 1) * self._step_s,
         )
         self.finished += len(ends)
         self.laps += int(finished.lap.sum())

@@ -97,7 +97,8 @@ class Training:
         self.budget = Budget(experiment.budget)
         stopping = experiment.stopping
         cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
-        self.book = EpisodeBook(cars, stopping.episodes if isinstance(stopping, ReliableStopping) else 50)
+        remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else 50
+        self.book = EpisodeBook(cars, remembered, experiment.car.control_period_s)
         self.trace = TraceWriter(self.folder.path / "trace")
         self.display = ProgressDisplay(console, self._header())
         # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an

@@ -1,12 +1,12 @@
-"""Notices a worker process that hangs, and ends it."""
+"""Notices a worker process that dies or hangs, and ends the latter."""
 
 import contextlib
 import multiprocessing
-import os
-import signal
 import threading
 import time
 from collections.abc import Sequence
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,8 @@ class Watchdog:
     """Watches the workers' step counters while the training process waits for them.
 
     A worker that should be stepping and has not for `timeout_s` is killed, which the collector then reports as a
-    lost process; `verdict` says that it hung.
+    lost process; `verdict` says that it hung. Of workers that die, the first is remembered: TorchRL ends the others
+    before it tells.
     """
 
     def __init__(self, heartbeat: Path, workers: int, timeout_s: float, lockstep: bool):
@@ -40,18 +41,26 @@ class Watchdog:
         self._start_timeout_s = max(_START_TIMEOUT_S, timeout_s)
         self._lockstep = lockstep
         self._due = 0
-        self._pids: Sequence[int] | None = None
+        self._processes: Sequence[BaseProcess] | None = None
         self._waiting = threading.Event()
         self._waiting.set()
         self._over = threading.Event()
         self.verdict: dict[int, str] = {}
         """Of each worker that was ended: what it had done."""
+        self.first_dead: int | None = None
+        """The worker whose process ended first."""
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
 
-    def workers_started(self, pids: Sequence[int]) -> None:
-        """Tell whom to end."""
-        self._pids = pids
+    def workers_started(self, processes: Sequence[BaseProcess]) -> None:
+        """Tell whom to watch."""
+        self._processes = processes
+        sentinels = [process.sentinel for process in processes]
+
+        def wait_for_a_death() -> None:
+            self.first_dead = min(sentinels.index(int(ended)) for ended in wait(sentinels))  # type: ignore[arg-type]
+
+        threading.Thread(target=wait_for_a_death, name="first death", daemon=True).start()
 
     def expect(self, steps: int) -> None:
         """Note that each worker has been asked to reach `steps` control steps, and that we wait for it."""
@@ -90,10 +99,9 @@ class Watchdog:
         if worker in self.verdict:
             return
         self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
-        if self._pids is not None:
-            # It may have died on its own meanwhile.
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self._pids[worker], signal.SIGKILL)
+        if self._processes is not None:
+            with contextlib.suppress(ValueError):  # a handle that TorchRL has closed
+                self._processes[worker].kill()
         else:
             # They are still being started, and nothing says yet which is which: none of them can go on alone.
             for process in multiprocessing.active_children():

@@ -263,6 +263,28 @@ def test_a_course_can_be_completed(race_of, column, steer_ahead, course):
     assert not race.truncated.any()
 
 
+def test_a_car_that_drives_back_is_reversed(race_of, column):
+    race = race_of("track=Straight_track", "action_space=continuous")
+    pose = race.setup.track.start_pose(np.array([0.4]))
+    race._batch.place(np.array([0]), pose.x, pose.y, pose.yaw_rad + np.pi)
+    race._observe()
+    for _ in range(60):
+        race.step(np.array([[0.0, 0.0]]))
+        if race.terminated[0]:
+            break
+    assert column(race, "episode_status")[0] == STATUS_CODE["reversed"]
+    assert 16 <= column(race, "steps")[0] <= 20
+
+
+def test_a_car_that_hardly_moves_is_immobilized(race_of, column):
+    race = race_of("track=Straight_track", "action_space=deepracer", "episode.immobilized_m=1")
+    for _ in range(16):
+        assert not race.terminated[0]
+        race.step(np.array([2]))
+    assert race.terminated[0]
+    assert column(race, "episode_status")[0] == STATUS_CODE["immobilized"]
+
+
 def test_every_episode_of_an_open_course_begins_at_its_start(race_of):
     race = race_of("track=Straight_track", n_cars=3)
     race.reset()

@@ -1,0 +1,90 @@
+"""Ctrl-C and SIGTERM, sent to all processes of a run, as terminals and service managers do."""
+
+import signal
+import time
+
+import pytest
+
+from deepracer_exp.formats.trace import read_trace
+
+
+def _assert_whole(ended, code):
+    assert ended.code == code, ended.stderr
+    assert ended.summary["status"] == "interrupted"
+    assert ended.summary["iteration"] == len(ended.metrics) > 0
+    assert ended.summary["env_steps"] == len(read_trace(ended.folder / "trace", ["steps"]))
+    assert (ended.folder / "checkpoints" / "last" / "manifest.json").is_file()
+    assert (ended.folder / "best_lap.png").is_file()
+    assert "Traceback" not in ended.stderr
+    assert "deepracer-exp: " not in ended.stderr
+    assert ended.stdout.startswith("\ninterrupted: ")
+    assert not (ended.folder / ".heartbeat").exists()
+
+
+@pytest.mark.parametrize(
+    ("signum", "code", "mode"), [(signal.SIGINT, 130, "sync"), (signal.SIGTERM, 143, "async")]
+)
+def test_an_interrupted_run_writes_everything(start_training, signum, code, mode):
+    training = start_training(f"collector={mode}")
+    training.wait_for_iterations(2)
+    assert len(training.workers()) == 2
+    training.signal_group(signum)
+    _assert_whole(training.end(), code)
+    training.assert_nothing_left()
+
+
+@pytest.mark.slow
+def test_an_interruption_while_the_workers_start_ends_after_one_iteration(start_training):
+    training = start_training()
+    training.wait_for_worker()
+    training.signal_group(signal.SIGINT)
+    ended = training.end()
+    _assert_whole(ended, 130)
+    assert ended.summary["iteration"] == 1
+    training.assert_nothing_left()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0])
+def test_an_interruption_before_the_run_has_a_folder_is_told_by_the_exit_code(start_training, after_s):
+    training = start_training()
+    training.wait_for(lambda: "starting" in (training.cwd / "stderr.txt").read_text(), "sign of life")
+    time.sleep(after_s)
+    training.signal_group(signal.SIGINT)
+    ended = training.end()
+    assert ended.code == 130
+    assert "Traceback" not in ended.stderr
+    assert all(folder.joinpath("summary.json").is_file() for folder in ended.folders)
+    training.assert_nothing_left()
+
+
+def test_a_second_interruption_ends_at_once(start_training, tmp_path):
+    """The iteration would go on for minutes: cars that sleep."""
+    (tmp_path / "slow.py").write_text(
+        "import time\ndef reward_function(params):\n    time.sleep(0.2)\n    return 1.0\n"
+    )
+    training = start_training("reward.file=slow.py", "reward.time_limit_s=60", "collector.cars=4")
+    training.wait_for(lambda: "results in" in (tmp_path / "stderr.txt").read_text(), "run")
+    training.wait_for(lambda: len(training.workers()) == 2, "workers")
+    time.sleep(3)
+    training.signal_group(signal.SIGINT)
+    time.sleep(0.5)
+    assert training.popen.poll() is None
+    began = time.monotonic()
+    training.signal_group(signal.SIGINT)
+    ended = training.end()
+    assert time.monotonic() - began < 10
+    assert ended.code == 130
+    assert "Traceback" not in ended.stderr
+    assert ended.summary["status"] == "interrupted"
+    assert ended.summary["reason"] == "ended at once by a second signal"
+    training.assert_nothing_left()
+
+
+@pytest.mark.slow
+def test_an_interrupted_grid_runs_no_further_combination(start_training):
+    training = start_training("-m", "seed=1,2")
+    training.wait_for_iterations(1)
+    training.signal_group(signal.SIGINT)
+    ended = training.end()
+    _assert_whole(ended, 130)
