@@ -213,9 +213,11 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
         parent = _lookup(mapping, key.split(".")[:-1])
         siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
         return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
-    if finding["type"] == "value_error":  # a dataclass that refuses values which contradict each other
-        return f"{key}: {finding['ctx']['error']}{more}"
     value = finding.get("input")
+    if finding["type"] == "value_error":
+        # A dataclass whose values contradict each other names them itself.
+        at = key if isinstance(value, dict) else f"{key}={_short(value)}"
+        return f"{at}: {finding['ctx']['error']}{more}"
     return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
 
 
