@@ -1,10 +1,10 @@
 """Stable-Baselines3's PPO on the same cars: what `benchmarks.throughput` holds the training against.
 
-    python -m benchmarks.sb3_peer --iterations 20 [--torch-threads 1] [OVERRIDE...]
+    python -m benchmarks.sb3_peer --iterations 20 [--physics-threads 0] [--torch-threads 1] [OVERRIDE...]
 
-As many cars as the experiment has over all its processes are driven through `DeepRacerVectorEnv`, with one physics
-thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights are the
-experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock starts;
+As many cars as the experiment has over all its processes are driven through `DeepRacerVectorEnv`, by default with one
+physics thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights
+are the experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock starts;
 then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
 """
 
@@ -70,7 +70,7 @@ class SB3Cars(VecEnv):
         return [False] * self.num_envs
 
 
-def build(experiment: Experiment) -> PPO:
+def build(experiment: Experiment, physics_threads: int) -> PPO:
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
     assert algorithm.frames_per_iteration is not None
@@ -78,7 +78,7 @@ def build(experiment: Experiment) -> PPO:
     hidden = list(network.hidden)
     return PPO(
         "MlpPolicy",
-        SB3Cars(DeepRacerVectorEnv(n_cars, threads=0, setup=build_setup(experiment))),
+        SB3Cars(DeepRacerVectorEnv(n_cars, threads=physics_threads, setup=build_setup(experiment))),
         learning_rate=algorithm.lr,
         n_steps=-(-algorithm.frames_per_iteration // n_cars),
         batch_size=algorithm.batch_size,
@@ -98,10 +98,12 @@ def build(experiment: Experiment) -> PPO:
     )
 
 
-def measure(experiment: Experiment, iterations: int, torch_threads: int) -> dict[str, float]:
+def measure(
+    experiment: Experiment, iterations: int, physics_threads: int, torch_threads: int
+) -> dict[str, float]:
     """Train for one iteration, then for `iterations` with the clock running."""
     torch.set_num_threads(torch_threads)
-    peer = build(experiment)
+    peer = build(experiment, physics_threads)
     frames = peer.n_steps * peer.n_envs
     peer.learn(frames, log_interval=None)
     began = time.perf_counter()
@@ -120,11 +122,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sb3_peer"
     )
     parser.add_argument("--iterations", type=int, required=True)
+    parser.add_argument("--physics-threads", type=int, default=0, help="0: one per core")
     parser.add_argument("--torch-threads", type=int, default=1)
     parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     args = parser.parse_args(arguments)
     experiment, _ = compose_experiment(args.overrides)
-    print(json.dumps(measure(experiment, args.iterations, args.torch_threads)))
+    print(json.dumps(measure(experiment, args.iterations, args.physics_threads, args.torch_threads)))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,8 @@
 """The command line, called in this process or started as a process of its own."""
 
+import contextlib
+import functools
+import io
 import json
 import os
 import shutil
@@ -207,29 +210,43 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Started]]:
         one.destroy()
 
 
+IN_PROCESS = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
+
+
+def call_in(cwd: Path, *arguments: str) -> Ended:
+    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(cwd),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as exit_,
+    ):
+        main(arguments)
+    return Ended(exit_.value.code or 0, out.getvalue(), err.getvalue(), cwd)
+
+
 @pytest.fixture
-def call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Ended]:
+def call(tmp_path: Path) -> Callable[..., Ended]:
     """Call `deepracer-exp ARGUMENTS` in this process, with `tmp_path` as the working folder."""
-
-    def go(*arguments: str) -> Ended:
-        monkeypatch.chdir(tmp_path)
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as exit_:
-            main(arguments)
-        out, err = capsys.readouterr()
-        return Ended(exit_.value.code or 0, out, err, tmp_path)
-
-    return go
+    return functools.partial(call_in, tmp_path)
 
 
 @pytest.fixture
 def train_here(call: Callable[..., Ended]) -> Callable[..., Ended]:
     """Train the tiny experiment in this process, its cars too."""
-    return lambda *overrides: call(
-        "train", "experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1", *overrides
-    )
+    return functools.partial(call, "train", *IN_PROCESS)
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Ended]:
+    """Train the tiny experiment in this process, in a folder of its own; once for each set of overrides."""
+
+    @functools.cache
+    def train(*overrides: str) -> Ended:
+        return call_in(tmp_path_factory.mktemp("trained"), "train", *IN_PROCESS, *overrides)
+
+    return train
 
 
 @pytest.fixture

@@ -45,16 +45,20 @@ def test_the_scalar_reward_is_the_experiments_without_its_batch_form(experiment:
     assert "reward_batch" not in text
 
 
-def test_throughput_tells_the_documented_figures_and_holds_the_training_against_the_faster_peer() -> None:
+def test_throughput_tells_the_documented_figures_and_holds_the_training_against_the_faster_peer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rates = {
         "physics": [100.0, 100.0, 200.0],
         "env": [80.0, 50.0, 180.0],
         "collect 1": [10.0, 10.0, 10.0],
         "collect 2": [15.0, 17.0, 19.0],
         "train": [30.0, 30.0, 30.0],
-        "peer, torch threads 1": [20.0, 10.0, 30.0],
-        "peer, torch threads 2": [10.0, 40.0, 10.0],
+        throughput.peer_name(1, 1): [15.0, 15.0, 15.0],
+        throughput.peer_name(2, 1): [20.0, 10.0, 30.0],
+        throughput.peer_name(2, 2): [10.0, 40.0, 10.0],
     }
+    monkeypatch.setattr(throughput, "cores", lambda: 2)
     summary = throughput.summarize(rates)
     assert summary["physics_steps_per_s"] == 100
     assert summary["env_steps_per_s"] == 80
@@ -64,6 +68,7 @@ def test_throughput_tells_the_documented_figures_and_holds_the_training_against_
     # The median of the rounds' ratios, not the ratio of the medians.
     assert summary["ratios"]["env_to_physics"] == {"median": 0.8, "min": 0.5, "max": 0.9, "wanted": 0.75}
     assert summary["ratios"]["train_to_peer"]["median"] == 1.5
+    assert summary["ratios"]["train_to_default_peer"]["median"] == 2
     assert "wanted" in throughput.show(summary)
 
 
@@ -80,7 +85,7 @@ def test_passes_are_measured_in_turns_each_for_its_seconds() -> None:
 
 
 def test_the_peer_trains_on_as_many_frames_as_the_experiment_has(experiment: Experiment) -> None:
-    result = sb3_peer.measure(experiment, iterations=2, torch_threads=1)
+    result = sb3_peer.measure(experiment, iterations=2, physics_threads=1, torch_threads=1)
     assert result["env_steps"] == 2 * (experiment.algorithm.frames_per_iteration or 0)
     assert result["steps_per_s"] > 0
 

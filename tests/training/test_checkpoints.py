@@ -22,6 +22,9 @@ def make_agent(seed: int) -> PPO:
     experiment, _ = compose_experiment(["experiment=tiny"])
     generator = torch.Generator().manual_seed(seed)
     networks = build_actor_critic(experiment.network, 7, 5, generator)
+    with torch.no_grad():
+        for parameter in networks.parameters():  # the same in every process, whatever its threads
+            parameter.fill_(seed)
     return PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), seed)
 
 
@@ -89,50 +92,56 @@ def test_a_checkpoint_is_tensors_and_json(store):
         assert {Path(name).suffix for name in members.namelist()} == {".json", ".memmap"}
 
 
-# Saves agent 0, then agents 1 and 2; the process dies at the n-th call that changes what a name leads to.
+# In RUN_DIR/0, RUN_DIR/1, ...: saves agent 0, then agents 1 and 2, and dies at the n-th call that changes what a name
+# leads to; ends after the first run that does not die. Forked, because torch takes seconds to import.
 _DIES = """
-import os, pathlib, shutil, sys
-sys.path.insert(0, {folder!r})
+import os, pathlib, sys, torch
+torch.set_num_threads(1)
+sys.path.insert(0, sys.argv[1])
 from test_checkpoints import CheckpointStore, make_agent
-store = CheckpointStore(pathlib.Path({run_dir!r}))
-store.save(make_agent(0), {{"iteration": 0}}, (0.0, 0.0))
-left = [{calls}]
-def dying(function):
+
+def dying(function, left):
     def call(*args, **kwargs):
         if left[0] == 0:
             os._exit(9)
         left[0] -= 1
         return function(*args, **kwargs)
     return call
-for module, name in ((os, "replace"), (os, "rename"), (os, "symlink"), (os, "unlink"), (os, "rmdir"), (os, "mkdir")):
-    setattr(module, name, dying(getattr(module, name)))
-store.save(make_agent(1), {{"iteration": 1}}, (1.0, 0.0))
-store.save(make_agent(2), {{"iteration": 2}}, None)
-print("survived", left[0])
+
+def save_all(run_dir, calls):
+    store = CheckpointStore(run_dir)
+    store.save(make_agent(0), {"iteration": 0}, (0.0, 0.0))
+    left = [calls]
+    for name in ("replace", "rename", "symlink", "unlink", "rmdir", "mkdir"):
+        setattr(os, name, dying(getattr(os, name), left))
+    store.save(make_agent(1), {"iteration": 1}, (1.0, 0.0))
+    store.save(make_agent(2), {"iteration": 2}, None)
+
+code, calls = 9, 0
+while code == 9:
+    run_dir = pathlib.Path(sys.argv[2], str(calls))
+    run_dir.mkdir()
+    pid = os.fork()
+    if pid == 0:
+        save_all(run_dir, calls)
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    calls += 1
+sys.exit(code)
 """
 
 
+@pytest.mark.slow
 def test_wherever_a_save_is_cut_off_best_and_last_are_whole(tmp_path):
+    here = str(Path(__file__).parent)
+    subprocess.run([sys.executable, "-c", _DIES, here, str(tmp_path)], check=True, timeout=250)
     agents = [make_agent(seed) for seed in range(3)]
-    calls = 0
-    while True:
-        run_dir = tmp_path / str(calls)
-        run_dir.mkdir()
-        code = _DIES.format(folder=str(Path(__file__).parent), run_dir=str(run_dir), calls=calls)
-        pid = os.fork()
-        if pid == 0:  # torch is imported already: a second instead of ten
-            try:
-                exec(code, {})
-            finally:
-                os._exit(0)
-        _, status = os.waitpid(pid, 0)
+    runs = sorted(tmp_path.iterdir(), key=lambda path: int(path.name))
+    assert len(runs) > 10
+    for run_dir in runs:
         best, last = (load(run_dir / "checkpoints" / name) for name in ("best", "last"))
         assert any(same(best, agent) for agent in agents[:2])
         assert any(same(last, agent) for agent in agents)
-        if os.waitstatus_to_exitcode(status) == 0:
-            break
-        calls += 1
-    assert calls > 10
     assert same(best, agents[1])
     assert same(last, agents[2])
 

@@ -1,0 +1,286 @@
+import json
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from rich.console import Console
+from torchrl.checkpoint import Checkpoint
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.ppo import PPO
+from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.observation import Features, feature_names
+from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.training.run import TIMES, train
+
+# Reached sooner than a lap: episodes end often.
+OVERRIDES = ("reward=speed_on_track", "episode.max_steps=60")
+
+
+def untimed(ended) -> list[dict]:
+    return [{key: value for key, value in row.items() if key not in TIMES} for row in ended.metrics]
+
+
+def last_weights(ended) -> dict[str, torch.Tensor]:
+    holder = _Holder()
+    Checkpoint(agent=holder).load(ended.folder / "checkpoints" / "last")
+    return holder.state["networks"]
+
+
+class _Holder:
+    """Takes whatever state a checkpoint has."""
+
+    def state_dict(self) -> dict:
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.state = state
+
+
+def same_weights(one, other) -> bool:
+    a, b = last_weights(one), last_weights(other)
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def assert_trace_tells_the_metrics(ended) -> None:
+    """Recompute every iteration's row from the trace."""
+    trace = read_trace(ended.folder / "trace")
+    metrics = pd.DataFrame(ended.metrics)
+    assert len(trace) == ended.summary["env_steps"] == metrics.env_steps.iloc[-1]
+    assert (trace.groupby("iteration").size().cumsum().to_numpy() == metrics.env_steps).all()
+
+    by_episode = trace.groupby("episode")
+    assert np.array_equal(np.sort(trace.episode.unique()), np.arange(trace.episode.nunique()))
+    assert (by_episode.car.nunique() == 1).all()
+    ordered = trace.sort_values(["episode", "steps"])
+    assert (ordered.steps == ordered.groupby("episode").cumcount() + 1).all()
+    assert np.allclose(ordered.groupby("episode").reward.cumsum(), ordered.episode_return)
+    assert (by_episode.iteration.apply(lambda part: part.is_monotonic_increasing)).all()
+    # An episode is over with its last step, and only then.
+    assert (by_episode.done.sum() <= 1).all()
+    assert (ordered.groupby("episode").done.shift(fill_value=False) == False).all()  # noqa: E712
+
+    ends = trace[trace.done]
+    laps = ends[ends.episode_status == "lap_complete"]
+    assert (
+        metrics.episodes == ends.groupby("iteration").size().reindex(metrics.index, fill_value=0).cumsum()
+    ).all()
+    assert (
+        metrics.laps == laps.groupby("iteration").size().reindex(metrics.index, fill_value=0).cumsum()
+    ).all()
+    for iteration, row in metrics.iterrows():
+        part = ends[ends.iteration == iteration]
+        assert row.iteration == iteration + 1
+        for name, column in (("mean_return", "episode_return"), ("completion", "progress")):
+            value = row[name]
+            assert (
+                part.empty
+                if value is None or math.isnan(value)
+                else value == pytest.approx(part[column].mean())
+            )
+    assert ended.summary["last"] == ended.metrics[-1]
+    for key in ("iteration", "env_steps", "episodes", "laps"):
+        assert ended.summary[key] == ended.metrics[-1][key]
+
+
+def test_a_finished_run_says_so_and_names_its_folder(trained):
+    ended = trained(*OVERRIDES)
+    assert ended.code == 0, ended.stderr
+    assert ended.summary["status"] == "finished"
+    assert ended.summary["reason"] == "budget reached: env_steps"
+    assert ended.stdout.startswith("\nfinished: budget reached: env_steps\n")
+    assert str(ended.folder.relative_to(ended.cwd)) in ended.stdout
+    assert "100 % · iteration 4 · 4,096 steps" in ended.stderr
+    assert "\x1b" not in ended.stderr + ended.stdout
+
+
+def test_metrics_and_trace_agree(trained):
+    ended = trained(*OVERRIDES)
+    assert ended.summary["episodes"] > 50
+    assert_trace_tells_the_metrics(ended)
+
+
+def test_the_same_seed_gives_the_same_run(trained, train_here):
+    first, second = trained(*OVERRIDES), train_here(*OVERRIDES)
+    assert untimed(first) == untimed(second)
+    assert same_weights(first, second)
+    pd.testing.assert_frame_equal(read_trace(first.folder / "trace"), read_trace(second.folder / "trace"))
+
+
+def test_the_number_of_physics_threads_changes_nothing(trained):
+    one, two = trained(*OVERRIDES), trained(*OVERRIDES, "collector.threads=2")
+    assert untimed(one) == untimed(two)
+    assert same_weights(one, two)
+
+
+def test_another_seed_gives_another_run(trained):
+    one, other = trained(*OVERRIDES), trained(*OVERRIDES, "seed=1")
+    assert untimed(one) != untimed(other)
+    assert not same_weights(one, other)
+
+
+def test_the_same_seed_gives_the_same_run_in_several_processes(start, tmp_path):
+    command = ("train", "experiment=tiny", "tracking=off", "collector.processes=2", *OVERRIDES)
+    runs = []
+    for name in ("first", "second"):
+        ended = start(*command, f"runs_dir={name}").end()
+        assert ended.code == 0, ended.stderr
+        (folder,) = tmp_path.glob(f"{name}/tiny/*")
+        rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        runs.append([{key: value for key, value in row.items() if key not in TIMES} for row in rows])
+        assert len(read_trace(folder / "trace", ["steps"])) == 4096
+    assert runs[0] == runs[1]
+    assert len(runs[0]) == 4
+
+
+def test_asynchronous_collection_numbers_and_counts_every_step(start):
+    ended = start(
+        "train", "experiment=tiny", "tracking=off", "collector=async", "collector.processes=2", *OVERRIDES
+    ).end()
+    assert ended.code == 0, ended.stderr
+    assert_trace_tells_the_metrics(ended)
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [
+        (["budget.env_steps=2000"], "budget reached: env_steps"),
+        (["budget.iterations=1"], "budget reached: iterations"),
+        (["budget.env_steps=null", "budget.wall_clock_s=0.5"], "budget reached: wall_clock_s"),
+    ],
+)
+def test_each_limit_of_the_budget_ends_the_run_with_its_name(trained, limits, reason):
+    ended = trained(*OVERRIDES, *limits)
+    assert ended.code == 0
+    assert ended.summary["reason"] == reason
+    if "env_steps" in reason:
+        assert ended.summary["env_steps"] == 2048
+    elif "iterations" in reason:
+        assert ended.summary["iteration"] == 1
+
+
+def test_the_stopping_rule_ends_the_run_once_enough_episodes_have_ended(trained):
+    ended = trained("stopping=reliable", "stopping.episodes=20", "stopping.lap_share=0")
+    assert ended.code == 0
+    assert ended.summary["reason"] == "reliable: 0% of the last 20 episodes completed the lap"
+    assert ended.summary["reliable"]["env_steps"] == ended.summary["env_steps"]
+    assert all(row["lap_share"] is None for row in ended.metrics[:-1])
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("action_space=continuous",),
+        ("network=mlp_small_shared",),
+        ("network=mlp_deep_shared", "action_space=continuous"),
+        ("lr_schedule=adaptive_kl",),
+        ("randomization=action_noise",),
+        ("track=Straight_track",),
+        ("track=Oval_track", "track.direction=reversed"),
+        ("reward=racing_line",),
+    ],
+    ids=" ".join,
+)
+def test_every_kind_of_choice_trains(trained, overrides):
+    ended = trained("budget.iterations=2", *overrides)
+    assert ended.code == 0, ended.stderr
+    assert all(math.isfinite(row["policy_loss"]) for row in ended.metrics)
+    assert_trace_tells_the_metrics(ended)
+
+
+def test_iterations_of_episodes_have_at_least_that_many(trained):
+    ended = trained(
+        "algorithm.frames_per_iteration=null",
+        "algorithm.episodes_per_iteration=20",
+        "algorithm.batch_size=64",
+    )
+    assert ended.code == 0, ended.stderr
+    assert_trace_tells_the_metrics(ended)
+    episodes = [0] + [row["episodes"] for row in ended.metrics]
+    assert len(episodes) > 2
+    assert (np.diff(episodes) >= 20).all()
+
+
+def test_an_observation_that_is_not_finite_ends_the_run_and_names_the_car(train_here, monkeypatch):
+    compute: Callable = Features.compute
+    calls = []
+
+    def break_one(self, *arguments):
+        features = compute(self, *arguments)
+        calls.append(None)
+        if len(calls) == 40:
+            features[3, 1] = np.nan
+        return features
+
+    monkeypatch.setattr(Features, "compute", break_one)
+    ended = train_here()
+    ended.assert_run_failed("observation", "of car 3", "became nan")
+    with np.load(ended.folder / "faults" / "training.npz") as state:
+        assert np.argwhere(np.isnan(state["observation"])).tolist() == [[3, 1]]
+        assert len(state["physics_state"]) == 16
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_batch(train_here):
+    """Steps of this size leave the range of float32 at once."""
+    ended = train_here("algorithm.lr=1e38", "algorithm.max_grad_norm=0")
+    ended.assert_run_failed("policy loss is nan")
+    assert json.loads((ended.folder / "faults" / "training.json").read_text())["error"] == "RunFailed"
+    with np.load(ended.folder / "faults" / "training.npz") as state:
+        assert state["observation"].shape[:2] == (16, 64)
+        assert state["reward"].shape == (16, 64, 1)
+
+
+def test_a_bug_of_ours_shows_its_traceback_and_the_run_counts_as_failed(tmp_path, monkeypatch):
+    def broken(self, *arguments):
+        raise ZeroDivisionError("of ours")
+
+    monkeypatch.setattr(PPO, "update", broken)
+    with pytest.raises(ZeroDivisionError, match="of ours"):
+        train(
+            *compose_experiment(
+                ["experiment=tiny", "tracking=off", "collector=in_process", f"runs_dir='{tmp_path}'"]
+            ),
+            Console(quiet=True),
+        )
+    (summary,) = tmp_path.glob("tiny/*/summary.json")
+    assert json.loads(summary.read_text())["status"] == "failed"
+    assert "Traceback" in summary.with_name("log.txt").read_text()
+
+
+@pytest.mark.slow
+def test_a_failed_run_of_a_grid_does_not_stop_the_others_and_gives_the_exit_code(call, tmp_path):
+    (tmp_path / "sometimes.py").write_text(
+        "FAIL = 0\ndef reward_function(params):\n    return 1.0 / (1 - FAIL)\n"
+    )
+    ended = call(
+        "train", "-m", "experiment=tiny", "tracking=off", "collector=in_process", "budget.iterations=1",
+        "reward.file=sometimes.py", "reward.constants.FAIL=0,1,0.5",
+    )  # fmt: skip
+    assert ended.code == 3
+    assert len(ended.folders) == 3
+    statuses = [json.loads((folder / "summary.json").read_text())["status"] for folder in ended.folders]
+    assert sorted(statuses) == ["failed", "finished", "finished"]
+    table = ended.stdout.split("3 runs:\n")[1].splitlines()
+    assert len(table) == 3
+    assert "ZeroDivisionError" in table[1]
+    assert "finished" in table[0]
+    assert "finished" in table[2]
+
+
+def test_a_checkpoint_loads_back_into_a_fresh_agent(trained):
+    ended = trained(*OVERRIDES)
+    state = last_weights(ended)
+    experiment, _ = compose_experiment(["experiment=tiny"])
+    out = next(value for name, value in reversed(state.items()) if "policy" in name and value.ndim == 2)
+    networks = build_actor_critic(
+        experiment.network, len(feature_names(experiment.observation)), out.shape[0], torch.Generator()
+    )
+    agent = PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), 7)
+    for name in ("best", "last"):
+        Checkpoint(agent=agent).load(ended.folder / "checkpoints" / name)
+    loaded = agent.state_dict()["networks"]
+    assert all(torch.equal(value, loaded[name]) for name, value in state.items())
