@@ -8,6 +8,7 @@ from typing import Any
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
 from deepracer_exp.agents.ppo import PPO
+from deepracer_exp.errors import RunFailed
 
 
 class CheckpointStore:
@@ -32,12 +33,22 @@ class CheckpointStore:
 
         Returns:
             Whether it is the new best.
+
+        Raises:
+            OSError, RunFailed: the disk takes no more.
         """
         name = f"{counters['iteration']:06d}"
         if not (self.folder / name).exists():  # nothing is learned between two updates
             # Memory-mapped tensors, the default, would end the process by SIGBUS on a full disk.
             archive = StateDictCheckpointAdapter("archive")
-            Checkpoint().register("agent", agent, adapter=archive).save(self.folder / name, metadata=counters)
+            checkpoint = Checkpoint().register("agent", agent, adapter=archive)
+            try:
+                checkpoint.save(self.folder / name, metadata=counters)
+            except RuntimeError as error:  # torch's word for a full disk
+                reason = str(error).splitlines()[0]
+                raise RunFailed(
+                    f"{self.folder / name}: the checkpoint cannot be written: {reason}"
+                ) from error
         best = self.is_better(rank)
         if best:
             self._best_rank = rank

@@ -1,5 +1,6 @@
 """One experiment, from its configuration to a folder of results."""
 
+import contextlib
 import json
 import logging
 import time
@@ -416,6 +417,11 @@ def _mean(values: np.ndarray) -> float | None:
 class _LogFile(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the base class's name
         """Say nothing: the run's end tells of a full disk, in one line."""
+
+    def close(self) -> None:
+        """Close the file; what a full disk does not take is lost."""
+        with contextlib.suppress(OSError):
+            super().close()
 
 
 def _log_to(path: Path) -> logging.FileHandler:

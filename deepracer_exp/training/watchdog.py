@@ -96,13 +96,14 @@ class Watchdog:
                 self._end(int(worker), float(idle_s[worker]), int(beats[worker]))
 
     def _end(self, worker: int, idle_s: float, steps: int) -> None:
-        if worker in self.verdict:
-            return
+        known = worker in self.verdict
+        # Before the kill: whoever sees the death asks for the verdict.
         self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
-        if self._processes is not None:
-            with contextlib.suppress(ValueError):  # a handle that TorchRL has closed
-                self._processes[worker].kill()
-        else:
-            # They are still being started, and nothing says yet which is which: none of them can go on alone.
+        if self._processes is None:
+            # They are still being started, and nothing says yet which is which: none of them can go on alone. Again
+            # and again, because one may be started only now.
             for process in multiprocessing.active_children():
                 process.kill()
+        elif not known:
+            with contextlib.suppress(ValueError):  # a handle that TorchRL has closed
+                self._processes[worker].kill()

@@ -1,0 +1,140 @@
+import json
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from deepracer_exp import __version__
+from deepracer_exp.config.compose import groups, options
+
+HEAVY = (
+    "torch",
+    "tensordict",
+    "torchrl",
+    "numpy",
+    "hydra",
+    "omegaconf",
+    "mujoco",
+    "mlflow",
+    "pandas",
+    "rich",
+    "pydantic",
+)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["train", "--help"], ["tracks", "--help"], ["ui", "--help"], ["--version"]]
+)
+def test_help_imports_nothing_that_takes_time(arguments):
+    code = (
+        "import sys\n"
+        "from deepracer_exp.cli import main\n"
+        f"try:\n    main({arguments!r})\n"
+        f"finally:\n    print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stderr == "[]\n"
+    assert done.stdout
+
+
+def test_version_is_the_packages(call):
+    assert call("--version").stdout == f"deepracer-exp {__version__}\n"
+
+
+def test_help_names_every_command(call):
+    text = call("--help").stdout
+    for command in ("train", "tracks", "ui"):
+        assert command in text
+
+
+def test_help_of_train_names_every_group(call):
+    text = call("train", "--help").stdout
+    listed = text[text.index("groups:") :].split()
+    assert set(groups()) <= set(listed)
+
+
+def test_options_lists_a_groups_options_one_a_line(call):
+    for group in groups():
+        assert call("train", "--options", group).stdout.split("\n")[:-1] == options(group)
+
+
+def test_options_of_no_group_names_the_nearest(call):
+    call("train", "--options", "trak").assert_bad_input("trak", "did you mean track?")
+
+
+def test_cfg_prints_the_experiment_and_runs_nothing(call, tmp_path):
+    ended = call("train", "experiment=tiny", "seed=5", "--cfg")
+    assert ended.code == 0
+    assert yaml.safe_load(ended.stdout)["seed"] == 5
+    assert not list(tmp_path.iterdir())
+
+
+def test_cfg_of_a_grid_prints_every_combination(call):
+    ended = call("train", "-m", "seed=1,2", "network=mlp,mlp_small", "--cfg")
+    assert [one["seed"] for one in yaml.safe_load_all(ended.stdout)] == [1, 1, 2, 2]
+
+
+def test_a_grid_without_m_is_refused(call):
+    call("train", "experiment=tiny", "seed=1,2").assert_bad_input("seed=1,2")
+
+
+def test_no_command_is_bad_input(call):
+    assert call().code == 2
+
+
+def test_a_grid_runs_every_combination_and_prints_a_table(call):
+    ended = call(
+        "train",
+        "-m",
+        "experiment=tiny",
+        "tracking=off",
+        "collector=in_process",
+        "budget.iterations=1",
+        "seed=1,2",
+    )
+    assert ended.code == 0, ended.stderr
+    assert len(ended.folders) == 2
+    seeds = [json.loads((folder / "summary.json").read_text())["seed"] for folder in ended.folders]
+    assert sorted(seeds) == [1, 2]
+    table = ended.stdout.split("\n2 runs:\n")[1]
+    assert table.count("\n") == 2
+    for folder in ended.folders:
+        assert folder.name in table
+
+
+def test_tracks_lists_every_track_with_its_measures(call):
+    text = call("tracks").stdout
+    for name in options("track"):
+        assert f"\n{name} (" in text
+
+
+def test_tracks_draws_a_picture_of_one(call, tmp_path):
+    ended = call("tracks", "reinvent_base", "-o", "picture.png")
+    assert ended.code == 0
+    assert "re:Invent 2018" in ended.stdout
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["tracks", "reinvent_bse"], "did you mean reinvent_base?"),
+        (["tracks", "missing.npy"], "missing.npy"),
+        (["tracks", "reinvent_base", "-o", "no/such/folder.png"], "no/such/folder.png"),
+        (["tracks", "reinvent_base", "-o", "picture.nothing"], "picture.nothing"),
+    ],
+)
+def test_a_picture_that_cannot_be_drawn_is_bad_input(call, arguments, word):
+    call(*arguments).assert_bad_input(word)
+
+
+def test_output_into_a_pipe_that_closes_early_is_no_traceback(tmp_path):
+    command = f"{sys.executable} -m deepracer_exp.cli tracks | head -n 1"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path, timeout=120, check=False
+    )
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
