@@ -4,8 +4,8 @@
 
 As many cars as the experiment has over all its processes are driven through `DeepRacerVectorEnv`, by default with one
 physics thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights
-are the experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock starts;
-then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
+are the experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock
+starts; then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
 """
 
 import argparse

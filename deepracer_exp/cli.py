@@ -37,7 +37,11 @@ groups: track car action_space observation randomization episode reward network 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130/143 interrupted."""
     parser = _parser()
-    args = parser.parse_args(arguments)
+    args, rest = parser.parse_known_args(arguments)
+    if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:  # argparse takes no positional arguments after an option between them
+        args.overrides += rest
     try:
         code = args.command(args)
     except BadInput as error:
@@ -144,7 +148,7 @@ def _start_workers_early(wanted: bool) -> None:
     from multiprocessing import forkserver
 
     multiprocessing.set_start_method("forkserver", force=True)
-    multiprocessing.set_forkserver_preload(["deepracer_exp.training.worker"])
+    multiprocessing.set_forkserver_preload(["deepracer_exp.training.fork_server"])
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

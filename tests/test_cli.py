@@ -77,6 +77,21 @@ def test_cfg_of_a_grid_prints_every_combination(call):
     assert [one["seed"] for one in yaml.safe_load_all(ended.stdout)] == [1, 1, 2, 2]
 
 
+def test_options_may_stand_between_overrides(call):
+    ended = call("train", "network=mlp", "-m", "seed=1,2", "--cfg", "name=between")
+    assert [(one["seed"], one["name"]) for one in yaml.safe_load_all(ended.stdout)] == [
+        (1, "between"),
+        (2, "between"),
+    ]
+
+
+@pytest.mark.parametrize("arguments", [["train", "seed=1", "--fast"], ["tracks", "a", "b"], ["ui", "seed=1"]])
+def test_an_argument_nobody_knows_is_refused(call, arguments):
+    ended = call(*arguments)
+    assert ended.code == 2
+    assert f"unrecognized arguments: {arguments[-1]}" in ended.stderr
+
+
 def test_a_grid_without_m_is_refused(call):
     call("train", "experiment=tiny", "seed=1,2").assert_bad_input("seed=1,2")
 

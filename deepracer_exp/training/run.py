@@ -4,7 +4,6 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from deepracer_exp.agents.ppo import PPO, UpdateMetrics
 from deepracer_exp.agents.schedules import Schedule
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import ReliableStopping
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.reward import RewardFunction
@@ -36,6 +34,7 @@ from .collection import Collection, worker_count
 from .display import ProgressDisplay, RunHeader
 from .episodes import EpisodeBook, Finished
 from .faults import write_fault
+from .iterations import frames_per_batch, iterations
 from .report import write_report
 from .run_folder import RunFolder
 from .signals import Interruption
@@ -46,7 +45,6 @@ TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 """Columns of metrics.jsonl that differ between two runs of the same seed."""
 _LAST_EVERY = 10  # iterations between two checkpoints `last`: one costs about 10 ms
 _FEWEST_EPISODES = 10  # below this the mean completion of an iteration says little about the policy
-_CHUNK_STEPS = 32  # steps a car drives between two looks at how many episodes have ended
 
 
 @dataclass(frozen=True)
@@ -125,7 +123,7 @@ class Training:
     def loop(self, collection: Collection, interruption: Interruption) -> str:
         """Collect, learn and record until there is a reason to stop; return it."""
         algorithm = self.experiment.algorithm
-        for batch, collect_s in _iterations(collection, algorithm, self.experiment.collector.mode == "async"):
+        for batch, collect_s in iterations(collection, algorithm, self.experiment.collector.mode == "async"):
             rows, finished = self.book.enter(batch["next", "trace"].numpy())
             self.env_steps += batch.numel()
             rank = self._rank(finished)
@@ -347,7 +345,7 @@ def read_files(experiment: Experiment) -> RaceSetup:
 
 def _drive_and_learn(training: Training, interruption: Interruption) -> str:
     experiment = training.experiment
-    frames = _frames_per_batch(experiment)
+    frames = frames_per_batch(experiment)
     # The view first: workers take a second or two to start.
     with (
         training.display,
@@ -356,45 +354,6 @@ def _drive_and_learn(training: Training, interruption: Interruption) -> str:
         ) as collection,
     ):
         return training.loop(collection, interruption)
-
-
-def _iterations(
-    collection: Collection, algorithm: AlgorithmConfig, separate: bool
-) -> Iterator[tuple[TensorDictBase, float]]:
-    """Yield what an update learns from, and the seconds it took to collect.
-
-    Args:
-        collection: the source of batches.
-        algorithm: says how many frames or episodes an iteration has.
-        separate: batches come from different cars and cannot be joined along time.
-    """
-    chunks: list[TensorDictBase] = []
-    frames = episodes = 0
-    began = time.monotonic()
-    for chunk in collection:
-        frames += chunk.numel()
-        episodes += int(chunk["next", "done"].sum())
-        wanted = algorithm.episodes_per_iteration
-        enough = frames >= (algorithm.frames_per_iteration or 0) if wanted is None else episodes >= wanted
-        if enough and not chunks:
-            yield chunk, time.monotonic() - began
-        elif enough:
-            whole = torch.cat([*chunks, chunk], dim=0 if separate else 1)
-            yield whole, time.monotonic() - began
-        else:
-            chunks.append(chunk.clone())
-            continue
-        chunks, frames, episodes = [], 0, 0
-        began = time.monotonic()
-
-
-def _frames_per_batch(experiment: Experiment) -> int:
-    collector = experiment.collector
-    workers = max(1, worker_count(collector))
-    frames = experiment.algorithm.frames_per_iteration
-    if frames is None:
-        return workers * collector.cars * _CHUNK_STEPS
-    return -(-frames // workers) if collector.mode == "async" else frames
 
 
 def _names(composition: Composition, track: str, reward: str) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """What happens inside a collector's process."""
 
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -20,6 +19,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 
 from .faults import keep_state, write_fault
+from .lifeline import die_with_parent
 
 PRINTS_FILE = "reward_prints.log"
 
@@ -106,9 +106,7 @@ def _obey_parent_only() -> None:
     if parent is None:
         return
     if sys.platform == "linux":
-        # From the fork server, which ends with the training process. Holds in C code that never returns, too.
-        PR_SET_PDEATHSIG = 1
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        die_with_parent()
         if not parent.is_alive():
             os._exit(RunFailed.exit_code)
     else:

@@ -89,6 +89,21 @@ def test_workers_do_not_outlive_a_killed_training(start_training, mode, moment):
 
 
 @pytest.mark.slow
+def test_workers_that_hang_do_not_outlive_a_killed_training(start_training, tmp_path):
+    (tmp_path / "deaf.py").write_text(
+        "def reward_function(params):\n"
+        "    while True:\n        try:\n            pass\n        except:\n            pass\n"
+    )
+    training = start_training("reward.file=deaf.py", "collector.hang_timeout_s=600", "reward.time_limit_s=1")
+    training.wait_for(lambda: len(training.workers()) == 2, "workers")
+    time.sleep(5)
+    training.workers()
+    training.popen.send_signal(signal.SIGKILL)
+    training.end()
+    training.assert_nothing_left(within_s=5.0)
+
+
+@pytest.mark.slow
 def test_a_fork_server_that_is_killed_ends_the_run(start_training):
     training = start_training()
     training.wait_for_iterations(1)

@@ -192,4 +192,4 @@ def test_a_save_on_a_full_disk_raises_and_leaves_nothing(tmp_path):
             store.save(make_agent(0), {"iteration": 0}, None)
         assert not list(store.folder.glob("[0-9b-l]*"))
     finally:
-        subprocess.run(["umount", str(tmp_path)], check=True)
+        subprocess.run(["umount", "--lazy", str(tmp_path)], check=True)
