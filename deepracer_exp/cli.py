@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -132,7 +133,7 @@ def _train(args: argparse.Namespace) -> int:
         outcomes.append(outcome)
         if experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
-        _tell(outcome, ui=experiment.tracking.kind == "mlflow")
+        _tell(outcome, None if experiment.tracking.kind == "off" else experiment.runs_dir)
         if outcome.status == "interrupted":
             break
     if args.multirun:
@@ -163,7 +164,7 @@ def _start_workers_early(wanted: bool) -> None:
         os.environ["OMP_NUM_THREADS"] = before
 
 
-def _tell(outcome: "Outcome", ui: bool) -> None:
+def _tell(outcome: "Outcome", tracked_in: str | None) -> None:
     summary = outcome.summary
     if outcome.status == "failed":
         print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
@@ -180,10 +181,11 @@ def _tell(outcome: "Outcome", ui: bool) -> None:
     for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):
         if (outcome.folder / name).exists():
             print(f"    {name}  {what}")
-    if ui:
+    if tracked_in is not None:
         # `make race` calls us by a path that a newcomer's shell does not know.
         command = "deepracer-exp" if shutil.which("deepracer-exp") else sys.argv[0]
-        print(f"  compare runs  {command} ui")
+        where = "" if tracked_in == "runs" else f" --runs-dir {shlex.quote(tracked_in)}"
+        print(f"  compare runs  {command} ui{where}")
 
 
 def _tell_all(outcomes: "Sequence[Outcome]") -> None:

@@ -271,6 +271,12 @@ def _check_together(experiment: Experiment) -> None:
             f"collector.processes={collector.processes} with collector.mode=in_process: "
             "choose collector=sync or collector=async for several processes"
         )
+    limit_s, hang_s = experiment.reward.time_limit_s, collector.hang_timeout_s
+    if collector.mode != "in_process" and limit_s >= hang_s:
+        raise BadInput(
+            f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}: a worker waiting for "
+            "its reward function would be taken for one that hangs"
+        )
     budget = experiment.budget
     if budget.env_steps is None and budget.iterations is None and budget.wall_clock_s is None:
         raise BadInput(

@@ -232,6 +232,7 @@ def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepte
         (["track.width_m=[1,2]"], ["2 values", "32"]),
         (["car.min_speed_mps=5"], ["5.0", "4.0"]),
         (["car.rear_axle_x_m=1"], ["1.0", "0.082311"]),
+        (["reward.time_limit_s=30"], ["30", "20"]),
         (["budget.env_steps=null"], ["env_steps", "iterations", "wall_clock_s"]),
     ],
 )

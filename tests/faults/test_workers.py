@@ -31,7 +31,7 @@ def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
 
 @MODES
 def test_a_worker_that_stops_is_ended_and_named(start_training, mode):
-    training = start_training(f"collector={mode}", "collector.hang_timeout_s=2")
+    training = start_training(f"collector={mode}", "collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
     training.wait_for_iterations(2)
     training.workers()[0].send_signal(signal.SIGSTOP)
     _lost(training, "collector worker 0", "took no ")
@@ -47,7 +47,7 @@ def test_a_worker_killed_while_it_starts_ends_the_run(start_training, mode):
 
 @pytest.mark.slow
 def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
-    training = start_training("collector.hang_timeout_s=2")
+    training = start_training("collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
     training.wait_for_worker().send_signal(signal.SIGSTOP)
     ended = training.end()
     ended.assert_run_failed("worker", "was ended")
@@ -65,7 +65,12 @@ def test_a_worker_killed_while_the_learner_learns_ends_the_run(start_training):
 
 @pytest.mark.slow
 def test_a_worker_stopped_while_the_learner_learns_ends_the_run(start_training):
-    training = start_training("algorithm.epochs=100", "algorithm.batch_size=32", "collector.hang_timeout_s=2")
+    training = start_training(
+        "algorithm.epochs=100",
+        "algorithm.batch_size=32",
+        "collector.hang_timeout_s=2",
+        "reward.time_limit_s=0.5",
+    )
     training.wait_for_iterations(1)
     training.workers()[0].send_signal(signal.SIGSTOP)
     _lost(training, "collector worker 0", "took no ")
@@ -114,7 +119,12 @@ def test_a_fork_server_that_is_killed_ends_the_run(start_training):
 @pytest.mark.slow
 def test_a_run_stopped_as_a_whole_goes_on_afterwards(start_training):
     """Ctrl-Z and fg: no worker is to blame for the pause."""
-    training = start_training("collector.hang_timeout_s=2", "budget.env_steps=null", "budget.iterations=40")
+    training = start_training(
+        "collector.hang_timeout_s=2",
+        "reward.time_limit_s=0.5",
+        "budget.env_steps=null",
+        "budget.iterations=40",
+    )
     training.wait_for_iterations(1)
     training.signal_group(signal.SIGSTOP)
     time.sleep(6)

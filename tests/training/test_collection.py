@@ -138,5 +138,7 @@ def test_workers_that_hang_while_they_start_are_ended(collect, monkeypatch):
     monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
     monkeypatch.setattr("deepracer_exp.training.collection.EnvFactory", _Sleeping)
     with pytest.raises(RunFailed, match="collector workers did not start: worker 0 took no step"):
-        collect("collector=sync", "collector.processes=2", "collector.hang_timeout_s=1")
+        collect(
+            "collector=sync", "collector.processes=2", "collector.hang_timeout_s=1", "reward.time_limit_s=0.5"
+        )
     assert set(multiprocessing.active_children()) == before
