@@ -63,7 +63,7 @@ def test_a_second_interruption_ends_at_once(start_training, tmp_path):
     (tmp_path / "slow.py").write_text(
         "import time\ndef reward_function(params):\n    time.sleep(0.2)\n    return 1.0\n"
     )
-    training = start_training("reward.file=slow.py", "reward.time_limit_s=60", "collector.cars=4")
+    training = start_training("reward.file=slow.py", "reward.time_limit_s=19", "collector.cars=4")
     training.wait_for(lambda: "results in" in (tmp_path / "stderr.txt").read_text(), "run")
     training.wait_for(lambda: len(training.workers()) == 2, "workers")
     time.sleep(3)
