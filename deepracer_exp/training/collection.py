@@ -150,6 +150,7 @@ class Collection:
             kind, more = MultiSyncCollector, {"cat_results": "stack"}
         else:
             kind, more = MultiAsyncCollector, {}
+        others = len(multiprocessing.active_children())
         with contextlib.ExitStack() as undo:
             undo.callback(self._give_up_starting)
             try:
@@ -158,6 +159,8 @@ class Collection:
                 verdicts = self._watchdog.verdict.items() if self._watchdog is not None else ()
                 hung = next((f"worker {worker} {verdict}" for worker, verdict in verdicts), None)
                 reason = hung or str(error).split(". ")[0].splitlines()[0]
+                if not hung and isinstance(error, BrokenPipeError):
+                    reason = f"worker {len(multiprocessing.active_children()) - others} died before it began"
                 raise RunFailed(f"collector workers did not start: {reason}") from error
             undo.pop_all()
         return collector

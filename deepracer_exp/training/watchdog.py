@@ -5,11 +5,13 @@ import multiprocessing
 import threading
 import time
 from collections.abc import Sequence
+from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 _LOOK_EVERY_S = 0.5
 # Building the cars takes 2 s on a quiet machine; a hang before the first step has no other sign.
@@ -104,6 +106,20 @@ class Watchdog:
             # and again, because one may be started only now.
             for process in multiprocessing.active_children():
                 process.kill()
+            _end_fork_servers_children()
         elif not known:
             with contextlib.suppress(ValueError):  # a handle that TorchRL has closed
                 self._processes[worker].kill()
+
+
+def _end_fork_servers_children() -> None:
+    """End the workers that the fork server has forked; one of them may not have been told yet what it is.
+
+    Until it has read that, `multiprocessing` does not list it, and the training process waits for it to read.
+    """
+    server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+    if server is None:
+        return
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for process in psutil.Process(server).children():
+            process.kill()
