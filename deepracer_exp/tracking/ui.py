@@ -43,8 +43,8 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
         announce(store.shown)
         return
     with _ending_by_exception(), running_ui(store, port) as (url, server):
-        announce(runs_page(url))
         try:
+            announce(runs_page(url))
             code = server.wait()
         except KeyboardInterrupt:
             return
