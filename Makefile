@@ -21,8 +21,9 @@ $(STAMP): pyproject.toml constraints.txt
 race: $(STAMP)  ## train the default experiment until the car drives reliably
 	@$(BIN)/deepracer-exp train
 
+# One process a core, and a file's tests together: they share what the file trains.
 test: $(STAMP)  ## the tests
-	@$(BIN)/python -m pytest -q -m "not slow"
+	@$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile
 
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each
 	@$(BIN)/python -m pytest -q -m slow

@@ -17,7 +17,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.config.compose import compose_experiment, options
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.options import options
+from deepracer_exp.env.courses import build_courses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 
@@ -82,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = [word for word in args.chosen if "=" not in word] or options("track")
 
     try:  # all of them before the first training; Hydra is not for several threads
-        tracks = [Track.from_config(compose_experiment([f"track={n}", *overrides])[0].track) for n in names]
+        composed = [compose_experiment([f"track={name}", *overrides])[0] for name in names]
+        tracks = [build_courses(experiment)[0].tracks[0] for experiment in composed]
     except BadInput as error:
         parser.error(str(error))
 

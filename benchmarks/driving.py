@@ -16,7 +16,6 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.reward_source import load_reward_source, source_with_constants
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.sim.batch import CarBatch
 
 PASS_STEPS = 150
 """Control steps of one pass: 10 s, several episodes of random driving."""
@@ -41,20 +40,23 @@ class SameDriving:
     """One pass of random driving that can be timed with the whole environment and with the physics alone.
 
     Both times the same cars do the same: the actions are drawn beforehand, the race begins anew from its seed, and
-    the bare batch gets the motor and servo commands and the new starts that the race gave its own.
+    every step of the bare physics starts from the state in which the environment's began.
     """
 
     def __init__(self, experiment: Experiment, n_cars: int):
-        """Drive the pass once to write down what the physics was told."""
+        """Drive the pass once to write down each step's state."""
         setup = scalar_setup(experiment)
         self.substeps = setup.car.substeps
         self._env = RaceEnv(Race(setup, n_cars, threads=1))
         torch.manual_seed(experiment.seed)
         self._actions = [self._env.action_spec.rand() for _ in range(PASS_STEPS)]
-        own = CarBatch(setup.car, n_cars, 1, setup.track.floor.friction)
-        self._batch = mujoco.batch.Batch(own.model, n_cars, 1)
-        self._rows, self._ctrl = self._batch.state, self._batch.bind("ctrl")
-        self._write_down()
+        cars = self._env.race._batch
+        self._physics = cars._batch
+        noting = _Noting(self._physics)
+        cars._batch = noting
+        self.env_pass_s()
+        cars._batch = self._physics
+        self._before, self._last = noting.before, noting.after
 
     @property
     def car_steps(self) -> int:
@@ -63,7 +65,8 @@ class SameDriving:
 
     def env_pass_s(self) -> float:
         """Return the seconds of the pass in the environment, new episodes included."""
-        root = self._begin()
+        self._env.race.seed(self._env.race.setup.seed)
+        root = self._env.reset()
         began = time.perf_counter()
         for action in self._actions:
             root.set("action", action)
@@ -76,38 +79,26 @@ class SameDriving:
         Raises:
             AssertionError: the cars did not end where the environment's did.
         """
-        rows, ctrl, batch, substeps = self._rows, self._ctrl, self._batch, self.substeps
-        rows[:] = self._first
+        physics, rows, substeps = self._physics, self._physics.state, self.substeps
         seconds = 0.0
-        for commands, (ids, starts) in zip(self._commands, self._starts, strict=True):
-            ctrl[:] = commands
+        for before in self._before:
+            rows[:] = before
             began = time.perf_counter()
-            batch.step(nstep=substeps)
+            physics.step(nstep=substeps)
             seconds += time.perf_counter() - began
-            rows[ids] = starts
         assert np.array_equal(rows, self._last), "the physics alone drove another way than the environment"
         return seconds
 
-    def _begin(self):  # type: ignore[no-untyped-def]
-        self._env.race.seed(self._env.race.setup.seed)
-        return self._env.reset()
 
-    def _write_down(self) -> None:
-        root = self._begin()
-        self._first = self._state()
-        self._commands, self._starts = [], []
-        for action in self._actions:
-            root.set("action", action)
-            following = self._env.step(root)["next"]
-            # The commands are part of the state.
-            self._rows[:] = self._state()
-            self._commands.append(self._ctrl.copy())
-            ids = np.flatnonzero(following["done"].numpy())
-            root = following.select("observation")
-            if len(ids):
-                self._env.race.reset(ids)
-            self._starts.append((ids, self._state()[ids]))
-        self._last = self._state()
+class _Noting:
+    """A batch that notes the state in which each of its steps begins, and in which the last one ended."""
 
-    def _state(self) -> np.ndarray:
-        return self._env.race.state_arrays()["physics_state"]
+    def __init__(self, batch: mujoco.batch.Batch):
+        self._batch = batch
+        self.before: list[np.ndarray] = []
+        self.after: np.ndarray
+
+    def step(self, nstep: int) -> None:
+        self.before.append(self._batch.state.copy())
+        self._batch.step(nstep=nstep)
+        self.after = self._batch.state.copy()

@@ -9,6 +9,7 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
   the call counts.
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
   experiment's without its `reward_batch`), episodes begun anew as they end.
+- `all_tracks_over_one_env` (a ratio): the same on all tracks of the catalogue at once, over the figure on one track.
 - `collect_steps_per_s`: batches of an iteration's frames through `Collection` in sync mode with 1 and 2 worker
   processes, the experiment's cars per process, its network sampling actions with its first weights.
 - `train_steps_per_s`: `deepracer-exp train` as a process of its own without MLflow: collection, update, trace, metrics,
@@ -55,6 +56,7 @@ Rates = dict[str, list[float]]
 
 RATIOS = (
     ("env_to_physics", "env", "physics", 0.75),
+    ("all_tracks_over_one_env", "env, all tracks", "env", 0.85),
     ("collect_2_to_1", "collect 2", "collect 1", 1.6),
     ("train_to_peer", "train", "peer", 1.5),
     ("train_to_default_peer", "train", "peer, 1 physics and 1 torch threads", None),
@@ -80,15 +82,19 @@ def in_turns(rounds: int, seconds: float, passes: dict[str, Callable[[], tuple[f
     return rates
 
 
-def driving(experiment: Experiment, n_cars: int, rounds: int, seconds: float) -> Rates:
-    """Measure physics and environment."""
-    same = SameDriving(experiment, n_cars)
+def driving(overrides: Sequence[str], n_cars: int, rounds: int, seconds: float) -> Rates:
+    """Measure physics and environment, and the environment on all tracks."""
+    same = SameDriving(compose_experiment(overrides)[0], n_cars)
+    everywhere = SameDriving(
+        compose_experiment([*overrides, "track=all", f"collector.cars={n_cars}"])[0], n_cars
+    )
     return in_turns(
         rounds,
         seconds,
         {
             "physics": lambda: (same.car_steps, same.physics_pass_s()),
             "env": lambda: (same.car_steps, same.env_pass_s()),
+            "env, all tracks": lambda: (everywhere.car_steps, everywhere.env_pass_s()),
         },
     )
 
@@ -125,7 +131,7 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
 
 def training(overrides: Sequence[str], iterations: int, rounds: int, folder: Path) -> Rates:
     """Measure training and peer."""
-    fixed = ["stopping=none", "tracking=off", "budget.env_steps=null", "budget.wall_clock_s=null"]
+    fixed = ["stopping=none", "tracking=off", "budget.env_steps=null", "budget.minutes=null"]
 
     def ours() -> tuple[float, float]:
         rows = read_metrics(train([*overrides, *fixed, f"budget.iterations={iterations + 1}"], folder))
@@ -215,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        rates = driving(experiment, args.cars, args.rounds, args.seconds)
+        rates = driving(args.overrides, args.cars, args.rounds, args.seconds)
         rates |= collecting(experiment, args.rounds, args.seconds, folder)
         frames = experiment.algorithm.frames_per_iteration or 0
         iterations = max(2, round(args.seconds * statistics.median(rates["collect 2"]) / frames))

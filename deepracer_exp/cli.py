@@ -7,11 +7,12 @@ import shutil
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from deepracer_exp import __version__
+from deepracer_exp.commands import compare, export, stopping
 from deepracer_exp.errors import BadInput, RunFailed
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ An experiment is one option of each group, and any value in it can be set:
   deepracer-exp train algorithm.lr=3e-4 seed=7              other values
   deepracer-exp train experiment=fast_lap                   a set of choices from conf/experiment/
   deepracer-exp train reward.file=my_reward.py              your own reward function
+  deepracer-exp train custom_files=DIR                      reward_function.py, model_metadata.json and
+                                                            hyperparameters.json as DeepRacer has them
   deepracer-exp train reward.constants.SPEED_WEIGHT=2       an UPPERCASE constant of the reward function
   deepracer-exp train -m seed=0,1,2 network=mlp_small,mlp   every combination, one run after the other
   deepracer-exp train track=Oval_track --cfg                print the experiment and stop
@@ -32,6 +35,28 @@ An experiment is one option of each group, and any value in it can be set:
 groups: track car action_space observation randomization episode reward network algorithm lr_schedule
         collector stopping budget tracking experiment
   deepracer-exp train --options GROUP                       the options of a group
+"""
+
+
+_VALIDATE_EPILOG = """\
+  deepracer-exp validate reward=racing_line                 of the reward zoo, on the default track
+  deepracer-exp validate reward.file=my_reward.py track=Oval_track
+  deepracer-exp validate reward.file=my_reward.py trial=60s also train so long: do reward and progress rise?
+
+exit code: 0 it can be trained, whatever the warnings; 2 it cannot, or --strict and the console would refuse it
+"""
+
+
+_EVALUATE_EPILOG = """\
+  deepracer-exp evaluate run=RUN                            RUN: a run's folder, its name or the beginning of it, or
+                                                            MLflow's id
+  deepracer-exp evaluate run=RUN evaluation=summit          three_trials, four_minutes, summit or aws_virtual
+  deepracer-exp evaluate run=RUN checkpoint=last evaluation.trials=20
+  deepracer-exp evaluate run=RUN evaluation.tracks=[Oval_track,Bowtie_track]
+  deepracer-exp evaluate run=RUN evaluation.held_out=null   on the usual conditions only
+  deepracer-exp evaluate run=RUN --video lap.mp4 --view top
+
+The results are also written into the run's folder, evaluations/TIME.json.
 """
 
 
@@ -82,6 +107,54 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.set_defaults(command=_train)
 
+    bring = commands.add_parser(
+        "import",
+        help="make options of a DeepRacer model's files",
+        description=(
+            "Make options of reward_function.py, model_metadata.json and hyperparameters.json, those of them that are "
+            "there: files in ./conf, to train with and to edit. Options in ./conf of the current folder stand beside "
+            "the project's own in every command. To train once with such files: deepracer-exp train custom_files=DIR."
+        ),
+    )
+    bring.add_argument(
+        "folder", metavar="DIR", help="deepracer-for-cloud's custom_files, or a model's folder"
+    )
+    bring.add_argument(
+        "--name", required=True, help="of the options, as in: deepracer-exp train experiment=NAME"
+    )
+    bring.set_defaults(command=_import)
+
+    validate = commands.add_parser(
+        "validate",
+        help="find out what a reward function pays for",
+        description=(
+            "Check a reward function as the AWS console does, call it in many situations on the track, draw what it "
+            "pays for, and warn of what often goes wrong."
+        ),
+        epilog=_VALIDATE_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    validate.add_argument("overrides", nargs="*", metavar="reward=NAME | reward.file=PATH | KEY=VALUE")
+    validate.add_argument("-o", "--output", help="picture to write (default: REWARD-TRACK.png)")
+    validate.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
+    validate.set_defaults(command=_validate)
+
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="find out how good a trained car is",
+        description=(
+            "Let a run's best policy race: several trials at once, on the usual conditions and on such it was not "
+            "trained on, on any tracks."
+        ),
+        epilog=_EVALUATE_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    evaluate.add_argument("overrides", nargs="*", metavar="run=RUN | evaluation=NAME | KEY=VALUE")
+    evaluate.add_argument("--video", metavar="FILE", help="film the fastest lap (.mp4)")
+    evaluate.add_argument("--view", choices=("chase", "top"), default="chase", help="of the film")
+    evaluate.add_argument("--cfg", action="store_true", help="print what is asked for as YAML and stop")
+    evaluate.set_defaults(command=_evaluate)
+
     tracks = commands.add_parser(
         "tracks",
         help="list the tracks, or draw one",
@@ -100,11 +173,16 @@ def _parser() -> argparse.ArgumentParser:
     ui.add_argument("--runs-dir", default="runs", help="where the runs are (default: runs)")
     ui.add_argument("--uri", help="another MLflow store, as given to tracking.uri")
     ui.set_defaults(command=_ui)
+
+    stopping.register(commands)
+    compare.register(commands)
+    export.register(commands)
     return parser
 
 
 def _train(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_experiment, expand_grid, options_of
+    from deepracer_exp.config.compose import compose_experiment, expand_grid
+    from deepracer_exp.config.options import options_of
 
     if args.options is not None:
         print("\n".join(options_of(args.options)))
@@ -113,6 +191,7 @@ def _train(args: argparse.Namespace) -> int:
     # All combinations are checked, and their files read, before the first one runs.
     composed = [compose_experiment(overrides) for overrides in grid]
     args.debug = any(experiment.debug for experiment, _ in composed)
+    _tell_notes(note for _, composition in composed for note in composition.notes)
     if args.cfg:
         print("---\n".join(composition.yaml() for _, composition in composed), end="")
         return 0
@@ -139,6 +218,78 @@ def _train(args: argparse.Namespace) -> int:
     if args.multirun:
         _tell_all(outcomes)
     return max(outcome.exit_code for outcome in outcomes)
+
+
+def _validate(args: argparse.Namespace) -> int:
+    # Before NumPy is imported: a reward function has one thread in a training, too, and on a busy machine the threads
+    # of a small linear-algebra problem wait for one another, up to the function's time limit.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.validation.trial import trial_overrides, trial_seconds
+
+    trials = [override.removeprefix("trial=") for override in args.overrides if override.startswith("trial=")]
+    overrides = [override for override in args.overrides if not override.startswith("trial=")]
+    seconds = trial_seconds(trials[-1]) if trials else None
+    experiment, composition = compose_experiment(overrides)
+    args.debug = experiment.debug
+    _tell_notes(composition.notes)
+    trial = None if seconds is None else compose_experiment([*overrides, *trial_overrides(seconds)])
+    if trial is not None:
+        _start_workers_early(experiment.collector.mode != "in_process")
+
+    from rich.console import Console
+
+    from deepracer_exp.validation.validate import validate
+
+    return validate(experiment, trial, args.output, args.strict, Console(), Console(stderr=True))
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_entry, compose_evaluation
+
+    if args.cfg:
+        print(compose_entry("evaluate", args.overrides).yaml(), end="")
+        return 0
+    config, _ = compose_evaluation(args.overrides)
+    args.debug = config.debug
+    if args.video is not None:
+        # MuJoCo looks at this once, when it is imported.
+        from deepracer_exp.evaluation.graphics import choose_graphics
+
+        choose_graphics()
+
+    from rich.console import Console
+
+    from deepracer_exp.evaluation.evaluate import evaluate
+
+    video = None if args.video is None else (Path(args.video), args.view)
+    out = Console(width=None if sys.stdout.isatty() else 160)
+    evaluate(config, video, out, Console(stderr=True))
+    return 0
+
+
+def _import(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.config.custom_files import KEY, read_custom_files
+    from deepracer_exp.config.import_files import import_files
+    from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.env.reward_source import load_reward_source
+
+    files = read_custom_files(args.folder)
+    experiment, composition = compose_experiment([override_line(KEY, args.folder)])
+    load_reward_source(experiment.reward)
+    written = import_files(files, args.name, composition)
+    _tell_notes(composition.notes)
+    for path in written:
+        print(path)
+    print(f"\n  train it  deepracer-exp train experiment={args.name}")
+    return 0
+
+
+def _tell_notes(notes: Iterable[str]) -> None:
+    for note in dict.fromkeys(notes):
+        print(note, file=sys.stderr)
 
 
 def _start_workers_early(wanted: bool) -> None:
@@ -170,12 +321,10 @@ def _tell(outcome: "Outcome", tracked_in: str | None) -> None:
         print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
         print(f"  what is known: {outcome.folder}", file=sys.stderr)
         return
-    best = summary["best_lap_time_s"]
     print(f"\n{outcome.status}: {outcome.reason}")
     print(
         f"  {summary['env_steps']:,} steps, {summary['episodes']:,} episodes, {summary['laps']:,} laps in "
-        f"{summary['wall_clock_s']:.0f} s"
-        + (f", best lap {best:.2f} s" if best is not None else ", no lap yet")
+        f"{summary['wall_clock_s']:.0f} s, {_laps(summary)}"
     )
     print(f"\n  results       {outcome.folder}")
     for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):
@@ -191,18 +340,30 @@ def _tell(outcome: "Outcome", tracked_in: str | None) -> None:
 def _tell_all(outcomes: "Sequence[Outcome]") -> None:
     print(f"\n{len(outcomes)} runs:")
     for outcome in outcomes:
-        best = outcome.summary.get("best_lap_time_s")
-        lap = f"best lap {best:.2f} s" if best is not None else "no lap"
-        print(f"  {outcome.folder.name}  {outcome.status}  {lap}  {outcome.reason}")
+        print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
+
+
+def _laps(summary: Mapping[str, Any]) -> str:
+    """Say what a run's laps came to."""
+    tracks = summary.get("tracks")
+    if tracks is not None:
+        return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
+    best = summary["best_lap_time_s"]
+    return f"best lap {best:.2f} s" if best is not None else "no lap yet"
 
 
 def _tracks(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_experiment, options
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.config.options import options
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
     from deepracer_exp.tracks.track import Track
 
     def load(override: str) -> Track:
-        return Track.from_config(compose_experiment([override])[0].track)
+        tracks = compose_experiment([override])[0].tracks
+        if len(tracks) > 1:
+            raise BadInput(f"{override}: {len(tracks)} tracks; accepted: one to draw")
+        (config,) = tracks.values()
+        return Track.from_config(config)
 
     if args.name is not None:
         is_file = Path(args.name).suffix in (".npy", ".yaml", ".yml")

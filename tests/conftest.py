@@ -17,8 +17,13 @@ from typing import Any
 
 import psutil
 import pytest
+from hypothesis import settings
 
 from deepracer_exp.cli import main
+
+# A deadline is a timed test: it fails on a busy machine.
+settings.register_profile("no_deadline", deadline=None)
+settings.load_profile("no_deadline")
 
 PATIENCE_S = 120.0
 """For what must happen, on a machine that may be busy."""

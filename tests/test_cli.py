@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from deepracer_exp import __version__
-from deepracer_exp.config.compose import groups, options
+from deepracer_exp.config.options import groups, options
 
 HEAVY = (
     "torch",
@@ -24,7 +24,15 @@ HEAVY = (
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["train", "--help"], ["tracks", "--help"], ["ui", "--help"], ["--version"]]
+    "arguments",
+    [
+        ["--help"],
+        ["train", "--help"],
+        ["import", "--help"],
+        ["tracks", "--help"],
+        ["ui", "--help"],
+        ["--version"],
+    ],
 )
 def test_help_imports_nothing_that_takes_time(arguments):
     code = (
@@ -46,7 +54,7 @@ def test_version_is_the_packages(call):
 
 def test_help_names_every_command(call):
     text = call("--help").stdout
-    for command in ("train", "tracks", "ui"):
+    for command in ("train", "import", "tracks", "ui"):
         assert command in text
 
 
@@ -153,3 +161,55 @@ def test_output_into_a_pipe_that_closes_early_is_no_traceback(tmp_path):
     )
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr
+
+
+# --- import
+
+
+def test_an_imported_experiment_trains(call, tmp_path):
+    folder = tmp_path / "custom_files"
+    folder.mkdir()
+    (folder / "reward_function.py").write_text("def reward_function(params):\n    return params['speed']\n")
+    ended = call("import", str(folder), "--name", "mine")
+    assert ended.code == 0
+    assert ended.stdout.splitlines()[:3] == [
+        "conf/reward/mine.py",
+        "conf/reward/mine.yaml",
+        "conf/experiment/mine.yaml",
+    ]
+    assert "deepracer-exp train experiment=mine" in ended.stdout
+    assert "taken as reward.file" in ended.stderr
+    assert "mine" in call("train", "--options", "reward").stdout.split()
+    cfg = call("train", "experiment=mine", "--cfg").stdout
+    assert yaml.safe_load(cfg)["reward"]["file"] == str(tmp_path / "conf/reward/mine.py")
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [("def reward_function(params)\n", "line 1"), ("def reward():\n    pass\n", "no function")],
+)
+def test_a_reward_function_that_is_none_is_not_imported(call, tmp_path, text, word):
+    folder = tmp_path / "custom_files"
+    folder.mkdir()
+    (folder / "reward_function.py").write_text(text)
+    call("import", str(folder), "--name", "mine").assert_bad_input("reward_function.py", word)
+    assert not (tmp_path / "conf").exists()
+
+
+def test_import_of_no_folder_is_bad_input(call):
+    call("import", "nowhere", "--name", "mine").assert_bad_input("nowhere", "reward_function.py")
+    assert call("import", "nowhere").code == 2
+
+
+def test_what_was_taken_from_files_is_told_once_and_logged(train_here, tmp_path):
+    folder = tmp_path / "model_3"
+    folder.mkdir()
+    (folder / "reward_function.py").write_text("def reward_function(params):\n    return params['speed']\n")
+    (folder / "hyperparameters.json").write_text(json.dumps({"lr": 1e-4, "stack_size": 1}))
+    ended = train_here(f"custom_files={folder}", "budget.iterations=1", "algorithm.episodes_per_iteration=2")
+    assert ended.code == 0, ended.stderr
+    note = "hyperparameters.json: stack_size=1: not applicable: the service ignores it, too"
+    assert ended.stderr.count(note) == 1
+    assert note in (ended.folder / "log.txt").read_text()
+    assert f"custom_files={folder}" in (ended.folder / "overrides.yaml").read_text()
+    assert "model_3" in ended.folder.name

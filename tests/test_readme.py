@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from deepracer_exp.config.compose import groups, options
+from deepracer_exp.config.options import groups, options
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

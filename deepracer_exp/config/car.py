@@ -42,11 +42,15 @@ class CarConfig:
     tyre_friction: Positive
 
     drive_radius_m: Positive
-    motor_gain_nms: Positive
+    front_motor_gain_nms: NonNegative
+    rear_motor_gain_nms: NonNegative
     motor_torque_nm: Positive
     servo_gain_nm: Positive
     servo_damping_nms: Positive
     servo_torque_nm: Positive
+    servo_kick: Annotated[float, Field(ge=0, lt=1)]
+    steering_trim_deg: Finite
+    ackermann: bool
 
     max_steering_deg: Positive
     min_speed_mps: NonNegative
@@ -59,10 +63,11 @@ class CarConfig:
     solver_iterations: Count
     line_search_iterations: Count
     solver_tolerance: NonNegative
-    friction_cone: Literal["pyramidal", "elliptic"]
     wheel_contact: Literal["sphere", "ellipsoid", "cylinder"]
     contact_time_s: Positive
     contact_impedance: Annotated[float, Field(gt=0, lt=1)]
+    front_slip_time_s: Positive
+    rear_slip_time_s: Positive
 
     def __post_init__(self) -> None:
         """Refuse limits that contradict each other."""
@@ -73,6 +78,11 @@ class CarConfig:
         if self.rear_axle_x_m >= self.front_axle_x_m:
             raise ValueError(
                 f"rear_axle_x_m ({self.rear_axle_x_m}) is not behind front_axle_x_m ({self.front_axle_x_m})"
+            )
+
+        if self.front_motor_gain_nms == self.rear_motor_gain_nms == 0.0:
+            raise ValueError(
+                "front_motor_gain_nms and rear_motor_gain_nms are both 0: nothing drives the car"
             )
 
     @property

@@ -4,10 +4,9 @@ import difflib
 import itertools
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from hydra import compose, initialize_config_dir
@@ -19,35 +18,20 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.errors import BadInput, nearest
 
+from . import custom_files
+from .custom_files import Beneath, beneath, read_custom_files
+from .evaluation import EvaluateConfig
 from .experiment import Experiment
-from .overrides import line_for_hydra, parse_single, parse_sweep
+from .export import ExportConfig
+from .options import conf_dirs, find, groups, options
+from .overrides import line_for_hydra, override_line, parse_single, parse_sweep
+from .several_tracks import GROUP as TRACK
+from .several_tracks import in_own_words, several_tracks
 
+Config = TypeVar("Config")
 
-def conf_dir() -> Path:
-    """Return the folder of option files: beside the code in an installed wheel, else the repository's."""
-    packaged = Path(__file__).parents[1] / "conf"
-    return packaged if packaged.is_dir() else Path(__file__).parents[2] / "conf"
-
-
-def options(group: str) -> list[str]:
-    """Return the names of a group's options, sorted."""
-    return sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
-
-
-def options_of(group: str) -> list[str]:
-    """Return the names of a group's options, sorted.
-
-    Raises:
-        BadInput: there is no such group.
-    """
-    if group not in groups():
-        raise BadInput(f"{group}: no such group{nearest(group, groups())}; groups: {', '.join(groups())}")
-    return options(group)
-
-
-def groups() -> list[str]:
-    """Return the names of the groups, sorted."""
-    return sorted(path.name for path in conf_dir().iterdir() if path.is_dir())
+# Option files name the files beside them by it, whatever the working folder: ${conf:'reward/mine.py'}.
+OmegaConf.register_new_resolver("conf", find, replace=True)
 
 
 @dataclass(frozen=True)
@@ -59,6 +43,10 @@ class Composition:
     """The option chosen in each group."""
     mapping: dict[str, Any]
     """All values, as plain Python."""
+    names: Mapping[str, str]
+    """What a racer calls the choices that come from `custom_files`, by group."""
+    notes: tuple[str, ...]
+    """What was taken from `custom_files` and what was not, a line each."""
 
     def yaml(self) -> str:
         """Return the values as YAML, in the order of the entry point's groups."""
@@ -72,7 +60,8 @@ def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Compositio
 
     Args:
         overrides: Hydra override expressions without sweeps, e.g. ``track=Oval_track``; paths and addresses need
-            no quotes.
+            no quotes. ``custom_files=DIR`` stands for the values of DeepRacer's files in a folder; they win over
+            defaults and experiments, and all other overrides over them.
 
     Raises:
         BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
@@ -81,18 +70,61 @@ def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Compositio
     return validate(composition.mapping), composition
 
 
+def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Composition]:
+    """Compose `conf/evaluate.yaml` with the overrides and validate the result.
+
+    Raises:
+        BadInput: as for `compose_experiment`, or no run is given.
+    """
+    composition = compose_entry("evaluate", overrides)
+    _require_run(composition)
+    return _typed(composition.mapping, EvaluateConfig), composition
+
+
+def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]:
+    """Compose `conf/export.yaml` with the overrides and validate the result.
+
+    Raises:
+        BadInput: as for `compose_experiment`, or no run or format is given.
+    """
+    composition = compose_entry("export", overrides)
+    _require_run(composition)
+    if composition.mapping["format"] is None:
+        raise BadInput("format: missing; write format=onnx or format=aws")
+    return _typed(composition.mapping, ExportConfig), composition
+
+
+def _require_run(composition: Composition) -> None:
+    if composition.mapping["run"] is None:
+        raise BadInput(
+            "run: missing; write run=RUN: a run's folder, its name or the beginning of it, or MLflow's id"
+        )
+
+
 def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     """Compose an entry point's YAML with the overrides into plain Python values.
 
     Raises:
-        BadInput: an override cannot be parsed or names something unknown.
+        BadInput: an override cannot be parsed or names something unknown, or a file cannot be used.
     """
-    parsed = [parse_single(override) for override in overrides]
-    for override in parsed:
-        _check_key(override)
+    given = [parse_single(override) for override in overrides]
+    own = [override for override in given if override.key_or_group != custom_files.KEY]
+    for override in own:
+        _check_key(entry, override)
+    files = _files(given, {one.key_or_group: text for one, text in zip(given, overrides, strict=True)})
+    has_tracks = TRACK in groups(entry)
+    several = several_tracks(own) if has_tracks else None
+    if several is not None:
+        rest = [override for override in own if override.key_or_group.partition(".")[0] != TRACK]
+        own = [*map(parse_single, several.choosing), *rest, *several.changing]
+    parsed = [*map(parse_single, files.lines), *own]
+    project, *more = conf_dirs()
+    lines = [line_for_hydra(override) for override in parsed]
     try:
-        with initialize_config_dir(str(conf_dir().resolve()), version_base="1.3"):
-            config = compose(entry, overrides=[line_for_hydra(o) for o in parsed], return_hydra_config=True)
+        with initialize_config_dir(str(project), version_base="1.3"):
+            if more:
+                lines.append(override_line("hydra.searchpath", [f"file://{folder}" for folder in more]))
+            config = compose(entry, overrides=lines, return_hydra_config=True)
         choices = {
             str(group): str(option).removesuffix(".yaml")
             for group, option in config.hydra.runtime.choices.items()
@@ -104,10 +136,17 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     except (HydraException, OmegaConfBaseException) as error:
         raise BadInput(_explain(entry, parsed, error)) from error
     assert isinstance(mapping, dict)
+    if has_tracks and TRACK in mapping and TRACK not in choices:
+        raise BadInput("track: a list of tracks in a file; several are chosen as an override: track=[A,B]")
+    if several is not None:
+        several.put_in_place(mapping)
+        choices[TRACK] = f"[{','.join(several.names)}]"
     return Composition(
         overrides=tuple(overrides),
-        choices={group: option for group, option in choices.items() if group in groups()},
+        choices={group: option for group, option in choices.items() if group in groups(entry)},
         mapping={str(key): value for key, value in mapping.items()},
+        names=files.names,
+        notes=files.notes,
     )
 
 
@@ -117,13 +156,17 @@ def validate(mapping: dict[str, Any]) -> Experiment:
     Raises:
         BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
     """
-    try:
-        # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
-        experiment = TypeAdapter(Experiment).validate_json(json.dumps(mapping), strict=True, extra="forbid")
-    except ValidationError as error:
-        raise BadInput(_first_finding(mapping, error)) from error
+    experiment = _typed(mapping, Experiment)
     _check_together(experiment)
     return experiment
+
+
+def _typed(mapping: dict[str, Any], kind: type[Config]) -> Config:
+    try:
+        # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
+        return TypeAdapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
+    except ValidationError as error:
+        raise BadInput(_first_finding(mapping, error)) from error
 
 
 def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
@@ -146,7 +189,15 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     return [list(combination) for combination in itertools.product(*axes)]
 
 
-def _check_key(override: Override) -> None:
+def _files(given: Sequence[Override], typed: Mapping[str, str]) -> Beneath:
+    """Return what the last `custom_files` stands for, nothing without one; `typed` is every override by its key."""
+    folders = [override.value() for override in given if override.key_or_group == custom_files.KEY]
+    if not folders or folders[-1] is None:
+        return Beneath((), {}, ())
+    return beneath(read_custom_files(str(folders[-1])), typed)
+
+
+def _check_key(entry: str, override: Override) -> None:
     """Refuse what Hydra would take without a word, or with a traceback."""
     key, value = override.key_or_group, override.value()
     if re.match(r"hydra\b", key):
@@ -155,7 +206,7 @@ def _check_key(override: Override) -> None:
         )
     if override.package is not None:
         raise BadInput(f"{key}@{override.package}: an option's place is its group's; write {key}=OPTION")
-    if key in groups() and not override.is_delete() and not isinstance(value, str | list | None):
+    if key in groups(entry) and not override.is_delete() and not isinstance(value, str | list | None):
         raise BadInput(f"{override.input_line}: no such {key}; options: {', '.join(options(key))}")
 
 
@@ -168,7 +219,7 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
 
 def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
     """Return one line for what Hydra tells in several."""
-    text = str(error)
+    text = in_own_words(str(error))
     missing = re.search(r"Could not find '([\w-]+)/([^']*)'", text)
     if missing:
         group, option = missing.groups()
@@ -176,17 +227,18 @@ def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
         return f"{group}={option}: no such {group}{nearest(option, known)}; options: {', '.join(known)}"
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
-        chosen = [o.input_line or "" for o in parsed if o.key_or_group in groups()]
-        return _unknown_key(unknown.group(1), compose_entry(entry, chosen))
+        known = groups(entry)
+        chosen = [o.input_line or "" for o in parsed if o.key_or_group in known and o.package is None]
+        return _unknown_key(entry, unknown.group(1), compose_entry(entry, chosen))
     loaded = re.search(r"in the defaults list", text)
     if loaded:
         key = next((o.key_or_group for o in parsed if o.key_or_group in text), parsed[0].key_or_group)
-        return f"{key}: no such group{nearest(key, groups())}; groups: {', '.join(groups())}"
+        return f"{key}: no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
     return f"{entry}: " + " ".join(text.split())
 
 
-def _unknown_key(key: str, chosen: Composition) -> str:
-    """Tell which keys there are where `key` was looked for; `chosen` is the experiment without other overrides."""
+def _unknown_key(entry: str, key: str, chosen: Composition) -> str:
+    """Tell which keys there are where `key` was looked for; `chosen` is the entry point without other overrides."""
     parent, _, leaf = key.rpartition(".")
     keys = list(_dotted(chosen.mapping))
     siblings = [k.rpartition(".")[2] for k in keys if parent and k.rpartition(".")[0] == parent]
@@ -199,7 +251,7 @@ def _unknown_key(key: str, chosen: Composition) -> str:
         leaves = {k.rpartition(".")[2]: k for k in reversed(keys)}
         match = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.8)
         close = f" (did you mean {leaves[match[0]]}?)" if match else ""
-    return f"{key}: no such key{close}; `deepracer-exp train --cfg` prints all of them"
+    return f"{key}: no such key{close}; `deepracer-exp {entry} --cfg` prints all of them"
 
 
 def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
@@ -277,14 +329,22 @@ def _check_together(experiment: Experiment) -> None:
             f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}: a worker waiting for "
             "its reward function would be taken for one that hangs"
         )
-    budget = experiment.budget
-    if budget.env_steps is None and budget.iterations is None and budget.wall_clock_s is None:
+    delay, still = experiment.randomization.action_delay_steps[1], experiment.episode.immobilized_steps
+    if still and delay + 1 >= still:
         raise BadInput(
-            "budget: env_steps, iterations and wall_clock_s are all null; at least one must end the run"
+            f"randomization.action_delay_steps reaches {delay} with episode.immobilized_steps={still}: a car whose "
+            f"commands come so late counts as standing before it moves; accepted there: up to {max(0, still - 2)}"
         )
-    track = experiment.track
-    if not isinstance(track.width_m, float) and len(track.width_m) != len(track.knots):
+    for name, track in experiment.tracks.items():
+        key = f"track.{name}" if isinstance(experiment.track, dict) else "track"
+        if not isinstance(track.width_m, float) and len(track.width_m) != len(track.knots):
+            raise BadInput(
+                f"{key}.width_m has {len(track.width_m)} values and {key}.knots {len(track.knots)}: "
+                "give one width, or one per knot"
+            )
+    cars = collector.cars * (collector.processes or 1)
+    if cars < len(experiment.tracks):
         raise BadInput(
-            f"track.width_m has {len(track.width_m)} values and track.knots {len(track.knots)}: "
-            "give one width, or one per knot"
+            f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted "
+            f"there: at least {-(-len(experiment.tracks) // (collector.processes or 1))}"
         )

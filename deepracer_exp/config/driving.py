@@ -7,7 +7,7 @@ from pydantic import Field
 
 from .bounds import Count, Finite, Fraction, Natural, NonNegative, Positive
 
-SpeedMps = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
+SpeedMps = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 SteeringDeg = Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
 
 
@@ -82,16 +82,6 @@ class ObservationConfig:
     lookahead_scale_m: Positive
     speed_scale_mps: Positive
     yaw_rate_scale_radps: Positive
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomizationConfig:
-    """Disturbances drawn from each car's own random stream."""
-
-    steering_noise_deg: NonNegative
-    """Standard deviation of Gaussian noise added to the steering command at every step."""
-    speed_noise: NonNegative
-    """Standard deviation of Gaussian noise multiplied onto the speed command, as a fraction of it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,15 +6,22 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from .budget import BudgetConfig
 from .car import CarConfig
-from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
+from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RewardConfig
 from .learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
-from .running import BudgetConfig, CollectorConfig, StoppingConfig, TrackingConfig
-from .track import TrackConfig
+from .randomization import RandomizationConfig
+from .running import CollectorConfig, TrackingConfig
+from .stopping import StoppingConfig
+from .track import TrackConfig, Tracks
 
 
-def _safe(name: str) -> str:
-    """Refuse what would be no plain folder name."""
+def safe_name(name: str) -> str:
+    """Return a name that is fit for a folder or a file.
+
+    Raises:
+        ValueError: it is not.
+    """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}", name):
         raise ValueError(
             "a name has letters, digits, '.', '_' and '-', at most 80, and begins with a letter or digit"
@@ -22,7 +29,7 @@ def _safe(name: str) -> str:
     return name
 
 
-SafeName = Annotated[str, AfterValidator(_safe)]
+SafeName = Annotated[str, AfterValidator(safe_name)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +42,8 @@ class Experiment:
     runs_dir: Annotated[str, Field(min_length=1)]
     debug: bool
     """Show a traceback for errors."""
-    track: TrackConfig
+    track: Tracks
+    """One, or several by name."""
     car: CarConfig
     action_space: ActionSpaceConfig
     observation: ObservationConfig
@@ -49,3 +57,8 @@ class Experiment:
     stopping: StoppingConfig
     budget: BudgetConfig
     tracking: TrackingConfig
+
+    @property
+    def tracks(self) -> dict[str, TrackConfig]:
+        """Return the tracks by name, one or several."""
+        return self.track if isinstance(self.track, dict) else {self.track.name: self.track}

@@ -14,8 +14,15 @@ from deepracer_exp.errors import BadInput
 OPEN_MAPPINGS = ("reward.constants",)
 # Values of these keys are taken as they are typed: Hydra's grammar has no umlaut, bracket or second equals sign
 # in a value without quotes, and a comma makes a sweep.
-PLAIN_TEXT = ("track.file", "reward.file", "action_space.file", "runs_dir", "tracking.uri")
-_PLAIN = re.compile(rf"(\+{{0,2}}(?:{'|'.join(map(re.escape, PLAIN_TEXT))})=)(.+)", re.DOTALL)
+PLAIN_TEXT = (
+    *("track.file", "reward.file", "action_space.file", "custom_files", "runs_dir", "tracking.uri"),
+    # Of the commands that read runs back; an id may look like a number.
+    *("run", "checkpoint", "tracking_uri"),
+)
+_KEYS = "|".join((*map(re.escape, PLAIN_TEXT), r"(?:track|several_tracks)\.[\w-]+\.file"))
+_PLAIN = re.compile(rf"(\+{{0,2}}(?:{_KEYS})=)(.+)", re.DOTALL)
+# A track may be called 2022_summit_speedway; Hydra's keys begin with a letter.
+_DIGIT = re.compile(r"([+~]*track\.)(?=\d)")
 
 
 def parse_single(override: str) -> Override:
@@ -57,9 +64,24 @@ def line_for_hydra(override: Override) -> str:
     return line
 
 
+def override_line(key: str, value: object) -> str:
+    """Return the expression that gives `key` a plain value: a number, text, list, mapping or null."""
+    return f"{key}={_expression(value)}"
+
+
+def _expression(value: object) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_expression(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(_expression, value)) + "]"
+    return _in_quotes(value) if isinstance(value, str) else repr(value)
+
+
 def _parse(override: str) -> Override:
     try:
-        parsed: Sequence[Override] = OverridesParser.create().parse_overrides([override])
+        parsed: Sequence[Override] = OverridesParser.create().parse_overrides([_DIGIT.sub(r"\1_", override)])
     except OverrideParseException as error:
         reason = str(error).splitlines()[0]
         key, equals, value = override.partition("=")
@@ -69,6 +91,9 @@ def _parse(override: str) -> Override:
         ) from error
     if not parsed[0].key_or_group:
         raise BadInput(f"{override}: no key before the equals sign; write GROUP=OPTION or KEY=VALUE")
+    if _DIGIT.match(override):
+        parsed[0].key_or_group = parsed[0].key_or_group.replace("track._", "track.", 1)
+        parsed[0].input_line = override
     return parsed[0]
 
 
@@ -79,6 +104,10 @@ def _quoted(value: str) -> str:
     if value.startswith("~"):
         # The shell does so at the beginning of a word only.
         value = str(Path(value).expanduser())
+    return _in_quotes(value)
+
+
+def _in_quotes(value: str) -> str:
     # Backslashes count as themselves, except in front of a quote.
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
     return f"'{escaped}'"

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .bounds import Count, Fraction, Natural, Positive
+from .bounds import Count, Natural
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,35 +22,6 @@ class CollectorConfig:
     """Physics threads per process (0: in_process one per core, else one)."""
     hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
     """Seconds without a control step after which a worker process counts as hanging."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BudgetConfig:
-    """Limits that end a run; null means none. The first one reached ends it."""
-
-    env_steps: Count | None
-    iterations: Count | None
-    wall_clock_s: Positive | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoStopping:
-    """Only the budget ends the run."""
-
-    kind: Literal["none"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReliableStopping:
-    """Stop once the car drives reliably: a share of the last episodes completed the lap."""
-
-    kind: Literal["reliable"]
-    lap_share: Fraction
-    episodes: Count
-    """How many of the last finished episodes are looked at."""
-
-
-StoppingConfig = Annotated[NoStopping | ReliableStopping, Field(discriminator="kind")]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,9 @@
 """The track an experiment drives on (`conf/track/`)."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 
 from .bounds import Finite, Positive
 
@@ -31,8 +31,10 @@ class TrackConfig:
     title: str
     closed: bool
     """Whether the last knot joins the first."""
-    direction: Literal["forward", "reversed"]
-    """Drive in the order of the knots (or route rows), or against it."""
+    direction: Literal["forward", "reversed", "alternate"]
+    """Drive in the order of the knots (or route rows), against it, or so and so in turn, episode by episode."""
+    weight: Positive
+    """How many of the cars drive here, relative to the other tracks of the experiment."""
     width_m: Positive | tuple[Positive, ...]
     """Distance between the borders in metres: one number, or one per knot."""
     knots: tuple[Point, ...]
@@ -40,3 +42,15 @@ class TrackConfig:
     floor: FloorConfig
     file: str | None
     """A route (.npy) or a YAML of knots that takes the place of name, title, closed, width_m and knots."""
+
+
+def _kind(value: Any) -> str:
+    """Tell several tracks from one, whose values are not all mappings."""
+    several = isinstance(value, dict) and value and all(isinstance(item, dict) for item in value.values())
+    return "several" if several else "one"
+
+
+Tracks = Annotated[
+    Annotated[TrackConfig, Tag("one")] | Annotated[dict[str, TrackConfig], Tag("several")],
+    Discriminator(_kind),
+]

@@ -66,9 +66,10 @@ class ContinuousActions:
 
     def commands(self, action: NDArray[Any]) -> Commands:
         """Clip N actions, (N, 2) floats, to -1..1 and scale them; NaN stays NaN."""
-        share = (np.clip(action, -1.0, 1.0) + 1.0) * 0.5
-        # This form of the interpolation is exact at both ends.
-        scaled = self.low * (1.0 - share) + self.high * share
+        # In 64 bits, as 32-bit shares of both ends do not add up to one.
+        share = (np.clip(np.asarray(action, np.float64), -1.0, 1.0) + 1.0) * 0.5
+        # This form of the interpolation is exact at both ends; in between rounding may leave a range of no width.
+        scaled = np.clip(self.low * (1.0 - share) + self.high * share, self.low, self.high)
         return scaled[:, 0], scaled[:, 1]
 
 

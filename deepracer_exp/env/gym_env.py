@@ -18,14 +18,16 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.trace import EPISODE_STATUS, PACKED
 
+from .courses import deal
 from .race import Race
 from .setup import RaceSetup, build_setup
 
 
 class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
-    """One car.
+    """One car; where there are several tracks it changes to another with every episode, by their weights.
 
     Observation: the features of `Features`, float32. Action: a number of the action space's list, or steering and
     speed in -1..1. `info` holds `progress` in per cent and `episode_status` of the pose that was judged.
@@ -42,6 +44,8 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
         """
         setup = build_setup(compose_experiment(overrides)[0])
         self._race = Race(setup, 1)
+        self._weights = [course.weight for course in setup.courses]
+        self._courses = deal(self._weights)
         self.observation_space, self.action_space = _spaces(self._race)
 
     def reset(
@@ -51,7 +55,9 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
         super().reset(seed=seed)
         if seed is not None:
             self._race.seed(seed)
-        self._race.reset()
+            self._courses = deal(self._weights)
+        # One episode after the other takes the place of one car beside the other.
+        self._race.reset(course=np.array([next(self._courses)]))
         return self._race.observation[0], {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -94,7 +100,13 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         Raises:
             BadInput: an override or a file it names is not accepted.
         """
-        self._race = Race(setup or build_setup(compose_experiment(overrides)[0]), num_envs, threads)
+        setup = setup or build_setup(compose_experiment(overrides)[0])
+        if num_envs < len(setup.courses):
+            raise BadInput(
+                f"num_envs={num_envs} with {len(setup.courses)} tracks: every track needs a car; accepted there: at "
+                f"least {len(setup.courses)}"
+            )
+        self._race = Race(setup, num_envs, threads)
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(self._race)
         self.observation_space = batch_space(self.single_observation_space, num_envs)

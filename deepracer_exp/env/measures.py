@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.sim.batch import CarState
-from deepracer_exp.tracks.track import Track
+from deepracer_exp.tracks.tracks import Tracks, Which
 
 Floats = NDArray[np.float64]
 
@@ -40,13 +40,20 @@ class Measures:
     is_left: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, car: CarState, front_point_m: float, track: Track) -> "Measures":
-        """Measure cars against `track`; `front_point_m` is how far ahead of the origin the front point is."""
+    def of(cls, car: CarState, front_point_m: float, tracks: Tracks, which: Which) -> "Measures":
+        """Measure cars.
+
+        Args:
+            car: their poses and motion, (N,).
+            front_point_m: how far ahead of the origin the front point is.
+            tracks: the courses.
+            which: number of each car's course, (N,).
+        """
         front = np.empty((len(car.x_m), 2))
         front[:, 0] = car.x_m + front_point_m * np.cos(car.yaw_rad)
         front[:, 1] = car.y_m + front_point_m * np.sin(car.yaw_rad)
-        projection = track.project(front)
-        track_width_m, is_left = track.border_distances(front, projection.center)
+        projection = tracks.project(front, which)
+        track_width_m, is_left = tracks.border_distances(front, projection.center, which)
         error = car.yaw_rad - projection.heading_rad
         closest = np.empty((len(front), 2), np.int64)
         closest[:, 0], closest[:, 1] = projection.previous, projection.next

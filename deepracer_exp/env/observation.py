@@ -32,18 +32,24 @@ class Features:
     """
 
     def __init__(
-        self, config: ObservationConfig, track_length_m: float, steering_max_deg: float, speed_max_mps: float
+        self, config: ObservationConfig, lengths_m: np.ndarray, steering_max_deg: float, speed_max_mps: float
     ):
         self._config = config
-        self._ahead_ndist = np.asarray(config.lookahead_m) / track_length_m
+        self._ahead_ndist = np.asarray(config.lookahead_m) / lengths_m[:, None]
         self._steering_max_deg = steering_max_deg
         self._speed_max_mps = speed_max_mps
         self.names = feature_names(config)
         self.size = len(self.names)
 
-    def ahead(self, ndist: np.ndarray) -> np.ndarray:
-        """Return the normalised distances (N, K) along the centre line at which the road is looked at."""
-        return ndist[:, None] + self._ahead_ndist
+    def ahead(self, ndist: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Return the normalised distances (N, K) along the centre line at which the road is looked at.
+
+        Args:
+            ndist: where the cars are, (N,).
+            which: place of each car's course among the lengths, (N,).
+        """
+        ahead: np.ndarray = ndist[:, None] + self._ahead_ndist[which]
+        return ahead
 
     def compute(
         self, now: Measures, steering_deg: np.ndarray, commanded_mps: np.ndarray, road: np.ndarray

@@ -1,10 +1,12 @@
 """The params dict that a reward function gets, as AWS DeepRacer defines it."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from deepracer_exp.tracks.track import Track
 
 Waypoints = list[tuple[float, float]]
 Row = tuple[Any, ...]
@@ -27,8 +29,22 @@ INDEX_COLUMNS = ("closest_waypoints",)
 COLUMNS = FLOAT_COLUMNS + BOOL_COLUMNS + INDEX_COLUMNS
 """The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
 
-CONSTANTS = ("track_length", "waypoints", "is_reversed")
-"""The keys that stay the same all run long."""
+
+class Road(NamedTuple):
+    """The keys that are the same for all cars on a course, all run long."""
+
+    waypoints: Waypoints
+    """Centre line of the direction driven, closing point included."""
+    track_length: float
+    """Metres."""
+    is_reversed: bool
+    """Whether the track is driven against its waypoint order."""
+
+    @classmethod
+    def of(cls, track: Track) -> "Road":
+        """Return what a course says of itself."""
+        return cls([(x, y) for x, y in track.waypoints.tolist()], track.length_m, track.reversed)
+
 
 _DTYPES: dict[str, type] = {
     **dict.fromkeys(FLOAT_COLUMNS, np.float64),

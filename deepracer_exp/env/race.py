@@ -1,19 +1,24 @@
-"""N cars on one track under the service's rules; NumPy only, so that any learning library can drive them."""
+"""N cars on their tracks under the service's rules; NumPy only, so that any learning library can drive them."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
+from deepracer_exp.config.randomization import RandomizationConfig
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.formats.trace import PACKED, STATUS_CODE
+from deepracer_exp.formats.trace import PACKED, RANDOMIZED
 from deepracer_exp.sim.batch import CarBatch, CarState
-from deepracer_exp.tracks.progress import progress
 
 from .measures import Measures
 from .observation import Features
 from .prints import RewardPrints
+from .randomization import Randomization
+from .referee import Referee, Verdict
 from .reward import RewardFunction
-from .rules import EpisodeRules
 from .setup import RaceSetup
-from .streams import CarStreams
+
+_RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
+"""Their columns lie side by side in packed rows."""
 
 
 class NonFinite(RunFailed):
@@ -47,6 +52,7 @@ class Race:
         threads: int = 1,
         first_car: int = 0,
         prints: RewardPrints | None = None,
+        randomizations: Sequence[RandomizationConfig] | None = None,
     ):
         """Build the cars; `reset` puts them on the track.
 
@@ -56,42 +62,36 @@ class Race:
             threads: physics threads; 0 means one per core.
             first_car: number of the first car over all processes, which its random stream and starts depend on.
             prints: where `print` of a reward function goes; None: nowhere.
+            randomizations: what each car suffers, (N,); None: all what the setup says.
         """
         self.setup = setup
         self.n_cars = n_cars
-        self.cars = np.arange(first_car, first_car + n_cars)
+        self.referee = Referee(setup, n_cars, first_car)
+        self.cars = self.referee.cars
         self._period_s = setup.car.control_period_s
-        self._batch = CarBatch(setup.car, n_cars, threads, setup.track.floor.friction)
-        self._rules = EpisodeRules(setup.episode, n_cars)
+        self._floors = np.array([course.tracks[0].floor.friction for course in setup.courses])
+        self._batch = CarBatch(setup.car, n_cars, threads, self._floors[self.referee.course])
         self._reward_function = RewardFunction(setup.reward, n_cars, setup.reward_time_limit_s, prints)
         low, high = setup.actions.low, setup.actions.high
         # A space that only drives straight ahead has no largest angle to divide by.
         steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
-        self._features = Features(setup.observation, setup.track.length_m, steering_max_deg, high[1])
-        self._params_of_run: dict[str, object] = {
-            "track_length": setup.track.length_m,
-            "waypoints": [(float(x), float(y)) for x, y in setup.track.waypoints],
-            "is_reversed": setup.track.reversed,
-        }
+        self._features = Features(setup.observation, self.referee.tracks.length_m, steering_max_deg, high[1])
+        self.randomization = Randomization(
+            randomizations or [setup.randomization] * n_cars,
+            self.cars.tolist(),
+            self._batch,
+            self._features.names,
+        )
         self._everyone = np.arange(n_cars)
-        self._episode = np.zeros(n_cars, np.int64)
-        self._steps = np.zeros(n_cars, np.int64)
-        self._clock_steps = np.zeros(n_cars, np.int64)
-        self._start_ndist = np.zeros(n_cars)
-        self._previous = np.zeros(n_cars)
-        self._last_progress = np.zeros(n_cars)
         self._return = np.zeros(n_cars)
         self._steering_deg = np.zeros(n_cars)
         self._commanded_mps = np.zeros(n_cars)
-        self._last_front = np.zeros((n_cars, 2))
-        self._wheels = np.array(setup.car.wheel_points_m)
         self.observation = np.zeros((n_cars, self._features.size), np.float32)
         self.reward = np.zeros(n_cars)
         self.terminated = np.zeros(n_cars, bool)
         self.truncated = np.zeros(n_cars, bool)
         self.trace = np.zeros((n_cars, len(PACKED)))
         self.trace[:, PACKED["car"]] = self.cars
-        self.trace[:, PACKED["track_len"]] = setup.track.length_m
         self.seed(setup.seed)
 
     @property
@@ -101,32 +101,44 @@ class Race:
 
     def seed(self, seed: int) -> None:
         """Begin anew: random streams from `seed`, start positions and clocks from the first episode."""
-        noise = self.setup.randomization
-        wanted = noise.steering_noise_deg > 0 or noise.speed_noise > 0
-        self._noise = CarStreams(seed, self.cars.tolist(), 2) if wanted else None
-        self._episode[:] = -1
-        self._clock_steps[:] = 0
+        self.randomization.seed(seed)
+        self.referee.restart()
 
-    def reset(self, ids: np.ndarray | None = None) -> None:
+    def reset(
+        self,
+        ids: np.ndarray | None = None,
+        course: np.ndarray | None = None,
+        start_ndist: np.ndarray | None = None,
+    ) -> None:
         """Put cars at the start of a new episode: on the centre line, standing, each start further along.
 
         Args:
             ids: indices of the cars, None: all of them.
+            course: places in `setup.courses` of other courses to go to, (n,); None: each stays on its own.
+            start_ndist: where they start as shares of the lap, (n,); None: as `episode` says.
         """
         ids = self._everyone if ids is None else ids
-        episode = self.setup.episode
-        self._episode[ids] += 1
-        # An open course is driven from its start: from anywhere else it could not be completed.
-        turns = self.cars[ids] + self._episode[ids] if self.setup.track.closed else np.zeros(len(ids))
-        start_ndist = np.mod(episode.start_offset + episode.start_advance * turns, 1.0)
-        self._start_ndist[ids] = start_ndist
-        for counter in (self._steps, self._previous, self._last_progress, self._return):
-            counter[ids] = 0
-        self._steering_deg[ids] = 0
-        self._commanded_mps[ids] = 0
-        self._rules.reset(ids)
-        x, y, yaw = self.setup.track.start_pose(start_ndist)
-        self._batch.place(ids, x, y, yaw)
+        pose = self.referee.reset(ids, start_ndist, course)
+        if course is not None:
+            self._batch.set_floor_friction(ids, self._floors[course])
+        for kept in (self._return, self._steering_deg, self._commanded_mps):
+            kept[ids] = 0
+        self.randomization.begin(ids, self.referee.episode[ids])
+        self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
+        self._observe_started(ids)
+
+    def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
+        """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn anew.
+
+        Args:
+            ids: indices of the cars.
+            percent: progress at which they go on, (n,); as `Referee.put_back`.
+        """
+        pose = self.referee.put_back(ids, percent)
+        for commanded in (self._steering_deg, self._commanded_mps):
+            commanded[ids] = 0
+        self.randomization.forget_commands(ids, self.referee.steps[ids])
+        self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
 
     def step(self, action: np.ndarray) -> None:
@@ -142,18 +154,17 @@ class Race:
             NonFinite: an action, a car's state or an observation is NaN or infinite.
         """
         steering_deg, speed_mps = self.setup.actions.commands(action)
-        self._steps += 1
-        self._clock_steps += 1
+        verdict = self.referee.judge()
         self._require_finite(
             "action", np.stack([steering_deg, speed_mps], axis=1), ("steering", "speed"), action
         )
-        running = self._steps > 1
-        self._judge()
-        self._pay(steering_deg, speed_mps, running)
-        self._write_trace(action, steering_deg, speed_mps)
-        self._last_front = self._now.front
+        self.terminated, self.truncated = verdict.terminated, verdict.truncated
+        params = self.referee.params(verdict, steering_deg, speed_mps)
+        self.reward = self._reward_function(params, self.referee.roads, verdict.running, self.referee.which)
+        self._return += self.reward
+        self._write_trace(verdict, action, steering_deg, speed_mps)
         try:
-            self._drive(steering_deg, speed_mps, running)
+            self._drive(steering_deg, speed_mps, verdict.running)
         except RunFailed as error:
             raise self._lost_car(error, action) from error
         self._observe()
@@ -164,61 +175,18 @@ class Race:
         return {
             "physics_state": self._batch.state.copy(),
             "observation": self.observation.copy(),
-            "steps": self._steps.copy(),
-            "episode": self._episode.copy(),
+            "steps": self.referee.steps.copy(),
+            "episode": self.referee.episode.copy(),
             "trace": self.trace.copy(),
         }
 
-    def _judge(self) -> None:
-        now = self._now
-        self._progress, self._previous = progress(now.ndist, self._start_ndist, self._previous)
-        wheels_on = self._wheels_on_road()
-        self._all_wheels_on: np.ndarray = np.asarray(wheels_on.all(axis=1))
-        self._off_track: np.ndarray = np.asarray(~wheels_on.any(axis=1))
-        moved_m = np.hypot(*(now.front - self._last_front).T)
-        status = self._rules.judge(self._steps, self._progress, self._last_progress, moved_m, self._off_track)
-        self._last_progress = self._progress
-        self.truncated = status == STATUS_CODE["time_up"]
-        self.terminated = (status > STATUS_CODE["in_progress"]) & ~self.truncated
-        self._status = status
-
-    def _wheels_on_road(self) -> np.ndarray:
-        """Return which wheel centres are on the road, (N, 4); flat, from x, y and yaw, as the service's log has."""
-        now = self._now
-        cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
-        wheel_x, wheel_y = self._wheels.T
-        points = np.empty((self.n_cars, len(self._wheels), 2))
-        points[:, :, 0] = now.x_m[:, None] + cos * wheel_x - sin * wheel_y
-        points[:, :, 1] = now.y_m[:, None] + sin * wheel_x + cos * wheel_y
-        return self.setup.track.on_road(points.reshape(-1, 2)).reshape(self.n_cars, -1)
-
-    def _pay(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
-        now = self._now
-        params: dict[str, np.ndarray] = {
-            "all_wheels_on_track": self._all_wheels_on,
-            "x": now.front[:, 0],
-            "y": now.front[:, 1],
-            "heading": np.degrees(now.yaw_rad),
-            "distance_from_center": now.distance_m,
-            "projection_distance": now.ndist * self.setup.track.length_m,
-            "progress": self._progress,
-            "steps": self._steps.astype(np.float64),
-            "speed": speed_mps,
-            "steering_angle": steering_deg,
-            "track_width": now.track_width_m,
-            "closest_waypoints": now.closest_waypoints,
-            "is_left_of_center": now.is_left,
-            "is_offtrack": self._off_track,
-            "sim_time": self._clock_steps * self._period_s,
-        }
-        self.reward = self._reward_function(params, self._params_of_run, running)
-        self._return += self.reward
-
-    def _write_trace(self, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray) -> None:
-        now, row = self._now, self.trace
+    def _write_trace(
+        self, verdict: Verdict, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray
+    ) -> None:
+        referee, now, row = self.referee, verdict.now, self.trace
         for name, values in (
-            ("episode", self._episode),
-            ("steps", self._steps),
+            ("episode", referee.episode),
+            ("steps", referee.steps),
             ("X", now.front[:, 0]),
             ("Y", now.front[:, 1]),
             ("yaw", np.degrees(now.yaw_rad)),
@@ -227,11 +195,13 @@ class Race:
             ("action", action if action.ndim == 1 else np.nan),
             ("reward", self.reward),
             ("done", self.terminated | self.truncated),
-            ("all_wheels_on_track", self._all_wheels_on),
-            ("progress", self._progress),
-            ("closest_waypoint", self._nearer_waypoint()),
-            ("tstamp", self._clock_steps * self._period_s),
-            ("episode_status", self._status),
+            ("all_wheels_on_track", verdict.all_wheels_on_track),
+            ("progress", verdict.progress),
+            ("closest_waypoint", referee.nearer_waypoint()),
+            ("track_len", referee.length_m),
+            ("track", referee.course),
+            ("tstamp", referee.clock_steps * self._period_s),
+            ("episode_status", verdict.status),
             ("speed_mps", now.speed_mps),
             ("yaw_rate_radps", now.yaw_rate_radps),
             ("offset_m", now.offset_m),
@@ -239,49 +209,36 @@ class Race:
             ("episode_return", self._return),
         ):
             row[:, PACKED[name]] = values
-
-    def _nearer_waypoint(self) -> np.ndarray:
-        """Return the nearer of the two closest waypoints, the one behind where they are equally far."""
-        closest = self._now.closest_waypoints
-        away = self.setup.track.waypoints[closest] - self._now.front[:, None]
-        behind_m, ahead_m = np.hypot(away[..., 0], away[..., 1]).T
-        return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
+        row[:, _RANDOMIZED] = self.randomization.values
 
     def _drive(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
         self._steering_deg = np.where(running, steering_deg, 0.0)
         self._commanded_mps = np.where(running, speed_mps, 0.0)
-        sent_deg, sent_mps = steering_deg, speed_mps
-        if self._noise is not None:
-            noise, randomization = self._noise.normal(), self.setup.randomization
-            sent_deg = sent_deg + randomization.steering_noise_deg * noise[:, 0]
-            sent_mps = sent_mps * (1 + randomization.speed_noise * noise[:, 1])
-        self._batch.drive(sent_mps, np.radians(sent_deg), moving=running)
+        sent_deg, sent_mps, moving = self.randomization.sent(steering_deg, speed_mps, self.referee.steps)
+        self._batch.drive(sent_mps, np.radians(sent_deg), moving=moving)
 
     def _observe(self) -> None:
         """Measure all cars, and compute what the policy sees of them."""
-        self._now = Measures.of(self._batch.read(), self.setup.car.front_point_m, self.setup.track)
-        self.observation = self._features_of(self._now, self._everyone)
+        features = self._features_of(self.referee.see(self._batch.read()), self._everyone)
+        self.observation = self.randomization.seen(features, self.observation)
 
     def _observe_started(self, ids: np.ndarray) -> None:
         """The same for the cars `ids` alone: at nearly every step some car of many starts an episode."""
         if len(ids) == self.n_cars:
-            self._observe()
-            self._last_front = self._now.front.copy()
-            return
-        car = CarState(*(values[ids] for values in self._batch.read()))
-        started = Measures.of(car, self.setup.car.front_point_m, self.setup.track)
-        self._now.replace(ids, started)
-        self._last_front[ids] = started.front
+            started = self.referee.see(self._batch.read())
+        else:
+            started = self.referee.see_some(ids, CarState(*(values[ids] for values in self._batch.read())))
         # The terminal observation has been handed out; it must stay as it was.
         self.observation = self.observation.copy()
-        self.observation[ids] = self._features_of(started, ids)
+        self.observation[ids] = self.randomization.first_seen(ids, self._features_of(started, ids))
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
+        which = self.referee.which[ids]
         return self._features.compute(
             measures,
             self._steering_deg[ids],
             self._commanded_mps[ids],
-            self.setup.track.points_at(self._features.ahead(measures.ndist)),
+            self.referee.tracks.points_at(self._features.ahead(measures.ndist, which), which),
         )
 
     def _lost_car(self, error: RunFailed, action: np.ndarray) -> RunFailed:
@@ -301,7 +258,8 @@ class Race:
             raise self._non_finite(f"{what} '{names[column]}' of {self._place(row)} {value}", action)
 
     def _place(self, row: int) -> str:
-        return f"car {self.cars[row]} at step {self._steps[row]} of its episode {self._episode[row]}"
+        step, episode = self.referee.steps[row], self.referee.episode[row]
+        return f"car {self.cars[row]} at step {step} of its episode {episode}"
 
     def _non_finite(self, message: str, action: np.ndarray) -> NonFinite:
         return NonFinite(message, {**self.state_arrays(), "action": np.asarray(action)})

@@ -1,8 +1,9 @@
 """Calls reward functions for many cars and trusts none of them."""
 
+import itertools
 import math
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import CodeType
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .params import Waypoints, batch_params, rows, scalar_params, select
+from .params import Road, batch_params, rows, scalar_params, select
 from .prints import RewardPrints
 from .reward_deadline import DeadlinePassed, deadline
 from .reward_source import RewardSource, source_with_constants
@@ -23,8 +24,12 @@ MAX_REWARD = 1e5
 class RewardFailed(RunFailed):
     """A reward function raised, hung or returned something that is no reward."""
 
-    def __init__(self, message: str, params: dict[str, Any] | None = None, car: int | None = None) -> None:
+    def __init__(
+        self, message: str, params: dict[str, Any] | None = None, car: int | None = None, what: str = ""
+    ) -> None:
         super().__init__(message)
+        self.what = what
+        """The middle of the message: what the function did, and in which line."""
         self.params = params
         """What the function was given (`reward_batch`: of all cars, where the car is not known)."""
         self.car = car
@@ -35,46 +40,54 @@ class RewardFunction:
 
     Each car has a module namespace of its own, as on the service, where a process has one car: module globals
     persist from call to call, and never pass from one car to another. They are no part of a checkpoint. A
-    module with `reward_batch(params)` is loaded once and called once a step for all cars instead.
+    module with `reward_batch(params)` is loaded once and called once a step for all cars of a road instead.
 
     Args:
         source: The module; its overriding constants are set.
         n_cars: Number of cars.
         time_limit_s: Wall-clock seconds for all calls of one step (see `deadline` for where it holds).
         prints: Where `print` goes; None discards it.
+        scalar: Call `reward_function` even where the module has `reward_batch`.
 
     Raises:
         BadInput: The module cannot be run or has no callable `reward_function` or `reward_batch`.
     """
 
     def __init__(
-        self, source: RewardSource, n_cars: int, time_limit_s: float, prints: RewardPrints | None
+        self,
+        source: RewardSource,
+        n_cars: int,
+        time_limit_s: float,
+        prints: RewardPrints | None,
+        scalar: bool = False,
     ) -> None:
         self.source = source
         self.n_cars = n_cars
         self.time_limit_s = time_limit_s
         code = compile(source_with_constants(source), source.path, "exec", dont_inherit=True)
         # Names that the module binds at its top level are listed in its code.
-        self._is_batch = "reward_batch" in code.co_names
+        self._is_batch = not scalar and "reward_batch" in code.co_names
         name = "reward_batch" if self._is_batch else "reward_function"
         cars = [None] if self._is_batch else list(range(n_cars))
         with deadline(time_limit_s):
             self._functions = [self._load(code, name, prints, car) for car in cars]
-        self._waypoints: object = None
-        self._waypoint_array = np.empty((0, 2))
+        self._roads: Sequence[Road] = ()
+        self._waypoints: list[np.ndarray] = []
 
     def __call__(
         self,
         columns: Mapping[str, np.ndarray],
-        constants: Mapping[str, Any],
+        roads: Sequence[Road],
         active: NDArray[np.bool_] | None = None,
+        which: NDArray[np.intp] | None = None,
     ) -> NDArray[np.float64]:
         """Return the reward of every car, shape (n_cars,); 0 for the cars that are not active.
 
         Args:
             columns: `params.COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
-            constants: `params.CONSTANTS`; `waypoints` is a list of (x, y) tuples.
+            roads: The courses that are driven.
             active: Cars to reward, shape (n_cars,); None: all.
+            which: Place in `roads` of each car's, shape (n_cars,); None: all drive on the first.
 
         Raises:
             RewardFailed: The function raised, hung, or returned no finite number within +-`MAX_REWARD`.
@@ -82,10 +95,37 @@ class RewardFunction:
         rewards = np.zeros(self.n_cars)
         cars = np.arange(self.n_cars) if active is None else np.flatnonzero(active)
         if len(cars):
-            selected = select(columns, None if active is None else cars)
+            road_of = np.zeros(len(cars), np.intp) if which is None else which[cars]
+            if len(roads) > 1:
+                order = np.argsort(road_of, kind="stable")
+                cars, road_of = cars[order], road_of[order]
             call = self._call_batch if self._is_batch else self._call_each
-            rewards[cars] = call(selected, constants, cars.tolist())
+            rewards[cars] = call(select(columns, cars), roads, road_of, cars.tolist())
         return rewards
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether `reward_batch` is called for all cars at once."""
+        return self._is_batch
+
+    @property
+    def functions(self) -> Sequence[Callable[[dict[str, Any]], object]]:
+        """The modules' own functions, unchecked and without a time limit."""
+        return self._functions
+
+    def pay(self, params: dict[str, Any]) -> float:
+        """Return what the module of the first car (`scalar`) pays for params that the caller made, in its `deadline`.
+
+        Raises:
+            RewardFailed: The function raised, hung, or returned no finite number within +-`MAX_REWARD`.
+        """
+        given = dict(params)
+        try:
+            return _as_reward(self._functions[0](params))
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise self._failure(error, 0, given) from error
 
     def _load(
         self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
@@ -109,15 +149,18 @@ class RewardFunction:
         return function
 
     def _call_each(
-        self, selected: dict[str, np.ndarray], constants: Mapping[str, Any], cars: list[int]
+        self,
+        selected: dict[str, np.ndarray],
+        roads: Sequence[Road],
+        road_of: NDArray[np.intp],
+        cars: list[int],
     ) -> list[float]:
-        road = _road(constants)
         functions = self._functions
         rewards: list[float] = []
-        table = list(rows(selected))
+        table, own_roads = list(rows(selected)), [roads[place] for place in road_of.tolist()]
         try:
             with deadline(self.time_limit_s):
-                for car, row in zip(cars, table, strict=True):
+                for car, road, row in zip(cars, own_roads, table, strict=True):
                     reward = functions[car](scalar_params(row, *road))
                     # A plain float within the bounds needs no closer look; NaN fails the comparison.
                     if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
@@ -129,27 +172,41 @@ class RewardFunction:
         except BaseException as error:
             # One reward a car that came through; a time limit may pass right after the last of them.
             at = min(len(rewards), len(cars) - 1)
-            raise self._failure(error, cars[at], scalar_params(table[at], *road)) from error
+            raise self._failure(error, cars[at], scalar_params(table[at], *own_roads[at])) from error
         return rewards
 
     def _call_batch(
-        self, selected: dict[str, np.ndarray], constants: Mapping[str, Any], cars: list[int]
+        self,
+        selected: dict[str, np.ndarray],
+        roads: Sequence[Road],
+        road_of: NDArray[np.intp],
+        cars: list[int],
     ) -> NDArray[np.float64]:
-        waypoints, length, is_reversed = road = _road(constants)
-        if waypoints is not self._waypoints:
-            self._waypoints, self._waypoint_array = waypoints, np.array(waypoints, dtype=float).reshape(-1, 2)
+        """Call the function once a road; the cars of a road stand side by side."""
+        if roads is not self._roads:
+            self._roads = roads
+            self._waypoints = [np.array(road.waypoints, dtype=float).reshape(-1, 2) for road in roads]
+        rewards = np.empty(len(cars))
+        bounds = [0, *(np.flatnonzero(np.diff(road_of)) + 1).tolist(), len(cars)]
+
+        def params(first: int, last: int) -> dict[str, Any]:
+            part = {key: column[first:last] for key, column in selected.items()}
+            place = road_of[first]
+            _, length, is_reversed = roads[place]
+            return batch_params(part, self._waypoints[place], length, is_reversed)
+
+        at = (0, len(cars))
         try:
             with deadline(self.time_limit_s):
-                result = self._functions[0](batch_params(selected, self._waypoint_array, length, is_reversed))
-            rewards = _as_rewards(result, len(cars))
+                for at in itertools.pairwise(bounds):
+                    rewards[slice(*at)] = _as_rewards(self._functions[0](params(*at)), at[1] - at[0])
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            params = batch_params(selected, self._waypoint_array, length, is_reversed)
-            raise self._failure(error, None, params) from error
+            raise self._failure(error, None, params(*at)) from error
         bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
         if len(bad):
-            row = list(rows(selected))[bad[0]]
+            row, road = list(rows(selected))[bad[0]], roads[road_of[bad[0]]]
             no_reward = _NotAReward(_no_reward(float(rewards[bad[0]])))
             raise self._failure(no_reward, cars[bad[0]], scalar_params(row, *road))
         return rewards
@@ -158,7 +215,7 @@ class RewardFunction:
         function = "reward_batch" if self._is_batch else "reward_function"
         where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
         what = self._what_happened(error)
-        return RewardFailed(f"reward {self.source.name}: {function} {what} ({where})", params, car)
+        return RewardFailed(f"reward {self.source.name}: {function} {what} ({where})", params, car, what)
 
     def _what_happened(self, error: BaseException) -> str:
         if isinstance(error, _NotAReward):
@@ -205,10 +262,6 @@ def _as_rewards(value: object, n: int) -> NDArray[np.float64]:
 
 def _no_reward(value: object) -> str:
     return f"returned {_short(value)}; a finite number from {-MAX_REWARD:g} to {MAX_REWARD:g} is wanted"
-
-
-def _road(constants: Mapping[str, Any]) -> tuple[Waypoints, float, bool]:
-    return constants["waypoints"], float(constants["track_length"]), bool(constants["is_reversed"])
 
 
 def _short(value: object) -> str:

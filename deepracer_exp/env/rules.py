@@ -5,6 +5,13 @@ import numpy as np
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.formats.trace import STATUS_CODE
 
+PENALTY_S = {"off_track": 2.0, "crashed": 5.0, "reversed": 2.0, "immobilized": 0.0}
+"""Seconds a car waits where an evaluation resets it; in training each of these ends the episode instead.
+
+The service's own figures (deepracer-simapp, rollout_agent_ctrl.py): OFF_TRACK_PENALTY 2 s and COLLISION_PENALTY 5 s;
+REVERSE_PENALTY is that of leaving the track and IMMOBILIZED_PENALTY nothing where a job does not set them.
+"""
+
 
 class EpisodeRules:
     """Counters and verdicts of N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).

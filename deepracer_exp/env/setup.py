@@ -1,22 +1,23 @@
 """Everything a car needs to know about its race, built once and sent to every process."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
+from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.errors import BadInput
+from deepracer_exp.config.randomization import RandomizationConfig
 from deepracer_exp.tracks.track import Track
 
 from .action_space import ActionSpace, build_action_space
+from .courses import Course, build_courses
 from .reward_source import RewardSource, load_reward_source
 
 
 @dataclass(frozen=True, kw_only=True)
 class RaceSetup:
-    """Track, car, actions, features, rules and reward of one experiment; picklable."""
+    """Courses, car, actions, features, rules and reward of one experiment; picklable."""
 
-    track: Track
+    courses: tuple[Course, ...]
     car: CarConfig
     actions: ActionSpace
     observation: ObservationConfig
@@ -26,6 +27,15 @@ class RaceSetup:
     reward_time_limit_s: float
     seed: int
 
+    @property
+    def track(self) -> Track:
+        """Return the first course's track, as its first episode drives it."""
+        return self.courses[0].tracks[0]
+
+    def on(self, track: Track) -> "RaceSetup":
+        """Return the same race on this track alone."""
+        return replace(self, courses=(Course(name=track.name, weight=1.0, tracks=(track,)),))
+
 
 def build_setup(experiment: Experiment) -> RaceSetup:
     """Read the files an experiment names and build what its environments need.
@@ -33,14 +43,8 @@ def build_setup(experiment: Experiment) -> RaceSetup:
     Raises:
         BadInput: a route, model_metadata or reward file is missing or malformed, or values contradict.
     """
-    track = Track.from_config(experiment.track)
-    if experiment.episode.start_offset and not track.closed:
-        raise BadInput(
-            f"episode.start_offset={experiment.episode.start_offset:g}: the open course {track.name} can only be "
-            "completed from its start; accepted there: 0"
-        )
     return RaceSetup(
-        track=track,
+        courses=build_courses(experiment),
         car=experiment.car,
         actions=build_action_space(experiment.action_space),
         observation=experiment.observation,

@@ -28,7 +28,23 @@ EPISODE_STATUS = (
 steps is `time_up`."""
 STATUS_CODE = {status: code for code, status in enumerate(EPISODE_STATUS)}
 
+RANDOMIZED = {
+    "friction_scale": "factor on the grip of the tyres",
+    "mass_scale": "factor on all masses",
+    "motor_scale": "factor on the motors' gain and torque",
+    "servo_scale": "factor on the steering servos' gain",
+    "battery_sag": "share of the commanded speed lost in the end",
+    "action_delay_steps": "control steps by which commands act late",
+    "steering_offset_deg": "degrees added to the steering, positive to the left",
+    "steering_noise_deg": "degrees, standard deviation of the noise on the steering",
+    "speed_noise": "standard deviation of the noise on the speed, as a fraction of it",
+    "observation_noise": "standard deviation of the noise on measured features",
+    "observation_dropout": "probability that the last observation is seen again",
+}
+"""Columns that tell what the episode drew (`conf/randomization/`), one value an episode, with their units."""
+
 _STATUS = pa.dictionary(pa.int8(), pa.string())
+_TRACK = pa.dictionary(pa.int16(), pa.string())
 _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
     # The service's columns, in its order (deepracer-simapp, markov/metrics/constants.py).
     ("episode", pa.int32(), "counted from 0 over the whole run, in the order in which episodes begin"),
@@ -51,12 +67,14 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
     ("obstacle_crash_counter", pa.int32(), "obstacles hit"),
     # Ours.
     ("car", pa.int32(), "number of the car over all processes"),
+    ("track", _TRACK, "name of the course"),
     ("iteration", pa.int32(), "policy update that learned from the row"),
     ("speed_mps", pa.float32(), "m/s measured"),
     ("yaw_rate_radps", pa.float32(), "rad/s measured, positive to the left"),
     ("offset_m", pa.float32(), "m from the centre line, positive to the left of the driving direction"),
     ("heading_error_rad", pa.float32(), "rad from the centre line's direction, positive to the left"),
     ("episode_return", pa.float64(), "sum of the episode's rewards up to here"),
+    *((name, pa.float32(), unit) for name, unit in RANDOMIZED.items()),
 )
 TRACE_COLUMNS = tuple(name for name, _, _ in _COLUMNS)
 """Columns of a written trace."""
@@ -64,7 +82,8 @@ PACKED_COLUMNS = tuple(
     name for name in TRACE_COLUMNS if name not in ("pause_duration", "obstacle_crash_counter", "iteration")
 )
 """Columns of packed rows, the float64 matrix in which a trace travels between processes; booleans are 0 or 1,
-`episode_status` is its code, and `action` is NaN where it is no number."""
+`episode_status` is its code, `track` the course's place in the experiment, and `action` is NaN where it is no
+number."""
 PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
 """Column number of each packed column."""
 _CONTINUOUS = (
@@ -77,15 +96,16 @@ _REPEATING = [name for name in TRACE_COLUMNS if name not in _CONTINUOUS]
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 
 
-def to_table(packed: NDArray[np.float64], iteration: int) -> pa.Table:
+def to_table(packed: NDArray[np.float64], iteration: int, tracks: Sequence[str]) -> pa.Table:
     """Turn packed rows into a table with the types and units of `SCHEMA`.
 
     Args:
         packed: (n, len(PACKED_COLUMNS)).
         iteration: policy update that learned from the rows.
+        tracks: names of the experiment's courses.
 
     Raises:
-        ValueError: the shape is another one, or a status code is unknown.
+        ValueError: the shape is another one, or a code of a status or course is unknown.
     """
     if packed.ndim != 2 or packed.shape[1] != len(PACKED_COLUMNS):
         raise ValueError(f"packed rows of shape {packed.shape}; wanted (n, {len(PACKED_COLUMNS)})")
@@ -98,18 +118,24 @@ def to_table(packed: NDArray[np.float64], iteration: int) -> pa.Table:
     columns = []
     for name, kind, _ in _COLUMNS:
         values = packed[:, PACKED[name]] if name in PACKED else np.full(rows, extra[name])
-        columns.append(_column(values, kind))
+        if kind is _STATUS:
+            columns.append(_words(name, values, EPISODE_STATUS, np.int8))
+        elif kind is _TRACK:
+            columns.append(_words(name, values, tracks, np.int16))
+        else:
+            columns.append(_column(values, kind))
     return pa.Table.from_arrays(columns, schema=SCHEMA)
 
 
+def _words(name: str, codes: NDArray[np.float64], words: Sequence[str], dtype: type) -> pa.Array:
+    # Arrow would accept a code beyond its words and fail only when somebody reads it.
+    unknown = ~np.isin(codes, np.arange(len(words)))
+    if unknown.any():
+        raise ValueError(f"{name} code {codes[unknown][0]:g}; known: 0 to {len(words) - 1}")
+    return pa.DictionaryArray.from_arrays(codes.astype(dtype), pa.array(words, pa.string()))
+
+
 def _column(values: NDArray[np.float64], kind: pa.DataType) -> pa.Array:
-    if kind is _STATUS:
-        # Arrow would accept a code beyond its words and fail only when somebody reads it.
-        unknown = ~np.isin(values, np.arange(len(EPISODE_STATUS)))
-        if unknown.any():
-            raise ValueError(f"status code {values[unknown][0]:g}; known: 0 to {len(EPISODE_STATUS) - 1}")
-        codes = values.astype(np.int8)
-        return pa.DictionaryArray.from_arrays(codes, pa.array(EPISODE_STATUS))
     if pa.types.is_floating(kind):
         return pa.array(np.ascontiguousarray(values), kind)
     missing = np.isnan(values)

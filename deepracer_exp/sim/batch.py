@@ -44,18 +44,25 @@ class CarBatch:
         car: dimensions and physics settings, the same for all cars.
         n_cars: number of cars.
         threads: number of threads including the caller's; 0 takes all cores this process may run on.
-        floor_friction: factor on the tyre friction.
+        floor_friction: factor on the tyre friction, one for all or (N,).
     """
 
-    def __init__(self, car: CarConfig, n_cars: int, threads: int, floor_friction: float = 1.0) -> None:
+    def __init__(self, car: CarConfig, n_cars: int, threads: int, floor_friction: ArrayLike = 1.0) -> None:
         self.car = car
         self.n_cars = n_cars
         self.model = build_model(car)
-        self._wheel_geoms = np.array([self.model.geom(name).id for name in WHEELS])
+        self._contacts = np.array([self.model.pair(name).id for name in WHEELS])
         self._motors = np.array([self.model.actuator(f"{name}_motor").id for name in WHEELS])
         self._servos = np.array([self.model.actuator(f"{name}_servo").id for name in STEERED])
-        self._floor_friction = floor_friction
-        self.model.geom_friction[self._wheel_geoms, 0] = car.tyre_friction * floor_friction
+        steered = [self.model.joint(f"{name}_steer") for name in STEERED]
+        self._steer_qpos = np.array([joint.qposadr[0] for joint in steered])
+        self._trim_rad = np.deg2rad(car.steering_trim_deg)
+        self._rest_row, self._rest_qpos = self._settle()
+        self._tyre_friction = np.full(n_cars, car.tyre_friction)
+        self._floor_friction = np.broadcast_to(np.asarray(floor_friction, np.float64), n_cars).copy()
+        # Along and across the wheel; the rest would be spinning and rolling friction. One floor for all cars is the
+        # model's own.
+        self.model.pair_friction[self._contacts, :2] = car.tyre_friction * self._floor_friction[0]
         self._batch = mujoco.batch.Batch(self.model, n_cars, threads or len(os.sched_getaffinity(0)))
         self._rows: Floats = self._batch.state
         self._qpos: Floats = self._batch.bind("qpos")
@@ -63,9 +70,10 @@ class CarBatch:
         # Position and velocity lie side by side in a row, after the time.
         self._moving: Floats = self._rows[:, 1 : 1 + self.model.nq + self.model.nv]
         self._ctrl: Floats = self._batch.bind("ctrl")
-        self._rest_row, self._rest_qpos = self._settle()
         self._max_steering_rad = np.deg2rad(car.max_steering_deg)
         self._rows[:] = self._rest_row
+        if (self._floor_friction != self._floor_friction[0]).any():
+            self._apply_friction(np.arange(n_cars))
 
     def place(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
         """Put cars at rest on their wheels, steering straight, with no memory of what they did before.
@@ -89,6 +97,45 @@ class CarBatch:
         self._qpos[rows, 5] = cos * y + sin * x
         self._qpos[rows, 6] = cos * z + sin * w
 
+    def move(self, ids: ArrayLike, pose: Floats, motion: Floats) -> None:
+        """Put cars elsewhere in motion; height, pitch, wheel turns and steering angles stay as they are.
+
+        Args:
+            ids: distinct car numbers, (n,).
+            pose: x_m, y_m, yaw_rad of the chassis origin, (n, 3).
+            motion: speed_mps, lateral_mps, yaw_rate_radps as in `CarState`, (n, 3).
+        """
+        rows = np.asarray(ids, np.intp)
+        half = 0.5 * (pose[:, 2] - self.read().yaw_rad[rows])
+        cos, sin = np.cos(half), np.sin(half)
+        w, x, y, z = self._qpos[rows, 3:7].T
+        turned = [cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w]
+        self._qpos[rows, :2] = pose[:, :2]
+        self._qpos[rows, 3:7] = np.stack(turned, axis=-1)
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        self._qvel[rows, 0] = cos * motion[:, 0] - sin * motion[:, 1]
+        self._qvel[rows, 1] = sin * motion[:, 0] + cos * motion[:, 1]
+        self._qvel[rows, 5] = motion[:, 2]
+
+    @property
+    def steering_rad(self) -> Floats:
+        """The angle at which the front wheels stand, (N,): a copy, left positive."""
+        angle: Floats = self._qpos[:, self._steer_qpos].mean(axis=1)
+        return angle
+
+    def lift(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
+        """Put cars at rest as `place` does, but with their front wheels and servos as they are."""
+        rows = np.asarray(ids, np.intp)[:, None]
+        angles, targets = self._qpos[rows, self._steer_qpos], self._ctrl[rows, self._servos]
+        self.place(ids, x_m, y_m, yaw_rad)
+        self._qpos[rows, self._steer_qpos], self._ctrl[rows, self._servos] = angles, targets
+
+    def steer(self, ids: ArrayLike, angle_rad: ArrayLike) -> None:
+        """Turn cars' front wheels to an angle at once, (n,); the servos go on from there."""
+        rows = np.asarray(ids, np.intp)
+        angle = np.broadcast_to(np.asarray(angle_rad, np.float64), rows.shape)
+        self._qpos[rows[:, None], self._steer_qpos] = angle[:, None]
+
     def drive(
         self, speed_mps: ArrayLike, steering_rad: ArrayLike, moving: NDArray[np.bool_] | None = None
     ) -> None:
@@ -110,13 +157,25 @@ class CarBatch:
         steering = np.clip(steering, -self._max_steering_rad, self._max_steering_rad)
         if moving is not None:
             speed, steering = speed * moving, steering * moving
-        self._ctrl[:, self._servos] = steering[:, None]
+        target = self._front_angles(steering + self._trim_rad)
+        self._qpos[:, self._steer_qpos] += self.car.servo_kick * (target - self._ctrl[:, self._servos])
+        self._ctrl[:, self._servos] = target
         self._ctrl[:, self._motors] = (speed / self.car.drive_radius_m)[:, None]
         try:
             self._batch.step(nstep=self.car.substeps)
         except mujoco.batch.SimulationError as error:
             raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
         _require_finite("physics state", np.isfinite(self._moving))
+
+    def _front_angles(self, steering: Floats) -> Floats:
+        """Return the angles of the left and the right front wheel, (N, 2) or (N, 1) where they are the same."""
+        if not self.car.ackermann:
+            return steering[:, None]
+        tangent = np.tan(steering)[:, None]
+        # The centre of the turn lies on the rear axle, wheelbase / tangent to the left of the middle.
+        length, left = self.car.wheelbase_m, self.car.front_wheel_y_m * np.array([1.0, -1.0])
+        angles: Floats = np.arctan(length * tangent / (length - left * tangent))
+        return angles
 
     def read(self) -> CarState:
         """Return position and motion of all cars."""
@@ -151,8 +210,19 @@ class CarBatch:
     def set_tyre_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
         """Give cars their own tyre friction coefficient, (n,), before the floor's factor."""
         rows = np.asarray(ids, np.intp)
-        friction = np.broadcast_to(np.asarray(values, np.float64) * self._floor_friction, rows.shape)
-        self._batch.expand("geom_friction")[rows[:, None], self._wheel_geoms, 0] = friction[:, None]
+        self._tyre_friction[rows] = values
+        self._apply_friction(rows)
+
+    def set_floor_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
+        """Put cars on floors with these factors on the tyre friction, (n,)."""
+        rows = np.asarray(ids, np.intp)
+        if (self._floor_friction[rows] != values).any():
+            self._floor_friction[rows] = values
+            self._apply_friction(rows)
+
+    def _apply_friction(self, rows: Ids) -> None:
+        friction = self._tyre_friction[rows] * self._floor_friction[rows]
+        self._batch.expand("pair_friction")[rows[:, None], self._contacts, :2] = friction[:, None, None]
 
     def set_mass_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
         """Multiply cars' masses and inertias by scale, (n,), relative to the configured ones."""
@@ -196,8 +266,11 @@ class CarBatch:
         pose[4] = pose[6] = 0.0
         pose[3:7] /= np.linalg.norm(pose[3:7])
         pose[7:] = 0.0
+        # A car that was told straight for long stands at its trim.
+        pose[self._steer_qpos] = self._trim_rad
         mujoco.mj_resetData(self.model, data)
         data.qpos[:] = pose
+        data.ctrl[self._servos] = self._trim_rad
         row = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION))
         mujoco.mj_getState(self.model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
         return row, pose

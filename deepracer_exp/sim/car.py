@@ -17,7 +17,6 @@ _INTEGRATOR = {
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
 _SOLVER = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
-_CONE = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 _CONTACT = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
@@ -79,7 +78,7 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     spec.modelname = car.name
     _set_options(spec, car)
     spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0
     )
     chassis = spec.worldbody.add_body(name="chassis")
     chassis.add_freejoint(name="chassis")
@@ -89,6 +88,7 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     chassis.explicitinertial = True
     for place in wheel_places(car):
         _add_wheel(chassis, car, place)
+        _add_contact(spec, car, place.name)
     _add_actuators(spec, car)
     if visual:
         _add_visuals(spec, chassis, car)
@@ -105,7 +105,7 @@ def _set_options(spec: mujoco.MjSpec, car: CarConfig) -> None:
     option.timestep = car.control_period_s / car.substeps
     option.integrator = _INTEGRATOR[car.integrator]
     option.solver = _SOLVER[car.solver]
-    option.cone = _CONE[car.friction_cone]
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.iterations = car.solver_iterations
     option.ls_iterations = car.line_search_iterations
     option.tolerance = car.solver_tolerance
@@ -141,17 +141,27 @@ def _add_wheel(chassis: mujoco.MjsBody, car: CarConfig, place: WheelPlace) -> No
         size=size,
         quat=quat,
         contype=0,
-        conaffinity=1,
-        condim=3,
-        # Above the floor's 0, so that the tyre's friction and contact stiffness are the pair's.
-        priority=1,
-        friction=[car.tyre_friction, 0, 0],
-        solref=[car.contact_time_s, 1],
-        # The same at any depth, so that the width (1 mm) and shape of the transition have no part.
-        solimp=[car.contact_impedance, car.contact_impedance, 0.001, 0.5, 2],
+        conaffinity=0,
         group=PHYSICS_GROUP,
         rgba=[0.1, 0.1, 0.1, 1],
     )
+
+
+def _add_contact(spec: mujoco.MjSpec, car: CarConfig, wheel: str) -> None:
+    """Let a wheel touch the floor: the only contacts there are, so that each has its own slip."""
+    slip_time_s = car.front_slip_time_s if wheel in STEERED else car.rear_slip_time_s
+    pair = spec.add_pair(
+        name=wheel,
+        geomname1="floor",
+        geomname2=wheel,
+        condim=3,
+        friction=[car.tyre_friction, car.tyre_friction, 0, 0, 0],
+        solref=[car.contact_time_s, 1],
+        solreffriction=[slip_time_s, 1],
+        # The same at any depth, so that the width (1 mm) and shape of the transition have no part.
+        solimp=[car.contact_impedance, car.contact_impedance, 0.001, 0.5, 2],
+    )
+    assert pair is not None
 
 
 def _add_actuators(spec: mujoco.MjSpec, car: CarConfig) -> None:
@@ -166,7 +176,7 @@ def _add_actuators(spec: mujoco.MjSpec, car: CarConfig) -> None:
         motor = spec.add_actuator(
             name=f"{name}_motor", target=f"{name}_spin", trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
-        motor.set_to_velocity(kv=car.motor_gain_nms)
+        motor.set_to_velocity(kv=car.front_motor_gain_nms if name in STEERED else car.rear_motor_gain_nms)
         motor.forcelimited = True
         motor.forcerange = [-car.motor_torque_nm, car.motor_torque_nm]
 

@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from .flatten import Scalar, flatten
 
 METRICS: Mapping[str, str] = {
     "completion": "per cent of the lap driven per finished episode, mean",
-    "lap_share": "share of the last episodes that completed the lap (0 to 1)",
+    "lap_share": "share of the last episodes that completed the lap (0 to 1), of several tracks the lowest",
     "best_lap_time_s": "fastest lap so far",
     "mean_lap_time_s": "mean time of the iteration's completed laps",
     "laps": "laps completed so far",
@@ -28,6 +29,12 @@ METRICS: Mapping[str, str] = {
 
 The order counts: the comparison of runs opens with the metric that was recorded first.
 """
+
+TRACK_METRICS = ("completion", "lap_share", "best_lap_time_s", "mean_lap_time_s")
+"""Metrics that a run on several tracks has of each: `completion/Oval_track`. The UI shows what stands before the
+slash as one section, so that the tracks stand beside one another."""
+
+_LONGEST_LABEL = 80  # MLflow takes 250 characters, older servers fewer; the UI shows about 40
 
 VIEW = "racing"
 """Name of the view of the runs table that the UI opens with."""
@@ -60,6 +67,40 @@ def in_order(metrics: Mapping[str, float | None]) -> list[tuple[str, float | Non
     return sorted(metrics.items(), key=lambda item: rank.get(item[0], len(rank)))
 
 
+def track_labels(names: Sequence[str]) -> list[str]:
+    """Return a label for each track that MLflow takes as part of a metric's name; no two are the same.
+
+    Letters, digits, `_`, `-` and `.` stay as they are, anything else becomes `_`. Labels differ by more than upper
+    and lower case, since some databases hold such names for the same one.
+    """
+    plain = [re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:_LONGEST_LABEL] for name in names]
+    # A part of a path made of dots alone would lead elsewhere.
+    plain = [label if label.strip(".") else f"track_{label}" for label in plain]
+    given = {label.casefold() for label in plain}
+    labels: list[str] = []
+    used: set[str] = set()
+    for label in plain:
+        chosen, number = label, 1
+        while chosen.casefold() in used or (number > 1 and chosen.casefold() in given):
+            number += 1
+            chosen = f"{label}-{number}"
+        used.add(chosen.casefold())
+        labels.append(chosen)
+    return labels
+
+
+def track_metric(metric: str, label: str) -> str:
+    """Return the name of one of TRACK_METRICS for the track of this label."""
+    return f"{metric}/{label}"
+
+
+def joined(names: Sequence[str], between: str = "+") -> str:
+    """Return up to three names in one, or how many there are: `18 tracks`."""
+    text = between.join(names)
+    # A folder's name takes 255 characters, and a label has more than the tracks in it.
+    return text if len(names) == 1 or (len(names) <= 3 and len(text) <= 120) else f"{len(names)} tracks"
+
+
 def run_params(names: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, Scalar]:
     """Return the names of the chosen options (track, reward, ...) beside every value of the experiment."""
     return {**flatten(config), **names}
@@ -75,6 +116,9 @@ def run_tags(
     """
     choices = "\n".join(f"- {key}: `{value}`" for key, value in names.items())
     metrics = "\n".join(f"- `{key}`: {meaning}" for key, meaning in METRICS.items())
+    metrics += (
+        f"\n\nWith several tracks also {', '.join(TRACK_METRICS)} of each, as `{TRACK_METRICS[0]}/TRACK`."
+    )
     tags = {
         **names,
         "reward_sha256": reward_sha256,

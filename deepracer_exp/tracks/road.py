@@ -1,6 +1,7 @@
 """The road's area and the exact test whether a point lies on it."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +19,15 @@ MOST_OFF = 0.05
 
 
 class Bands(NamedTuple):
-    """The edges of a polygon by y band; edges of band k are rows `first[k]:first[k + 1]` of `edge`."""
+    """The edges of polygons side by side, sorted by y band.
 
-    low_y: float
-    band_m: float
-    bands: int
+    Band k of polygon w has the rows `first[b]:first[b + 1]` of `edge` with b = `at[w] + k`.
+    """
+
+    low_y: np.ndarray
+    band_m: np.ndarray
+    bands: np.ndarray
+    at: np.ndarray
     first: np.ndarray
     edge: np.ndarray
     """(entries, 4): lower y, upper y, x at the lower end, dx / dy."""
@@ -76,19 +81,45 @@ def build_bands(road: BaseGeometry) -> Bands:
         [low[:, 1], high[:, 1], low[:, 0], (high[:, 0] - low[:, 0]) / (high[:, 1] - low[:, 1])]
     )
     first = np.r_[0, np.cumsum(np.bincount(band, minlength=bands))]
-    return Bands(low_y, band_m, bands, first, np.ascontiguousarray(edges[index]))
+    return Bands(
+        low_y=np.array([low_y]),
+        band_m=np.array([band_m]),
+        bands=np.array([bands]),
+        at=np.array([0]),
+        first=first,
+        edge=np.ascontiguousarray(edges[index]),
+    )
+
+
+def join_bands(roads: Sequence[Bands]) -> Bands:
+    """Put polygons side by side, in their order."""
+    if len(roads) == 1:
+        return roads[0]
+    at, edge_at = (
+        np.cumsum([0, *(len(getattr(road, name)) for road in roads[:-1])]) for name in ("first", "edge")
+    )
+    joined = {name: np.concatenate([getattr(road, name) for road in roads]) for name in Bands._fields}
+    moved = {
+        "at": np.concatenate([road.at + by for road, by in zip(roads, at, strict=True)]),
+        "first": np.concatenate([road.first + by for road, by in zip(roads, edge_at, strict=True)]),
+    }
+    return Bands(**{**joined, **moved})
 
 
 @njit(cache=True, nogil=True)
-def on_road(b, points):  # type: ignore[no-untyped-def]
-    """Tell for points (m, 2) whether a ray to the right crosses an odd number of edges."""
+def on_road(b, which, points):  # type: ignore[no-untyped-def]
+    """Tell for points (m, 2) whether a ray to the right crosses an odd number of edges of their polygon.
+
+    `which` (n,) holds a polygon for each m / n points that follow one another.
+    """
     inside = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
+        road = which[i * len(which) // len(points)]
         px, py = points[i, 0], points[i, 1]
-        band = (py - b.low_y) / b.band_m
+        band = (py - b.low_y[road]) / b.band_m[road]
         # The top edge can round into the band above the last; nan falls through both comparisons.
-        if 0.0 <= band < b.bands + 1:
-            k = min(int(band), b.bands - 1)
+        if 0.0 <= band < b.bands[road] + 1:
+            k = b.at[road] + min(int(band), b.bands[road] - 1)
             odd = False
             for j in range(b.first[k], b.first[k + 1]):
                 if (

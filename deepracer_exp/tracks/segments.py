@@ -1,4 +1,4 @@
-"""Exact nearest-segment queries on a polyline at a cost that does not grow with its length.
+"""Exact nearest-segment queries on polylines at a cost that does not grow with their length or number.
 
 A uniform grid stores for each cell every segment that can be nearest to some point of the cell. Let c be
 the cell's centre and h its half diagonal: no point of the cell is farther than h from c, so the nearest
@@ -7,6 +7,7 @@ polyline. The stored set is therefore a superset of the answers, and testing it 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,29 +23,40 @@ SPLIT = 8
 
 
 class Segments(NamedTuple):
-    """A polyline of n segments with its grid (arrays that compiled code reads)."""
+    """Polylines side by side, each with its grid (arrays that compiled code reads).
+
+    Line w has `segments[w]` segments, rows `at[w]` to `at[w] + segments[w] - 1`, and one vertex more. What is said of
+    segments has an unused last row for each line, so that a row means the same everywhere.
+    """
 
     x: np.ndarray
-    """Vertices (n + 1,) in metres."""
+    """Vertices in metres."""
     y: np.ndarray
     length_m: np.ndarray
-    """Length of each segment (n,)."""
+    """Length of each segment."""
     start_m: np.ndarray
-    """Distance of each vertex from the first along the polyline (n + 1,)."""
+    """Distance of each vertex from its line's first along the line."""
     share: np.ndarray
-    """The same as a share of the whole, 0 to 1 (n + 1,)."""
+    """The same as a share of the whole line, 0 to 1."""
     heading_rad: np.ndarray
-    """Direction of each segment (n,)."""
+    """Direction of each segment."""
+    at: np.ndarray
+    segments: np.ndarray
+    total_m: np.ndarray
     bucket: np.ndarray
-    """Segment at the start of each of equal shares of the line, so that a look-up needs no search."""
-    low_x: float
-    low_y: float
-    cell_m: float
-    columns: int
-    rows: int
+    """Row of the segment at the start of each of equal shares of the line, so that a look-up needs no search."""
+    bucket_at: np.ndarray
+    buckets: np.ndarray
+    low_x: np.ndarray
+    low_y: np.ndarray
+    cell_m: np.ndarray
+    columns: np.ndarray
+    rows: np.ndarray
+    cell_at: np.ndarray
     first: np.ndarray
-    """Candidates of cell k are `member[first[k]:first[k + 1]]`, ascending."""
+    """Candidates of cell k of line w are `member[first[c]:first[c + 1]]` with c = `cell_at[w] + k`, ascending."""
     member: np.ndarray
+    """Rows of segments."""
 
 
 def build_segments(vertices: np.ndarray) -> Segments:
@@ -73,10 +85,49 @@ def build_segments(vertices: np.ndarray) -> Segments:
     whole = (np.array([0, len(every)]), every, 1, SPLIT * max(columns, rows))
     coarse = _candidates(x, y, low_x, low_y, cell_m * SPLIT, columns_c, rows_c, *whole)
     first, member = _candidates(x, y, low_x, low_y, cell_m, columns, rows, *coarse, columns_c, SPLIT)
+    beyond = [0.0]
     return Segments(
-        *(x, y, length_m, start_m, share, np.arctan2(dy, dx), bucket),
-        *(low_x, low_y, cell_m, columns, rows, first, member),
+        x=x,
+        y=y,
+        length_m=np.r_[length_m, beyond],
+        start_m=start_m,
+        share=share,
+        heading_rad=np.r_[np.arctan2(dy, dx), beyond],
+        at=np.array([0]),
+        segments=np.array([len(length_m)]),
+        total_m=start_m[-1:],
+        bucket=bucket,
+        bucket_at=np.array([0]),
+        buckets=np.array([len(bucket)]),
+        low_x=np.array([low_x]),
+        low_y=np.array([low_y]),
+        cell_m=np.array([cell_m]),
+        columns=np.array([columns]),
+        rows=np.array([rows]),
+        cell_at=np.array([0]),
+        first=first,
+        member=member,
     )
+
+
+def join_segments(lines: Sequence[Segments]) -> Segments:
+    """Put polylines side by side, in their order."""
+    if len(lines) == 1:
+        return lines[0]
+    at, bucket_at, cell_at, member_at = (
+        np.cumsum([0, *(len(getattr(line, name)) for line in lines[:-1])])
+        for name in ("x", "bucket", "first", "member")
+    )
+    joined = {name: np.concatenate([getattr(line, name) for line in lines]) for name in Segments._fields}
+    moved = {
+        "at": np.concatenate([line.at + by for line, by in zip(lines, at, strict=True)]),
+        "bucket": np.concatenate([line.bucket + by for line, by in zip(lines, at, strict=True)]),
+        "bucket_at": np.concatenate([line.bucket_at + by for line, by in zip(lines, bucket_at, strict=True)]),
+        "cell_at": np.concatenate([line.cell_at + by for line, by in zip(lines, cell_at, strict=True)]),
+        "first": np.concatenate([line.first + by for line, by in zip(lines, member_at, strict=True)]),
+        "member": np.concatenate([line.member + np.int32(by) for line, by in zip(lines, at, strict=True)]),
+    }
+    return Segments(**{**joined, **moved})
 
 
 @njit(cache=True, nogil=True)
@@ -128,20 +179,20 @@ def _candidates(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def nearest_segment(s, px, py):  # type: ignore[no-untyped-def]
-    """Return index of the segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
-    column = (px - s.low_x) / s.cell_m
-    row = (py - s.low_y) / s.cell_m
-    best, found, fraction = np.inf, 0, np.nan
-    if 0.0 <= column < s.columns and 0.0 <= row < s.rows:
-        cell = int(row) * s.columns + int(column)
+def nearest_segment(s, line, px, py):  # type: ignore[no-untyped-def]
+    """Return row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
+    column = (px - s.low_x[line]) / s.cell_m[line]
+    row = (py - s.low_y[line]) / s.cell_m[line]
+    best, found, fraction = np.inf, s.at[line], np.nan
+    if 0.0 <= column < s.columns[line] and 0.0 <= row < s.rows[line]:
+        cell = s.cell_at[line] + int(row) * s.columns[line] + int(column)
         for k in range(s.first[cell], s.first[cell + 1]):
             index = s.member[k]
             d, f = squared_distance(s.x, s.y, index, px, py)
             if d < best:
                 best, found, fraction = d, index, f
     else:
-        for index in range(len(s.length_m)):
+        for index in range(s.at[line], s.at[line] + s.segments[line]):
             d, f = squared_distance(s.x, s.y, index, px, py)
             if d < best:
                 best, found, fraction = d, index, f
@@ -150,7 +201,7 @@ def nearest_segment(s, px, py):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def along(s, index, fraction):  # type: ignore[no-untyped-def]
-    """Return the point at `fraction` of segment `index`."""
+    """Return the point at `fraction` of the segment in row `index`."""
     if fraction >= 1.0:
         return s.x[index + 1], s.y[index + 1]
     x, y = s.x[index], s.y[index]

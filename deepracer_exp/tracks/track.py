@@ -1,62 +1,27 @@
 """The course a car drives on: centre line, borders, and where a point lies between them."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.config.track import FloorConfig, TrackConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.routes import checked_rows, read_knots, read_route
 
-from .road import Bands, build_bands, on_road, road_area
-from .segments import Segments, along, build_segments, nearest_segment
+from .road import Bands, build_bands, road_area
+from .segments import Segments, build_segments
 from .spline import rows_from_knots
+from .tracks import Borders, Pose, Projection, Tracks
 
 PLAIN_FLOOR = FloorConfig(friction=1.0, road_color="#3d4148", ground_color="#54795a", line_color="#f2f2ee")
 """The floor of a course whose file says nothing about it."""
-
-
-class Projection(NamedTuple):
-    """Points projected on the centre line; every array has one entry a point."""
-
-    ndist: np.ndarray
-    """Share of the course from waypoint 0 to the projection, 0 to 1."""
-    distance_m: np.ndarray
-    """The same in metres."""
-    offset_m: np.ndarray
-    """Distance from the centre line, positive on the left of the driving direction."""
-    previous: np.ndarray
-    """Index of the waypoint behind (int64)."""
-    next: np.ndarray
-    """Index of the waypoint ahead (int64)."""
-    center: np.ndarray
-    """The projected points (n, 2)."""
-    heading_rad: np.ndarray
-    """Direction of the centre line's segment there."""
-
-
-class Borders(NamedTuple):
-    """What the borders say about points."""
-
-    track_width_m: np.ndarray
-    is_left: np.ndarray
-    """Whether the point is left of the centre, in the service's sense (bool)."""
-
-
-class Pose(NamedTuple):
-    """Places on the course to start from."""
-
-    x: np.ndarray
-    y: np.ndarray
-    yaw_rad: np.ndarray
+_FIRST = np.zeros(1, np.intp)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -167,13 +132,17 @@ class Track:
         return cls.from_route(rows, name, title=title, reversed=reversed, floor=floor)
 
     @classmethod
-    def from_config(cls, config: TrackConfig) -> "Track":
+    def from_config(cls, config: TrackConfig, reversed: bool | None = None) -> "Track":
         """Build the course an experiment names; `config.file` takes the place of its knots.
+
+        Args:
+            config: What is driven on.
+            reversed: Drive against the order of the rows; None: as `config.direction` says of the first episode.
 
         Raises:
             BadInput: The file or the knots make no course; the message names the file or the track.
         """
-        backwards = config.direction == "reversed"
+        backwards = config.direction == "reversed" if reversed is None else reversed
         if config.file is not None:
             with _blaming("track.file"):
                 return _from_file(Path(config.file), backwards, config.floor)
@@ -188,6 +157,10 @@ class Track:
                 floor=config.floor,
             )
 
+    @cached_property
+    def _alone(self) -> "Tracks":
+        return Tracks([self])
+
     def project(self, points: np.ndarray) -> Projection:
         """Project points (n, 2) on the centre line.
 
@@ -195,7 +168,7 @@ class Track:
         `bisect_right` of it in the waypoints' own positions, wrapping at the ends as the service does
         (next = 0 after the last waypoint).
         """
-        return Projection(*_project(self._center_line, _points(points)))
+        return self._alone.project(points, _FIRST)
 
     def border_distances(self, points: np.ndarray, center: np.ndarray) -> Borders:
         """Return the road's width at projected points and the side the points are on.
@@ -205,27 +178,22 @@ class Track:
             center: Their projections (n, 2), from `project`. The nearest point of each border is the one
                 nearest to the projection, not to the point itself.
         """
-        points, center = _points(points), _points(center)
-        return Borders(*_borders(self._inner_line, self._outer_line, points, center, self.is_clockwise))
+        return self._alone.border_distances(points, center, _FIRST)
 
     def on_road(self, points: np.ndarray) -> np.ndarray:
         """Tell for points (m, 2) whether they are inside the road (bool)."""
-        return on_road(self._bands, _points(points))
+        return self._alone.on_road(points, _FIRST)
 
     def points_at(self, ndist: np.ndarray) -> np.ndarray:
         """Return the centre-line points (..., 2) at normalised distances of any shape.
 
         Distances wrap on a closed course and stop at the ends of an open one.
         """
-        ndist = np.asarray(ndist, np.float64)
-        x, y, _ = _at(self._center_line, self.closed, ndist.ravel())
-        return np.stack([x, y], axis=-1).reshape(*ndist.shape, 2)
+        return self._alone.points_at(ndist, _FIRST)
 
     def start_pose(self, ndist: np.ndarray) -> Pose:
         """Return poses on the centre line that look at the next waypoint; arrays shaped as `ndist`."""
-        ndist = np.asarray(ndist, np.float64)
-        pose = _at(self._center_line, self.closed, ndist.ravel())
-        return Pose(*(part.reshape(ndist.shape) for part in pose))
+        return self._alone.start_pose(ndist, _FIRST)
 
 
 def _from_file(path: Path, backwards: bool, floor: FloorConfig) -> Track:
@@ -254,13 +222,6 @@ def _blaming(what: object) -> Iterator[None]:
         raise BadInput(f"{what}: {error}") from None
 
 
-def _points(points: np.ndarray) -> np.ndarray:
-    points = np.ascontiguousarray(points, np.float64)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"points have shape {points.shape}, not (n, 2)")
-    return points
-
-
 def _frozen(array: np.ndarray) -> np.ndarray:
     array = np.array(array, order="C")
     array.flags.writeable = False
@@ -269,70 +230,3 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 def _is_counter_clockwise(ring: np.ndarray) -> bool:
     return bool(shapely.is_ccw(shapely.LinearRing(ring)))
-
-
-@njit(cache=True, nogil=True)
-def _project(s, points):  # type: ignore[no-untyped-def]
-    count = len(points)
-    ndist, distance_m, offset_m = np.empty(count), np.empty(count), np.empty(count)
-    previous, following = np.empty(count, np.int64), np.empty(count, np.int64)
-    center, heading_rad = np.empty((count, 2)), np.empty(count)
-    vertices = len(s.share)
-    for i in range(count):
-        px, py = points[i, 0], points[i, 1]
-        index, fraction = nearest_segment(s, px, py)
-        x, y = along(s, index, fraction)
-        center[i, 0], center[i, 1] = x, y
-        distance_m[i] = s.start_m[index] + fraction * s.length_m[index]
-        ndist[i] = distance_m[i] / s.start_m[-1]
-        heading_rad[i] = s.heading_rad[index]
-        off_m = math.sqrt((px - x) ** 2 + (py - y) ** 2)
-        dx, dy = s.x[index + 1] - s.x[index], s.y[index + 1] - s.y[index]
-        offset_m[i] = off_m if dx * (py - s.y[index]) - dy * (px - s.x[index]) >= 0.0 else -off_m
-        # bisect_right from close by: rounding or a projection on a vertex moves it by one at most.
-        ahead = index
-        while ahead < vertices and s.share[ahead] <= ndist[i]:
-            ahead += 1
-        while ahead > 0 and s.share[ahead - 1] > ndist[i]:
-            ahead -= 1
-        previous[i] = ahead - 1 if ahead > 0 else vertices - 1
-        following[i] = ahead if ahead < vertices else 0
-    return ndist, distance_m, offset_m, previous, following, center, heading_rad
-
-
-@njit(cache=True, nogil=True)
-def _borders(inner, outer, points, center, is_clockwise):  # type: ignore[no-untyped-def]
-    count = len(points)
-    width_m, is_left = np.empty(count), np.empty(count, np.bool_)
-    for i in range(count):
-        index, fraction = nearest_segment(inner, center[i, 0], center[i, 1])
-        inner_x, inner_y = along(inner, index, fraction)
-        index, fraction = nearest_segment(outer, center[i, 0], center[i, 1])
-        outer_x, outer_y = along(outer, index, fraction)
-        px, py = points[i, 0], points[i, 1]
-        width_m[i] = math.sqrt((inner_x - outer_x) ** 2 + (inner_y - outer_y) ** 2)
-        to_inner = math.sqrt((px - inner_x) ** 2 + (py - inner_y) ** 2)
-        to_outer = math.sqrt((px - outer_x) ** 2 + (py - outer_y) ** 2)
-        is_left[i] = (to_inner < to_outer) != is_clockwise
-    return width_m, is_left
-
-
-@njit(cache=True, nogil=True)
-def _at(s, closed, ndist):  # type: ignore[no-untyped-def]
-    count = len(ndist)
-    x, y, heading_rad = np.empty(count), np.empty(count), np.empty(count)
-    last = len(s.length_m) - 1
-    for i in range(count):
-        share = ndist[i] - math.floor(ndist[i]) if closed else min(max(ndist[i], 0.0), 1.0)
-        if math.isfinite(share):
-            index = s.bucket[min(int(share * len(s.bucket)), len(s.bucket) - 1)]
-            while index < last and s.share[index + 1] <= share:
-                index += 1
-            while index > 0 and s.share[index] > share:
-                index -= 1
-            fraction = (share * s.start_m[-1] - s.start_m[index]) / s.length_m[index]
-            x[i], y[i] = along(s, index, fraction)
-            heading_rad[i] = s.heading_rad[index]
-        else:
-            x[i], y[i], heading_rad[i] = np.nan, np.nan, np.nan
-    return x, y, heading_rad

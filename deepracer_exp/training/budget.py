@@ -1,26 +1,193 @@
-"""How much of its budget a run has used."""
+"""How much of its budget a run has used, and all runs of its experiment together."""
 
-from deepracer_exp.config.running import BudgetConfig
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from deepracer_exp.config.budget import BudgetConfig
+from deepracer_exp.errors import BadInput
+
+_REFRESH_S = 10.0  # between two looks at what other runs have used
+_TAIL_BYTES = 16_384  # more than any line of metrics.jsonl
+_UNITS = {
+    "env_steps": "{:,.0f} steps",
+    "iterations": "{:,.0f} iterations",
+    "minutes": "{:,.4g} min",
+    "max_cost": "{:,.2f} in cost",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alert:
+    """A share of a limit that was passed."""
+
+    limit: str
+    """Key of the limit."""
+    percent: int
+    message: str
 
 
 class Budget:
-    """The limits of a run; the first one reached ends it."""
+    """The limits of a run and of its experiment; the first one reached ends the run."""
 
-    def __init__(self, config: BudgetConfig):
-        self._limits = (
-            ("env_steps", config.env_steps),
-            ("iterations", config.iterations),
-            ("wall_clock_s", config.wall_clock_s),
-        )
+    def __init__(self, config: BudgetConfig, folder: Path | None = None):
+        """Set the limits.
+
+        Args:
+            config: the budget group.
+            folder: the run's own; the folders beside it are the other runs of the experiment. None: there are none.
+        """
+        self._config = config
+        self._folder = folder
+        self._others = _OtherRuns(config.price_per_hour or 0.0)
+        self._told: dict[str, int] = {}
 
     def used(self, env_steps: int, iterations: int, wall_clock_s: float) -> tuple[str, float]:
-        """Return the limit that is nearest and the share of it that is used, 1 or more once it is reached."""
-        spent = {"env_steps": env_steps, "iterations": iterations, "wall_clock_s": wall_clock_s}
-        shares = [(name, spent[name] / limit) for name, limit in self._limits if limit is not None]
+        """Return the limit that is nearest and the share of it that is used, 1 or more once it is reached.
+
+        Of a limit of the experiment, the share is that of what the other runs have left: 0 at this run's start.
+        """
+        shares = []
+        for limit, own, others, most in self._spent(env_steps, iterations, wall_clock_s):
+            shares.append((limit, own / (most - others) if most > others else 1.0))
         return max(shares, key=lambda share: share[1])
+
+    def alerts(self, env_steps: int, iterations: int, wall_clock_s: float) -> list[Alert]:
+        """Return what was passed since the last call, at most one alert a limit; the first call sets the start."""
+        first, passed = not self._told, []
+        for limit, own, others, most in self._spent(env_steps, iterations, wall_clock_s):
+            spent = own + others
+            percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
+            if not first and percent > self._told[limit]:
+                number = _UNITS[limit.removeprefix("experiment_")]
+                message = (
+                    f"{percent} % of budget.{limit} used: {number.format(spent)} of {number.format(most)}"
+                )
+                passed.append(Alert(limit=limit, percent=percent, message=message))
+            self._told[limit] = max(percent, self._told.get(limit, 0))
+        return passed
+
+    def cost(self, wall_clock_s: float) -> float | None:
+        """Return what the run has cost, None where no price is given."""
+        price = self._config.price_per_hour
+        return None if price is None else round(price * wall_clock_s / 3600, 6)
 
     def __str__(self) -> str:
         """Return the limits in words, e.g. ``3,000,000 steps``."""
-        units = {"env_steps": "steps", "iterations": "iterations", "wall_clock_s": "s"}
-        words = [f"{limit:,.0f} {units[name]}" for name, limit in self._limits if limit is not None]
+        words = [_UNITS[limit].format(most) for limit, most in _limits(self._config).items()]
+        words += [
+            f"{_UNITS[limit.removeprefix('experiment_')].format(most)} of all runs"
+            for limit, most in _limits(self._config, "experiment_").items()
+        ]
         return " or ".join(words)
+
+    def _spent(
+        self, env_steps: int, iterations: int, wall_clock_s: float
+    ) -> list[tuple[str, float, float, float]]:
+        """Return of each limit its key, what this run has used of it, what the others have, and the limit."""
+        own = {
+            **_by_name(_Spent(env_steps, wall_clock_s, self.cost(wall_clock_s) or 0.0)),
+            "iterations": iterations,
+        }
+        found = [(limit, own[limit], 0.0, most) for limit, most in _limits(self._config).items()]
+        shared = _limits(self._config, "experiment_")
+        if shared and self._folder is not None:
+            others = _by_name(self._others.spent(self._folder.parent, self._folder.name))
+            for limit, most in shared.items():
+                name = limit.removeprefix("experiment_")
+                found.append((limit, own[name], others[name], most))
+        return found
+
+
+def refuse_spent(config: BudgetConfig, experiment_dir: Path) -> None:
+    """Refuse to start a run of an experiment that has nothing left.
+
+    Args:
+        config: the budget group.
+        experiment_dir: the folder of the experiment's runs; it need not exist.
+
+    Raises:
+        BadInput: a limit is reached; it is named with what was used.
+    """
+    limits = _limits(config, "experiment_")
+    if not limits:
+        return
+    spent = _by_name(_OtherRuns(config.price_per_hour or 0.0).spent(experiment_dir, None))
+    for limit, most in limits.items():
+        used = spent[limit.removeprefix("experiment_")]
+        if used >= most:
+            raise BadInput(
+                f"budget.{limit}={most:g}: the runs in {experiment_dir} have used {used:,.6g} already; accepted: "
+                "more than that, or another name="
+            )
+
+
+@dataclass(frozen=True)
+class _Spent:
+    env_steps: int = 0
+    wall_clock_s: float = 0.0
+    cost: float = 0.0
+
+    def __add__(self, other: "_Spent") -> "_Spent":
+        return _Spent(
+            self.env_steps + other.env_steps,
+            self.wall_clock_s + other.wall_clock_s,
+            self.cost + other.cost,
+        )
+
+
+class _OtherRuns:
+    """What the other runs in a folder have used, looked up every few seconds: they may run at the same time."""
+
+    def __init__(self, price_per_hour: float):
+        self._price = price_per_hour
+        self._ended: dict[str, _Spent] = {}
+        self._sum = _Spent()
+        self._look_again_at = 0.0
+
+    def spent(self, folder: Path, besides: str | None) -> _Spent:
+        """Return the sum over all run folders in `folder` but the one called `besides`."""
+        if time.monotonic() >= self._look_again_at:
+            runs = folder.iterdir() if folder.is_dir() else ()
+            self._sum = sum((self._of(path) for path in runs if path.name != besides), _Spent())
+            self._look_again_at = time.monotonic() + _REFRESH_S
+        return self._sum
+
+    def _of(self, run: Path) -> _Spent:
+        if run.name in self._ended:
+            return self._ended[run.name]
+        try:
+            spent = self._from(json.loads((run / "summary.json").read_text(encoding="utf-8")))
+            self._ended[run.name] = spent
+        except (OSError, ValueError, KeyError, TypeError):
+            # It goes on, was killed, or is no run at all: a sum of what is known must not end a training.
+            return self._so_far(run)
+        return spent
+
+    def _so_far(self, run: Path) -> _Spent:
+        try:
+            with (run / "metrics.jsonl").open("rb") as file:
+                file.seek(max(0, file.seek(0, 2) - _TAIL_BYTES))
+                lines = file.read().split(b"\n")
+            return self._from(json.loads(lines[-2]))
+        except (OSError, ValueError, KeyError, TypeError, IndexError):
+            return _Spent()
+
+    def _from(self, row: Mapping[str, float]) -> _Spent:
+        seconds = float(row["wall_clock_s"])
+        cost = row.get("cost")
+        return _Spent(
+            int(row["env_steps"]), seconds, self._price * seconds / 3600 if cost is None else float(cost)
+        )
+
+
+def _limits(config: BudgetConfig, prefix: str = "") -> dict[str, float]:
+    """Return the limits that are set, by their keys."""
+    keys = [f"{prefix}{name}" for name in _UNITS]
+    return {key: limit for key in keys if (limit := getattr(config, key, None)) is not None}
+
+
+def _by_name(spent: _Spent) -> dict[str, float]:
+    return {"env_steps": spent.env_steps, "minutes": spent.wall_clock_s / 60, "max_cost": spent.cost}

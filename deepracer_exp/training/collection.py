@@ -144,6 +144,20 @@ class Collection:
             self._watchdog.close()
         if not self._collector.closed:
             self._collector.shutdown()
+        if self._workers:
+            self._close_weight_queues()
+
+    def _close_weight_queues(self) -> None:
+        """Close what weights travelled through.
+
+        TorchRL does so when its collector is garbage: after a failure that is never, and the interpreter's end would
+        wait without end for a queue that nobody empties.
+        """
+        for scheme in (self._collector._weight_sync_schemes or {}).values():
+            for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
+                for queue in (getattr(scheme, name, None) or {}).values():
+                    queue.cancel_join_thread()
+            scheme.shutdown()
 
     def _start(self, envs: list[EnvFactory], policy: torch.nn.Module, options: dict[str, Any]) -> Any:
         if self._mode == "sync":

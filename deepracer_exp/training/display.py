@@ -15,10 +15,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from .track_table import NOTHING, TrackTable
+
 Row = Mapping[str, float | int | None]
 """One line of metrics.jsonl."""
 
-NOTHING = "\N{EN DASH}"
 SPARKS = "▁▂▃▄▅▆▇█"
 REFRESH_S = 0.2
 """Shortest time between two drawings: more often only costs the training time."""
@@ -28,6 +29,7 @@ WIDE = 76
 """Columns from which the figures stand in two halves side by side."""
 LABEL, VALUE, GAP, RIGHT = 12, 10, 3, 24
 """Columns of a figure's name, of its value, between the halves, and of the right half."""
+_FRAME_LINES = 10  # of the panel beside figures and table, and the terminal's last
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +38,8 @@ class RunHeader:
 
     name: str
     track: str
+    track_labels: tuple[str, ...]
+    """What each of several tracks is called in the rows; empty with one track."""
     reward: str
     network: str
     actions: str
@@ -124,6 +128,7 @@ class _View:
         self._eta_s: float | None = None
         self._elapsed_s = 0.0
         self._history: dict[str, list[float]] = {"completion": [], "mean_return": [], "entropy": []}
+        self._tracks = TrackTable(header.track_labels)
 
     def add(self, row: Row, fraction: float, eta_s: float | None, elapsed_s: float) -> None:
         self._row, self._eta_s, self._elapsed_s = row, eta_s, elapsed_s
@@ -132,6 +137,7 @@ class _View:
             value = _value(row, key)
             if value is not None:
                 values.append(value)
+        self._tracks.add(row)
 
     def line(self) -> str:
         row = self._row
@@ -143,7 +149,9 @@ class _View:
             f"return {_format(row, 'mean_return', ',.2f')}",
             f"completion {_format(row, 'completion', '.1f', ' %')}",
             f"laps {_format(row, 'laps', ',.0f')} ({_share(row)} of last 50)",
-            f"best lap {_format(row, 'best_lap_time_s', '.2f', ' s')}",
+            self._tracks.least()
+            if self._tracks
+            else f"best lap {_format(row, 'best_lap_time_s', '.2f', ' s')}",
             f"entropy {_format(row, 'entropy', '.3f')}",
             f"lr {_format(row, 'lr', '.2g')}",
             _left(self._eta_s),
@@ -155,13 +163,17 @@ class _View:
         width = min(options.max_width, 100)
         # Less the border and two columns of padding on each side.
         inner = width - 6
+        figures = self._figures(inner, width >= WIDE)
+        if self._tracks:
+            room = console.height - len(figures) - _FRAME_LINES
+            figures += [Text(""), *self._tracks.lines(inner, room)]
         yield Panel(
             Group(
                 Text(_join(self.header), style="dim", overflow="ellipsis", no_wrap=True),
                 Text(""),
                 self._bar(inner, width >= WIDE),
                 Text(""),
-                *self._figures(inner, width >= WIDE),
+                *figures,
             ),
             title=Text(self.header.name, style="bold"),
             title_align="left",
@@ -213,14 +225,20 @@ class _View:
             ),
             cell("return", _format(row, "mean_return", ",.2f"), curve("mean_return", "cyan")),
             cell("entropy", _format(row, "entropy", ".3f"), curve("entropy", "magenta")),
-            cell("learn rate", _format(row, "lr", ".2g")),
         ]
         laps = [
             cell("laps", _format(row, "laps", ",.0f"), room=right),
             cell("of last 50", _share(row), room=right),
-            cell("best lap", _format(row, "best_lap_time_s", ".2f", " s"), room=right),
-            cell("mean lap", _format(row, "mean_lap_time_s", ".2f", " s"), room=right),
         ]
+        rate = _format(row, "lr", ".2g")
+        if self._tracks:  # lap times stand at each track
+            laps.append(cell("learn rate", rate, room=right))
+        else:
+            learning.append(cell("learn rate", rate))
+            laps += [
+                cell("best lap", _format(row, "best_lap_time_s", ".2f", " s"), room=right),
+                cell("mean lap", _format(row, "mean_lap_time_s", ".2f", " s"), room=right),
+            ]
         work = [
             cell("env steps", _format(row, "env_steps", ",.0f")),
             cell("speed", _format(row, "env_steps_per_s", ",.0f", " steps/s")),
@@ -276,7 +294,9 @@ def _clock(seconds: float) -> str:
 
 
 def _left(eta_s: float | None) -> str:
-    return f"{NOTHING} left" if eta_s is None or not math.isfinite(eta_s) else f"at most {_clock(eta_s)} left"
+    if eta_s is None or not math.isfinite(eta_s):
+        return f"{NOTHING} left"
+    return f"at most {_clock(max(eta_s, 0.0))} left"  # the last iteration may end past the budget
 
 
 def _join(header: RunHeader) -> str:

@@ -12,6 +12,8 @@ from deepracer_exp.formats.trace import PACKED, STATUS_CODE
 class Finished:
     """Episodes that ended, in the order of their ends; arrays of one length."""
 
+    track: np.ndarray
+    """Number of the track, int64."""
     returns: np.ndarray
     """Sum of rewards."""
     progress: np.ndarray
@@ -21,21 +23,21 @@ class Finished:
     time_s: np.ndarray
     """Seconds of driving, the prepare step not counted: the lap time where the lap was completed."""
 
+    def on(self, track: int) -> "Finished":
+        """Return the episodes of one track."""
+        here = self.track == track
+        return Finished(*(values[here] for values in vars(self).values()))
 
-class EpisodeBook:
-    """Numbers the episodes of a run and remembers how the last ones ended."""
 
-    def __init__(self, n_cars: int, remembered: int, step_s: float):
-        """Open the book.
+class Record:
+    """How episodes ended: how many, how many laps, the fastest, and the last ones."""
+
+    def __init__(self, remembered: int):
+        """Begin with nothing.
 
         Args:
-            n_cars: cars over all processes.
-            step_s: simulated seconds of a control step.
             remembered: how many of the last finished episodes `lap_share` looks at.
         """
-        self._number = np.full(n_cars, -1)
-        self._next_number = 0
-        self._step_s = step_s
         self._laps_of_last: deque[bool] = deque(maxlen=remembered)
         self.finished = 0
         self.laps = 0
@@ -46,6 +48,39 @@ class EpisodeBook:
         """Share of complete laps among the last episodes, None before as many as are remembered have ended."""
         last = self._laps_of_last
         return sum(last) / len(last) if len(last) == last.maxlen else None
+
+    def add(self, finished: Finished) -> None:
+        """Note episodes."""
+        self.finished += len(finished.lap)
+        self.laps += int(finished.lap.sum())
+        self._laps_of_last.extend(finished.lap.tolist())
+        if finished.lap.any():
+            fastest = float(finished.time_s[finished.lap].min())
+            self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
+
+
+class EpisodeBook:
+    """Numbers the episodes of a run and remembers how they ended.
+
+    Attributes:
+        all: the episodes of all tracks.
+        tracks: those of each track.
+    """
+
+    def __init__(self, n_cars: int, n_tracks: int, remembered: int, step_s: float):
+        """Open the book.
+
+        Args:
+            n_cars: cars over all processes.
+            n_tracks: tracks the cars drive on.
+            remembered: how many of the last finished episodes `Record.lap_share` looks at.
+            step_s: simulated seconds of a control step.
+        """
+        self._number = np.full(n_cars, -1)
+        self._next_number = 0
+        self._step_s = step_s
+        self.all = Record(remembered)
+        self.tracks = tuple(Record(remembered) for _ in range(n_tracks))
 
     def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
         """Note a batch of driving.
@@ -84,17 +119,15 @@ class EpisodeBook:
         in_time = trace.transpose(1, 0, 2)
         ends = in_time[in_time[:, :, PACKED["done"]] == 1]
         finished = Finished(
+            track=ends[:, PACKED["track"]].astype(np.int64),
             returns=ends[:, PACKED["episode_return"]],
             progress=ends[:, PACKED["progress"]],
             lap=ends[:, PACKED["episode_status"]] == STATUS_CODE["lap_complete"],
             time_s=(ends[:, PACKED["steps"]] - 1) * self._step_s,
         )
-        self.finished += len(ends)
-        self.laps += int(finished.lap.sum())
-        self._laps_of_last.extend(finished.lap.tolist())
-        if finished.lap.any():
-            fastest = float(finished.time_s[finished.lap].min())
-            self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
+        self.all.add(finished)
+        for number, record in enumerate(self.tracks):
+            record.add(finished.on(number))
         return finished
 
 

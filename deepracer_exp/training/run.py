@@ -1,6 +1,5 @@
 """One experiment, from its configuration to a folder of results."""
 
-import contextlib
 import json
 import logging
 import time
@@ -19,32 +18,35 @@ from deepracer_exp.agents.ppo import PPO, UpdateMetrics
 from deepracer_exp.agents.schedules import Schedule
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.running import ReliableStopping
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.formats.trace import TraceWriter, to_table
-from deepracer_exp.tracking.names import run_params, run_tags
+from deepracer_exp.tracking.names import joined, run_params, run_tags
 from deepracer_exp.tracking.recorder import open_tracker
 
-from .budget import Budget
+from .alerts import Alerts
+from .budget import Budget, refuse_spent
 from .checkpoints import CheckpointStore
 from .collection import Collection, worker_count
 from .display import ProgressDisplay, RunHeader
-from .episodes import EpisodeBook, Finished
+from .episodes import Finished
 from .faults import write_fault
 from .iterations import frames_per_batch, iterations
+from .log_file import log_to
+from .ranking import Ranking
 from .report import write_report
+from .results import Results
 from .run_folder import RunFolder
 from .signals import Interruption
+from .stopping import Decision, Stopping
 
 logger = logging.getLogger("deepracer_exp")
 
 TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 """Columns of metrics.jsonl that differ between two runs of the same seed."""
 _LAST_EVERY = 10  # iterations between two checkpoints `last`: one costs about 10 ms
-_FEWEST_EPISODES = 10  # below this the mean completion of an iteration says little about the policy
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Outcome:
     """How a run ended."""
 
     status: str
-    """`finished`, `interrupted` or `failed`."""
+    """`finished`, `hopeless` (ended by a stopping rule that expects nothing of it), `interrupted` or `failed`."""
     reason: str
     exit_code: int
     folder: Path
@@ -72,13 +74,20 @@ class Training:
         """
         self.experiment = experiment
         self.setup = read_files(experiment)
+        refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
+        self._alerts = Alerts(experiment.budget)
         self._tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
-        self.names = _names(composition, self.setup.track.name, self.setup.reward.name)
+        courses = self.setup.courses
+        # One track is called by its own name, which may stand in a file; several by their options.
+        self._tracks = [course.name for course in courses] if len(courses) > 1 else [self.setup.track.name]
+        self.names = _names(composition, joined(self._tracks), self.setup.reward.name)
         label = f"{self.names['track']}-{self.names['reward']}-seed{experiment.seed}"
         self.folder = RunFolder(experiment.runs_dir, experiment.name, label)
         try:
             commit = self.folder.describe(composition, self.setup.reward, experiment.seed)
-            self._log_file = _log_to(self.folder.path / "log.txt")
+            self._log_file = log_to(self.folder.path / "log.txt")
+            for note in composition.notes:
+                logger.info(note)
             self.checkpoints = CheckpointStore(self.folder.path)
         except OSError as error:
             self.folder.remove()
@@ -93,11 +102,12 @@ class Training:
             run_params(self.names, composition.mapping),
             run_tags(self.names, commit, self.setup.reward.sha256, self.folder.path.resolve()),
         )
-        self.budget = Budget(experiment.budget)
-        stopping = experiment.stopping
+        self.budget = Budget(experiment.budget, self.folder.path)
+        self._stopping = Stopping(experiment.stopping, self.setup.actions.n)
+        self._decision: Decision | None = None
         cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
-        remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else 50
-        self.book = EpisodeBook(cars, remembered, experiment.car.control_period_s)
+        self.results = Results(self._tracks, cars, experiment.car.control_period_s, experiment.stopping)
+        self.ranking = Ranking([course.tracks[0].length_m for course in courses])
         self.trace = TraceWriter(self.folder.path / "trace")
         self.display = ProgressDisplay(console, self._header())
         # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
@@ -123,10 +133,11 @@ class Training:
     def loop(self, collection: Collection, interruption: Interruption) -> str:
         """Collect, learn and record until there is a reason to stop; return it."""
         algorithm = self.experiment.algorithm
+        self.budget.alerts(*self._usage())  # what was used before this loop needs no alert
         for batch, collect_s in iterations(collection, algorithm, self.experiment.collector.mode == "async"):
-            rows, finished = self.book.enter(batch["next", "trace"].numpy())
+            rows, finished = self.results.book.enter(batch["next", "trace"].numpy())
             self.env_steps += batch.numel()
-            rank = self._rank(finished)
+            rank = self.ranking.rank(finished)
             if self.checkpoints.is_better(rank):  # these weights drove; the update makes others
                 self.checkpoints.save(self.agent, self._counters(), rank)
             began = time.monotonic()
@@ -141,6 +152,11 @@ class Training:
                 return reason
         raise RunFailed("the collector ended without a reason")
 
+    @property
+    def verdict(self) -> str:
+        """What a run is that was not interrupted: `finished`, or `hopeless` by its stopping rule."""
+        return "hopeless" if self._decision is not None and self._decision.hopeless else "finished"
+
     def close(self, status: str, reason: str, exit_code: int) -> Outcome:
         """Write what a run has at its end: checkpoint, pictures, summary.
 
@@ -149,7 +165,7 @@ class Training:
         """
         if self.iteration:
             self.checkpoints.save(self.agent, self._counters(), None)
-        write_report(self.folder.path, self.setup.track)
+        write_report(self.folder.path, self.setup.courses)
         return self._end(status, reason, exit_code)
 
     def fail(self, reason: str, error: BaseException) -> Outcome:
@@ -170,8 +186,9 @@ class Training:
             **self._counters(),
             "seed": self.experiment.seed,
             "wall_clock_s": round(time.monotonic() - self._began, 3),
-            "lap_share": self.book.lap_share,
-            "best_lap_time_s": self.book.best_lap_s,
+            "cost": self.budget.cost(time.monotonic() - self._began),
+            **self.results.summary(),
+            "stopping": self._decision and self._decision.as_dict(),
             "first_lap": self._first_lap,
             "reliable": self._reliable,
             "last": self._row,
@@ -190,8 +207,12 @@ class Training:
         for name in ("best", "last"):
             if (self.checkpoints.folder / name).exists():
                 self._tracker.log_artifact((self.checkpoints.folder / name).resolve(), f"checkpoints/{name}")
-        self._tracker.set_tag("end", f"{status}: {reason}")
-        self._tracker.finish({"finished": "FINISHED", "failed": "FAILED"}.get(status, "KILLED"))  # type: ignore[arg-type]
+        tags = self._decision.tags() if self._decision else {}
+        for tag, value in {**tags, "end": f"{status}: {reason}"}.items():
+            self._tracker.set_tag(tag, value)
+        ends = {"finished": "FINISHED", "hopeless": "FINISHED", "failed": "FAILED"}
+        self._tracker.finish(ends.get(status, "KILLED"))  # type: ignore[arg-type]
+        self._alerts.close()
         logger.removeHandler(self._log_file)
         self._log_file.close()
         return Outcome(status, reason, exit_code, path, summary, error)
@@ -217,29 +238,27 @@ class Training:
         collect_s: float,
         update_s: float,
     ) -> None:
-        book = self.book
-        if self._first_lap is None and book.laps:
+        if self._first_lap is None and self.results.book.all.laps:
             self._first_lap = self._moment()
-        if self._reliable is None and self._reliability() is not None:
-            self._reliable = self._moment()
         self._row = {
             **self._counters(),
-            "mean_return": _mean(finished.returns),
-            "completion": _mean(finished.progress),
-            "lap_share": book.lap_share,
-            "best_lap_time_s": book.best_lap_s,
-            "mean_lap_time_s": _mean(finished.time_s[finished.lap]),
+            **self.results.metrics(finished),
             **{name: float(value) for name, value in vars(update).items()},
             "wall_clock_s": round(time.monotonic() - self._began, 3),
             "collect_s": round(collect_s, 4),
             "update_s": round(update_s, 4),
             "env_steps_per_s": round(frames / (collect_s + update_s), 1),
+            **self.results.metrics_of_tracks(finished),
         }
+        self._decision = self._stopping.observe(self._row)
+        if self._decision is not None and self._decision.rule == "reliable":
+            self._reliable = self._moment()
         self.folder.append_metrics(self._row)
-        self.trace.write(self.iteration - 1, to_table(rows, iteration=self.iteration - 1))
+        self.trace.write(self.iteration - 1, to_table(rows, self.iteration - 1, self._tracks))
         self._tracker.log(
             {key: value for key, value in self._row.items() if key != "env_steps"}, step=self.env_steps
         )
+        self._send_alerts()
         _, fraction = self._spent()
         wall_clock_s = self._row["wall_clock_s"]
         self.display.update(
@@ -249,18 +268,10 @@ class Training:
     def _reason_to_stop(self, interruption: Interruption) -> str | None:
         if interruption.signum is not None:
             return "interrupted"
-        reliability = self._reliability()
-        if reliability is not None:
-            return f"reliable: {reliability}"
+        if self._decision is not None:
+            return str(self._decision)
         limit, fraction = self._spent()
         return f"budget reached: {limit}" if fraction >= 1 else None
-
-    def _reliability(self) -> str | None:
-        """Say what makes the car reliable by the stopping rule, None if it is not or there is no such rule."""
-        stopping, share = self.experiment.stopping, self.book.lap_share
-        if isinstance(stopping, ReliableStopping) and share is not None and share >= stopping.lap_share:
-            return f"{share:.0%} of the last {stopping.episodes} episodes completed the lap"
-        return None
 
     def _moment(self) -> dict[str, float]:
         return {
@@ -269,26 +280,30 @@ class Training:
         }
 
     def _spent(self) -> tuple[str, float]:
-        return self.budget.used(self.env_steps, self.iteration, time.monotonic() - self._began)
+        return self.budget.used(*self._usage())
 
-    def _rank(self, finished: Finished) -> tuple[float, float] | None:
-        if len(finished.progress) < _FEWEST_EPISODES:
-            return None
-        lap_times = finished.time_s[finished.lap]
-        return float(finished.progress.mean()), -float(lap_times.mean()) if len(lap_times) else -np.inf
+    def _usage(self) -> tuple[int, int, float]:
+        return self.env_steps, self.iteration, time.monotonic() - self._began
+
+    def _send_alerts(self) -> None:
+        for alert in self.budget.alerts(*self._usage()):
+            logger.info(alert.message)
+            self._tracker.set_tag(f"budget.{alert.limit}", f"{alert.percent} %")
+            self._alerts.send(alert.message, self.folder.path)
 
     def _counters(self) -> dict[str, int]:
         return {
             "iteration": self.iteration,
             "env_steps": self.env_steps,
-            "episodes": self.book.finished,
-            "laps": self.book.laps,
+            "episodes": self.results.book.all.finished,
+            "laps": self.results.book.all.laps,
         }
 
     def _header(self) -> RunHeader:
         return RunHeader(
             name=self.folder.name,
-            track=self.setup.track.title,
+            track=joined([course.tracks[0].title for course in self.setup.courses], " + "),
+            track_labels=tuple(self.results.labels),
             reward=self.names["reward"],
             network=self.names["network"],
             actions=self.names["action_space"],
@@ -317,7 +332,7 @@ def train(experiment: Experiment, composition: Composition, console: Console) ->
         try:
             reason = _drive_and_learn(training, interruption)
             code = interruption.exit_code
-            return training.close("finished" if code is None else "interrupted", reason, code or 0)
+            return training.close(training.verdict if code is None else "interrupted", reason, code or 0)
         except RunFailed as error:
             return training.fail(str(error), error)
         except OSError as error:
@@ -357,7 +372,7 @@ def _drive_and_learn(training: Training, interruption: Interruption) -> str:
 
 
 def _names(composition: Composition, track: str, reward: str) -> dict[str, str]:
-    """Return what a racer calls the run's choices: an option's name, or a file's stem."""
+    """Return what a racer calls the run's choices: an option's name, a file's stem, the folder of custom_files."""
     choices, mapping = composition.choices, composition.mapping
     actions_file = mapping["action_space"].get("file")
     return {
@@ -366,26 +381,4 @@ def _names(composition: Composition, track: str, reward: str) -> dict[str, str]:
         "action_space": Path(actions_file).stem if actions_file else choices["action_space"],
         "network": choices["network"],
         "lr_schedule": choices["lr_schedule"],
-    }
-
-
-def _mean(values: np.ndarray) -> float | None:
-    return float(values.mean()) if len(values) else None
-
-
-class _LogFile(logging.FileHandler):
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the base class's name
-        """Say nothing: the run's end tells of a full disk, in one line."""
-
-    def close(self) -> None:
-        """Close the file; what a full disk does not take is lost."""
-        with contextlib.suppress(OSError):
-            super().close()
-
-
-def _log_to(path: Path) -> logging.FileHandler:
-    handler = _LogFile(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    return handler
+    } | dict(composition.names)

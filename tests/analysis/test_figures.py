@@ -12,7 +12,13 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from deepracer_exp.analysis.figures import LINE_COLUMNS, driven_line, episodes, learning_curves
+from deepracer_exp.analysis.figures import (
+    LINE_COLUMNS,
+    driven_line,
+    driven_lines,
+    episodes,
+    learning_curves,
+)
 from deepracer_exp.tracks.track import Track
 
 CONSOLE = (
@@ -36,6 +42,8 @@ def drive(
     episode: int = 0,
     start_s: float = 0.0,
     first_step: int = 1,
+    top_mps: float = 2.0,
+    track: str = "circle",
 ) -> pd.DataFrame:
     """One episode on the circle, at constant speed from the prepare row on."""
     step = np.arange(first_step, steps + 1)
@@ -51,7 +59,8 @@ def drive(
             "episode_status": ["prepare" if n == 1 else "in_progress" for n in step[:-1]] + [status],
             "tstamp": start_s + (step - 1) / 15,
             "iteration": 5,
-            "speed_mps": np.linspace(0, 2, len(step)),
+            "speed_mps": np.linspace(0, top_mps, len(step)),
+            "track": track,
         }
     )
 
@@ -61,7 +70,12 @@ def caption(figure: Figure) -> str:
 
 
 def driven(figure: Figure) -> LineCollection:
-    return next(item for item in figure.axes[0].collections if isinstance(item, LineCollection))
+    return all_driven(figure)[0]
+
+
+def all_driven(figure: Figure) -> list[LineCollection]:
+    lines = [item for axes in figure.axes for item in axes.collections]
+    return [line for line in lines if isinstance(line, LineCollection) and line.get_array() is not None]
 
 
 def png(figure: Figure) -> bytes:
@@ -156,6 +170,39 @@ def test_even_the_shortest_episode_is_a_picture(steps: int) -> None:
     assert png(driven_line(trace, circle_track())).startswith(b"\x89PNG")
 
 
+def test_each_track_has_its_own_best_episode_and_one_scale_of_speed_holds_for_all() -> None:
+    trace = pd.concat(
+        [
+            drive(steps=200, status="lap_complete", episode=0, track="a"),
+            drive(steps=151, status="lap_complete", episode=1, track="a", top_mps=3.0),
+            drive(steps=60, status="off_track", episode=2, share=0.3, track="b", top_mps=1.0),
+            drive(steps=60, status="off_track", episode=3, share=0.2, track="b", top_mps=4.0),
+        ]
+    )
+    figure = driven_lines(trace, {"a": circle_track(), "b": circle_track(), "c": circle_track()})
+    words = [text.get_text() for text in figure.texts]
+    assert words == [
+        *("Circle", "lap in 10.00 s"),
+        *("Circle", "30.0 % of the lap, off track"),
+        *("Circle", "not driven"),
+    ]
+    lines = all_driven(figure)
+    assert [len(line.get_segments()) for line in lines] == [150, 59]
+    assert {line.get_clim() for line in lines} == {lines[0].get_clim()}
+    assert lines[0].get_clim()[1] == 3.0
+
+
+@pytest.mark.parametrize("count", [2, 7, 18])
+def test_any_number_of_tracks_is_a_picture_on_which_no_two_roads_meet(count: int) -> None:
+    figure = driven_lines(
+        drive(steps=3, status="off_track", track="0"), {str(k): circle_track() for k in range(count)}
+    )
+    roads = [axes.get_position() for axes in figure.axes[:count]]
+    assert all(0 <= box.x0 < box.x1 <= 1 and 0 <= box.y0 < box.y1 <= 1 for box in roads)
+    assert not any(one.overlaps(other) for k, one in enumerate(roads) for other in roads[:k])
+    assert png(figure).startswith(b"\x89PNG")
+
+
 def metrics(rows: int, laps: bool = True) -> pd.DataFrame:
     lap_s = np.linspace(14, 9, rows) if laps else np.full(rows, np.nan)
     return pd.DataFrame(
@@ -185,6 +232,21 @@ def test_a_run_of_any_length_is_a_picture_even_before_its_first_lap(rows: int) -
     figure = learning_curves(metrics(rows, laps=False))
     assert png(figure).startswith(b"\x89PNG")
     assert [text.get_text() for text in figure.axes[2].texts] == ["none yet"]
+
+
+def test_each_track_has_a_thin_line_without_the_iterations_that_tell_nothing_of_it() -> None:
+    frame = metrics(20).assign(best_lap_time_s=np.nan, mean_lap_time_s=np.nan)
+    for name, every in (("a", 1), ("b", 2)):
+        told = np.arange(20) % every == 0
+        frame[f"completion/{name}"] = np.where(told, 50.0, np.nan)
+        frame[f"mean_lap_time_s/{name}"] = np.where(told, 12.0, np.nan)
+    figure = learning_curves(frame)
+    driving, _, laps, _ = figure.axes
+    assert [len(line.get_xdata()) for line in driving.lines] == [20, 10, 20, 20]
+    assert driving.lines[0].get_linewidth() < driving.lines[2].get_linewidth()
+    assert [len(line.get_xdata()) for line in laps.lines] == [20, 10]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
+    assert png(figure).startswith(b"\x89PNG")
 
 
 def test_values_read_from_json_as_none_are_gaps() -> None:

@@ -6,7 +6,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.config.compose import compose_experiment, expand_grid, options_of, validate
+from deepracer_exp.config.compose import compose_experiment, expand_grid, validate
+from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.errors import BadInput
 
@@ -62,7 +63,7 @@ def test_an_option_may_be_named_as_its_file():
         [],
         ["experiment=fast_lap", "track=reinvent_wood"],
         ["track.file=/tmp/ein Weg, (schön) = gut/ü's.npy", "algorithm.lr=1e-5", "reward.constants.A=-3"],
-        ["budget.wall_clock_s=1e3", "runs_dir='2024'", "track.title='yes: no'"],
+        ["budget.minutes=1e3", "runs_dir='2024'", "track.title='yes: no'"],
     ],
 )
 def test_what_is_printed_can_be_read_back(overrides):
@@ -200,7 +201,7 @@ def test_an_unknown_key_is_looked_for_in_the_chosen_option():
         ("name=..", "letters, digits"),
         ("runs_dir=", "at least 1 character"),
         ("collector.processes=0", "greater than or equal to 1"),
-        ("track.direction=backwards", "'forward' or 'reversed'"),
+        ("track.direction=backwards", "'forward', 'reversed' or 'alternate'"),
         ("track.floor.road_color=red", "pattern"),
         ("car.solver=foo", "'newton' or 'cg'"),
         ("episode.start_offset=1", "less than 1"),
@@ -233,7 +234,7 @@ def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepte
         (["car.min_speed_mps=5"], ["5.0", "4.0"]),
         (["car.rear_axle_x_m=1"], ["1.0", "0.082311"]),
         (["reward.time_limit_s=30"], ["30", "20"]),
-        (["budget.env_steps=null"], ["env_steps", "iterations", "wall_clock_s"]),
+        (["budget.env_steps=null"], ["env_steps", "iterations", "minutes", "max_cost"]),
     ],
 )
 def test_values_that_contradict_each_other_are_both_named(overrides, both):

@@ -10,8 +10,9 @@ import yaml
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.schedules import Schedule
-from deepracer_exp.config.compose import Composition, compose_experiment, conf_dir, groups, options
+from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.training.budget import Budget
@@ -32,10 +33,9 @@ def test_the_groups_are_the_fields_of_an_experiment():
     assert fields - set(groups()) == {"name", "seed", "runs_dir", "debug"}
 
 
-def test_the_entry_point_names_an_option_of_every_group():
-    entry = yaml.safe_load((conf_dir() / "train.yaml").read_text())
-    named = {group for item in entry["defaults"] if isinstance(item, dict) for group in item}
-    assert named == set(groups())
+def test_every_folder_of_options_belongs_to_an_entry_point():
+    named = {group for entry in conf_dir().glob("*.yaml") for group in groups(entry.stem)}
+    assert named == {path.name for path in conf_dir().iterdir() if path.is_dir()}
 
 
 @pytest.mark.parametrize(("group", "name"), EVERY_OPTION)

@@ -20,7 +20,7 @@ def test_specs_and_rollouts_agree(setup_of, space):
 @pytest.mark.parametrize("space", SPACES)
 def test_the_short_step_gives_exactly_what_the_generic_one_gives(setup_of, space):
     """300 steps; episodes end by the limit and off the track, and some steps end none."""
-    setup = setup_of(space, "episode.max_steps=45", "randomization=action_noise")
+    setup = setup_of(space, "episode.max_steps=45", "randomization=aws")
     ours, generic = (RaceEnv(Race(setup, 5)) for _ in range(2))
     assert type(ours).step_and_maybe_reset is not EnvBase.step_and_maybe_reset
     root, generic_root = ours.reset(), generic.reset()
@@ -74,12 +74,12 @@ def test_a_partial_reset_starts_the_marked_cars_alone(setup_of):
     mark = torch.tensor([[False], [True], [False]])
     again = env.reset(root.clone().set("_reset", mark))
     np.testing.assert_array_equal((again["observation"] == root["observation"]).all(-1), [True, False, True])
-    np.testing.assert_array_equal(env.race._episode, [0, 1, 0])
+    np.testing.assert_array_equal(env.race.referee.episode, [0, 1, 0])
 
 
 @pytest.mark.parametrize("space", SPACES)
 def test_a_seed_gives_the_same_rollout_whatever_the_threads(setup_of, space):
-    setup = setup_of(space, "randomization=action_noise", "episode.max_steps=25")
+    setup = setup_of(space, "randomization=aws", "episode.max_steps=25")
     runs = []
     for threads in (1, 2):
         env = RaceEnv(Race(setup, 6, threads=threads))

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepracer_exp.env.params import COLUMNS, CONSTANTS, batch_params, rows, scalar_params, select
+from deepracer_exp.env.params import COLUMNS, Road, batch_params, rows, scalar_params, select
 from deepracer_exp.env.prints import RewardPrints
 from deepracer_exp.env.reward import RewardFailed, RewardFunction
 from deepracer_exp.env.reward_source import RewardSource
 from deepracer_exp.errors import BadInput, RunFailed
 
 WAYPOINTS = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 0.0)]
-ROAD = {"track_length": 3.4, "waypoints": WAYPOINTS, "is_reversed": False}
+ROAD = [Road(WAYPOINTS, 3.4, False)]
 KEYS = {
     **dict.fromkeys(("x", "y", "heading", "distance_from_center", "projection_distance", "progress"), float),
     **dict.fromkeys(("steps", "speed", "steering_angle", "track_width", "track_length", "sim_time"), float),
@@ -65,7 +65,7 @@ def test_the_params_are_the_27_keys_of_the_service_as_plain_python(dtype: type) 
     assert len(KEYS) == 27
     assert all(type(index) is int for index in params["closest_waypoints"])
     assert all(type(point) is tuple and type(point[0]) is float for point in params["waypoints"])
-    assert set(COLUMNS) | set(CONSTANTS) < set(KEYS)
+    assert set(COLUMNS) | set(Road._fields) < set(KEYS)
 
 
 def test_keys_about_other_objects_hold_the_defaults_of_an_empty_road() -> None:
@@ -81,7 +81,7 @@ def test_batch_params_hold_the_same_keys_and_values() -> None:
     batch = batch_params(selected, np.array(WAYPOINTS), 3.4, False)
     for car, row in enumerate(rows(selected)):
         for key, value in scalar_params(row, WAYPOINTS, 3.4, False).items():
-            shared = key in CONSTANTS or key.startswith("objects_")
+            shared = key in Road._fields or key.startswith("objects_")
             np.testing.assert_array_equal(batch[key] if shared else batch[key][car], value)
     assert set(batch) == set(KEYS)
 
@@ -204,11 +204,11 @@ def test_what_a_reward_does_to_its_params_reaches_neither_the_next_call_nor_the_
         "    params['closest_objects'][1] = 5; params['objects_speed'].append(1.0); params.clear()\n"
         "    return seen == (27, 4, 0, 1, 0, 0, 0)"
     )
-    given, road = columns(3), {**ROAD, "waypoints": list(WAYPOINTS)}
+    given, road = columns(3), [Road(list(WAYPOINTS), 3.4, False)]
     reward = function(body)
     for _ in range(2):
         np.testing.assert_array_equal(reward(given, road), np.ones(3))
-    assert road["waypoints"] == WAYPOINTS
+    assert road[0].waypoints == WAYPOINTS
     np.testing.assert_array_equal(given["closest_waypoints"], columns(3)["closest_waypoints"])
 
 

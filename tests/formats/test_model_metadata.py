@@ -48,6 +48,8 @@ def test_a_file_with_nothing_but_actions_gets_every_default(tmp_path: Path) -> N
         version=1,
         training_algorithm="clipped_ppo",
         lidar_config=LidarConfig(num_sectors=8, num_values_per_sector=8, clipping_dist_m=2.0),
+        given=("action_space",),
+        renumbered=False,
     )
 
 
@@ -212,3 +214,17 @@ def test_no_value_of_any_key_ends_in_another_error_than_bad_input(
     with contextlib.suppress(BadInput):
         metadata = read(tmp_path, content)
         assert (metadata.low is None) == bool(metadata.actions)
+
+
+def test_an_index_that_is_not_the_position_is_told(tmp_path: Path) -> None:
+    def numbered(*indices: object) -> bool:
+        space = [{"steering_angle": 0, "speed": 1, "index": index} for index in indices]
+        return read(tmp_path, {"action_space": space}).renumbered
+
+    assert not numbered(0, 1, "2")
+    assert numbered(1, 0)
+
+
+def test_a_list_no_policy_could_choose_from_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"1001 actions.*at most 1000"):
+        read(tmp_path, {"action_space": DISCRETE[:1] * 1001})

@@ -29,6 +29,7 @@ CONSOLE = (
 )
 WHOLE = ("episode", "steps", "action", "closest_waypoint", "car")
 YES_NO = ("done", "all_wheels_on_track")
+TRACKS = ("Oval_track", "Bowtie_track", "2022_summit_speedway")
 
 
 def packed_rows(count: int, seed: int = 0) -> np.ndarray:
@@ -39,11 +40,12 @@ def packed_rows(count: int, seed: int = 0) -> np.ndarray:
     for name in YES_NO:
         rows[:, PACKED[name]] = draw.integers(0, 2, count)
     rows[:, PACKED["episode_status"]] = draw.integers(0, len(EPISODE_STATUS), count)
+    rows[:, PACKED["track"]] = draw.integers(0, len(TRACKS), count)
     return rows
 
 
 def table(count: int = 7, iteration: int = 3) -> pa.Table:
-    return to_table(packed_rows(count, iteration), iteration)
+    return to_table(packed_rows(count, iteration), iteration, TRACKS)
 
 
 def test_the_services_columns_come_first_and_in_its_order() -> None:
@@ -60,7 +62,7 @@ def test_a_recording_of_the_console_goes_through_packed_rows_unchanged() -> None
     assert TRACE_COLUMNS[: len(recorded.columns)] == tuple(recorded.columns)
     coded = recorded.assign(episode_status=recorded["episode_status"].map(STATUS_CODE))
     packed = coded.reindex(columns=PACKED_COLUMNS, fill_value=0).to_numpy(dtype=np.float64)
-    trace = to_table(packed, 6).to_pandas()
+    trace = to_table(packed, 6, TRACKS).to_pandas()
     for name in recorded.columns:
         values = trace[name].astype(str) if name == "episode_status" else trace[name]
         np.testing.assert_array_equal(values, recorded[name], err_msg=name)
@@ -68,8 +70,8 @@ def test_a_recording_of_the_console_goes_through_packed_rows_unchanged() -> None
 
 @given(rows=arrays(np.float64, (3, len(PACKED_COLUMNS)), elements=st.floats(-1e9, 1e9)))
 def test_no_double_column_loses_a_bit(rows: np.ndarray) -> None:
-    rows[:, PACKED["episode_status"]] = 1
-    trace = to_table(rows, 0)
+    rows[:, [PACKED["episode_status"], PACKED["track"]]] = 1
+    trace = to_table(rows, 0, TRACKS)
     for field in SCHEMA:
         if field.name in PACKED and field.type == pa.float64():
             np.testing.assert_array_equal(trace[field.name].to_numpy(), rows[:, PACKED[field.name]])
@@ -85,8 +87,20 @@ def test_every_column_has_its_type_and_says_its_unit() -> None:
 def test_every_status_code_becomes_its_word() -> None:
     rows = packed_rows(len(EPISODE_STATUS))
     rows[:, PACKED["episode_status"]] = np.arange(len(EPISODE_STATUS))
-    trace = to_table(rows, 0)
+    trace = to_table(rows, 0, TRACKS)
     assert trace["episode_status"].to_pylist() == list(EPISODE_STATUS)
+
+
+def test_every_row_names_its_course() -> None:
+    rows = packed_rows(3)
+    rows[:, PACKED["track"]] = [2, 0, 1]
+    assert to_table(rows, 0, TRACKS)["track"].to_pylist() == [
+        "2022_summit_speedway",
+        "Oval_track",
+        "Bowtie_track",
+    ]
+    with pytest.raises(ValueError, match="track code 2"):
+        to_table(rows, 0, TRACKS[:2])
 
 
 @pytest.mark.parametrize("code", [-1, len(EPISODE_STATUS), 256, 0.5, np.nan])
@@ -94,21 +108,21 @@ def test_an_unknown_status_code_is_refused(code: float) -> None:
     rows = packed_rows(3)
     rows[1, PACKED["episode_status"]] = code
     with pytest.raises(ValueError, match="status code"):
-        to_table(rows, 0)
+        to_table(rows, 0, TRACKS)
 
 
 def test_a_continuous_action_has_no_number_but_its_steering_and_speed() -> None:
     rows = packed_rows(2)
     rows[:, PACKED["action"]] = np.nan
     rows[:, PACKED["steer"]] = [-12.5, 31.0]
-    trace = to_table(rows, 0)
+    trace = to_table(rows, 0, TRACKS)
     assert trace["action"].to_pylist() == [None, None]
     assert trace["steer"].to_pylist() == [-12.5, 31.0]
 
 
 def test_rows_of_another_width_are_refused() -> None:
     with pytest.raises(ValueError, match="shape"):
-        to_table(np.zeros((3, 4)), 0)
+        to_table(np.zeros((3, 4)), 0, TRACKS)
 
 
 def test_no_rows_are_a_table_too(tmp_path: Path) -> None:

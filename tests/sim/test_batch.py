@@ -12,8 +12,12 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.sim.batch import CarBatch
 
-CAR_FILE = Path(__file__).parents[2] / "conf/car/deepracer.yaml"
-CAR = TypeAdapter(CarConfig).validate_python(yaml.safe_load(CAR_FILE.read_text()))
+CONF = Path(__file__).parents[2] / "conf/car"
+CAR, IDEAL = (
+    TypeAdapter(CarConfig).validate_python(yaml.safe_load((CONF / f"{name}.yaml").read_text()))
+    for name in ("deepracer", "ideal")
+)
+EVEN = dataclasses.replace(CAR, steering_trim_deg=0.0)
 STILL = dataclasses.replace(CAR, min_speed_mps=0.0)
 # At rest: within a tenth of a millimetre, and slower than that a second. The service calls a car standing below
 # 0.3 mm a step, 4.5 mm/s.
@@ -103,10 +107,19 @@ def test_driving_does_not_depend_on_place_and_heading():
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 1.0, 2.0, 3.0, 4.0])
 def test_a_car_steering_straight_goes_straight_at_about_the_speed_it_was_told(speed):
-    state = drive(CarBatch(CAR, 1, 1), speed, 0.0, 60)
-    assert abs(state.y_m[0]) < 1e-3
-    assert abs(state.yaw_rad[0]) < 1e-3
-    assert 0.95 < state.speed_mps[0] / speed < 1.04
+    for car in (EVEN, IDEAL):
+        state = drive(CarBatch(car, 1, 1), speed, 0.0, 60)
+        assert abs(state.y_m[0]) < 1e-3
+        assert abs(state.yaw_rad[0]) < 1e-3
+        assert 0.95 < state.speed_mps[0] / speed < 1.06
+
+
+def test_a_car_told_straight_pulls_to_where_its_wheels_are_trimmed():
+    state = drive(CarBatch(CAR, 1, 1), 1.0, 0.0, 30)
+    straight = drive(CarBatch(CAR, 1, 1), 1.0, -CAR.steering_trim_deg, 30)
+    assert state.y_m[0] > 0.05
+    # It begins to move with its wheels still where they were.
+    assert abs(straight.y_m[0]) < 0.4 * state.y_m[0]
 
 
 def test_two_thirds_of_the_speed_are_reached_in_about_a_third_of_a_second():
@@ -119,18 +132,71 @@ def test_two_thirds_of_the_speed_are_reached_in_about_a_third_of_a_second():
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
 def test_positive_steering_turns_left_and_negative_as_much_to_the_right(speed):
-    state = drive(CarBatch(CAR, 2, 1), speed, [15.0, -15.0], 20)
+    state = drive(CarBatch(EVEN, 2, 1), speed, [15.0, -15.0], 20)
     assert state.yaw_rate_radps[0] > 0.3
     assert state.y_m[0] > 0.02
     assert state.y_m[1] == pytest.approx(-state.y_m[0], abs=2e-3)
 
 
 def test_the_car_gets_round_the_tightest_corner_of_a_course():
-    # 0.7 m radius at 1.5 m/s.
+    # 0.7 m radius at 1 m/s.
     cars = CarBatch(CAR, 1, 1)
-    drive(cars, 1.5, 0.0, 15)
-    state = drive(cars, 1.5, 30.0, 30)
+    drive(cars, 1.0, 0.0, 15)
+    state = drive(cars, 1.0, 30.0, 30)
     assert state.speed_mps[0] / state.yaw_rate_radps[0] < 0.7
+
+
+@pytest.mark.parametrize("steering", [5.0, 10.0, 20.0, 30.0, -30.0])
+def test_the_ideal_car_turns_as_the_bicycle_formula_says(steering):
+    cars = CarBatch(IDEAL, 3, 1)
+    state = drive(cars, [0.5, 1.0, 2.0], steering, 45)
+    radius_m = IDEAL.wheelbase_m / np.tan(np.deg2rad(steering))
+    np.testing.assert_allclose(state.speed_mps / state.yaw_rate_radps, radius_m, rtol=0.05)
+
+
+def test_the_fitted_car_turns_wider_than_the_ideal_one():
+    fitted, ideal = (drive(CarBatch(car, 1, 1), 1.0, 30.0, 45) for car in (CAR, IDEAL))
+    assert fitted.yaw_rate_radps[0] / fitted.speed_mps[0] < 0.7 * ideal.yaw_rate_radps[0] / ideal.speed_mps[0]
+
+
+def test_a_moved_car_goes_on_from_its_new_place_with_its_new_motion():
+    cars = CarBatch(EVEN, 2, 1)
+    drive(cars, 1.0, 0.0, 20)
+    # The first is left as it is, the second is the first seen from elsewhere.
+    before = cars.read()
+    turn = 2.0
+    pose = np.array([[5.0, -3.0, before.yaw_rad[0] + turn]])
+    motion = np.array([[before.speed_mps[0], before.lateral_mps[0], before.yaw_rate_radps[0]]])
+    cars.move([1], pose, motion)
+    placed = cars.read()
+    assert (placed.x_m[1], placed.y_m[1]) == (5.0, -3.0)
+    assert placed.yaw_rad[1] == pytest.approx(before.yaw_rad[0] + turn)
+    assert placed.speed_mps[1] == pytest.approx(before.speed_mps[0])
+    after = drive(cars, 1.0, 10.0, 10)
+    dx, dy = after.x_m - placed.x_m, after.y_m - placed.y_m
+    turned = (np.cos(turn) * dx[0] - np.sin(turn) * dy[0], np.sin(turn) * dx[0] + np.cos(turn) * dy[0])
+    np.testing.assert_allclose(turned, (dx[1], dy[1]), atol=2e-3)
+
+
+def test_a_moved_car_has_the_motion_it_was_given():
+    cars = CarBatch(CAR, 1, 1)
+    cars.move([0], np.array([[1.0, 2.0, -2.5]]), np.array([[1.5, 0.2, 0.7]]))
+    state = cars.read()
+    assert (state.speed_mps[0], state.lateral_mps[0]) == pytest.approx((1.5, 0.2))
+    assert state.yaw_rate_radps[0] == pytest.approx(0.7)
+
+
+def test_lifting_a_car_stops_it_but_leaves_its_wheels_turned():
+    cars = CarBatch(CAR, 2, 1)
+    drive(cars, 1.5, 30.0, 15)
+    turned = cars.steering_rad
+    cars.lift([0], 1.0, 2.0, 0.5)
+    state = cars.read()
+    assert (state.x_m[0], state.y_m[0], state.speed_mps[0]) == (1.0, 2.0, 0.0)
+    np.testing.assert_array_equal(cars.steering_rad, turned)
+    assert turned[0] > 0.3
+    cars.place([1], 0.0, 0.0, 0.0)
+    assert cars.steering_rad[1] == pytest.approx(np.deg2rad(CAR.steering_trim_deg))
 
 
 def test_the_wheels_stay_on_the_floor_in_the_wildest_driving():
@@ -184,7 +250,7 @@ def test_a_weak_servo_steers_late():
     cars = CarBatch(CAR, 2, 1)
     drive(cars, 1.0, 0.0, 15)
     cars.set_servo_scale([1], [0.2])
-    rate = drive(cars, 1.0, 20.0, 1).yaw_rate_radps
+    rate = drive(cars, 1.0, 20.0, 4).yaw_rate_radps
     assert 0.0 < rate[1] < 0.7 * rate[0]
 
 

@@ -171,7 +171,7 @@ def test_the_candidates_of_a_place_on_the_road_do_not_depend_on_the_length_of_th
         x = np.arange(0.0, 6.0 * bends, 0.15)
         line = np.column_stack([x, np.sin(x * np.pi / 3)])
         grid = build_segments(line)
-        cells = ((line - [grid.low_x, grid.low_y]) / grid.cell_m).astype(int)
+        cells = ((line - [grid.low_x[0], grid.low_y[0]]) / grid.cell_m).astype(int)
         cell = cells[:, 1] * grid.columns + cells[:, 0]
         return float(np.diff(grid.first)[cell].mean())
 

@@ -15,6 +15,8 @@ from deepracer_exp.training import watchdog
 from deepracer_exp.training.collection import Collection, cores, worker_count
 from deepracer_exp.training.worker import EnvFactory
 
+pytestmark = pytest.mark.usefixtures("workers_start_early")
+
 
 @pytest.fixture
 def collect(tmp_path):

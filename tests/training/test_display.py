@@ -1,5 +1,6 @@
 """Laws of the terminal view."""
 
+import dataclasses
 import io
 import math
 import re
@@ -15,6 +16,7 @@ from deepracer_exp.training.display import LINE_S, SPARKS, ProgressDisplay, RunH
 HEADER = RunHeader(
     name="default",
     track="re:Invent 2018",
+    track_labels=(),
     reward="progress_gain",
     network="mlp_small",
     actions="15 actions",
@@ -61,13 +63,15 @@ class Clock:
         return self.now_s
 
 
-def screen(width: int, act: Callable[[ProgressDisplay], None], height: int = 24) -> list[str]:
+def screen(
+    width: int, act: Callable[[ProgressDisplay], None], height: int = 24, header: RunHeader = HEADER
+) -> list[str]:
     """The lines of the last drawing on a terminal of this size."""
     file = io.StringIO()
     console = Console(
         file=file, force_terminal=True, width=width, height=height, color_system=None, legacy_windows=False
     )
-    with ProgressDisplay(console, HEADER, Clock()) as display:
+    with ProgressDisplay(console, header, Clock()) as display:
         act(display)
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", file.getvalue()).replace("\r", "\n")
     lines = plain.split("\n")
@@ -76,11 +80,11 @@ def screen(width: int, act: Callable[[ProgressDisplay], None], height: int = 24)
     return lines[first : last + 1]
 
 
-def lines(act: Callable[[ProgressDisplay, Clock], None]) -> list[str]:
+def lines(act: Callable[[ProgressDisplay, Clock], None], header: RunHeader = HEADER) -> list[str]:
     """What is written where there is no terminal."""
     file = io.StringIO()
     clock = Clock()
-    with ProgressDisplay(Console(file=file, width=80), HEADER, clock) as display:
+    with ProgressDisplay(Console(file=file, width=80), header, clock) as display:
         act(display, clock)
     return file.getvalue().splitlines()
 
@@ -176,6 +180,57 @@ def test_the_last_row_is_drawn_when_the_training_raises() -> None:
     with pytest.raises(KeyboardInterrupt):
         train()
     assert "iteration 3" in file.getvalue().splitlines()[-1]
+
+
+TRACKS = tuple(f"track_{letter}" for letter in "abcdefghijklmnopqr")
+SEVERAL = dataclasses.replace(HEADER, track="18 tracks", track_labels=TRACKS)
+ROW_OF_TRACKS = {
+    **ROW,
+    "best_lap_time_s": None,
+    "mean_lap_time_s": None,
+    **{f"completion/{label}": 81.0 + number for number, label in enumerate(TRACKS)},
+    **{f"best_lap_time_s/{label}": 20.25 + number for number, label in enumerate(TRACKS)},
+}
+
+
+def test_eighteen_tracks_fit_a_terminal_of_80_by_24_with_completion_and_best_lap_of_each() -> None:
+    panel = screen(80, lambda display: display.update(ROW_OF_TRACKS, 0.5, 23.0), header=SEVERAL)
+    text = "\n".join(panel)
+    assert len(panel) < 24
+    assert {len(line) for line in panel} == {80}
+    for number, label in enumerate(TRACKS):
+        assert re.search(rf"{label} +{81 + number} +{20.25 + number:.2f}\b", text), label
+    for word in [
+        "655,360",
+        "99.5 %",
+        "96 %",
+        "525",
+        "82.58",
+        "1.538",
+        "0.0003",
+        "15,096",
+        "2,489",
+        "18 tracks",
+    ]:
+        assert word in text, word
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 24), (60, 24), (60, 40), (80, 20), (200, 60)])
+def test_the_panel_of_many_tracks_is_never_higher_or_wider_than_the_terminal(width: int, height: int) -> None:
+    panel = screen(width, lambda display: display.update(ROW_OF_TRACKS, 0.5, 23.0), height, SEVERAL)
+    assert len(panel) < height
+    assert {len(line) for line in panel} == {min(width, 100)}
+
+
+def test_a_plain_line_names_the_track_on_which_the_car_comes_least_far() -> None:
+    def act(display: ProgressDisplay, clock: Clock) -> None:
+        display.update({**ROW_OF_TRACKS, "completion/track_h": 12.34}, 0.5, 23.0)
+        clock.now_s += 2 * LINE_S
+        # Nothing ended there in this iteration: what was known of it holds.
+        display.update({**ROW_OF_TRACKS, "completion/track_h": None}, 0.6, 20.0)
+
+    assert "least 12.3 % on track_h" in lines(act, SEVERAL)[-1]
+    assert "best lap" not in lines(act, SEVERAL)[-1]
 
 
 @given(st.lists(st.floats(-1e6, 1e6), max_size=300), st.integers(1, 40))

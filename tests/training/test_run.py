@@ -123,11 +123,12 @@ def test_another_seed_gives_another_run(trained):
     assert not same_weights(one, other)
 
 
-def test_the_same_seed_gives_the_same_run_in_several_processes(start, tmp_path):
+@pytest.mark.usefixtures("workers_start_early")
+def test_the_same_seed_gives_the_same_run_in_several_processes(call, tmp_path):
     command = ("train", "experiment=tiny", "tracking=off", "collector.processes=2", *OVERRIDES)
     runs = []
     for name in ("first", "second"):
-        ended = start(*command, f"runs_dir={name}").end()
+        ended = call(*command, f"runs_dir={name}")
         assert ended.code == 0, ended.stderr
         (folder,) = tmp_path.glob(f"{name}/tiny/*")
         rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
@@ -137,10 +138,11 @@ def test_the_same_seed_gives_the_same_run_in_several_processes(start, tmp_path):
     assert len(runs[0]) == 4
 
 
-def test_asynchronous_collection_numbers_and_counts_every_step(start):
-    ended = start(
+@pytest.mark.usefixtures("workers_start_early")
+def test_asynchronous_collection_numbers_and_counts_every_step(call):
+    ended = call(
         "train", "experiment=tiny", "tracking=off", "collector=async", "collector.processes=2", *OVERRIDES
-    ).end()
+    )
     assert ended.code == 0, ended.stderr
     assert_trace_tells_the_metrics(ended)
 
@@ -150,7 +152,7 @@ def test_asynchronous_collection_numbers_and_counts_every_step(start):
     [
         (["budget.env_steps=2000"], "budget reached: env_steps"),
         (["budget.iterations=1"], "budget reached: iterations"),
-        (["budget.env_steps=null", "budget.wall_clock_s=0.5"], "budget reached: wall_clock_s"),
+        (["budget.env_steps=null", "budget.minutes=0.008"], "budget reached: minutes"),
     ],
 )
 def test_each_limit_of_the_budget_ends_the_run_with_its_name(trained, limits, reason):
@@ -171,6 +173,40 @@ def test_the_stopping_rule_ends_the_run_once_enough_episodes_have_ended(trained)
     assert all(row["lap_share"] is None for row in ended.metrics[:-1])
 
 
+TRACKS = ("reinvent_base", "Oval_track", "Straight_track")
+SEVERAL = (*OVERRIDES, f"track=[{','.join(TRACKS)}]", "track.Oval_track.direction=alternate")
+
+
+def test_several_tracks_train_together_and_each_has_its_metrics(trained):
+    ended = trained(*SEVERAL)
+    assert ended.code == 0, ended.stderr
+    assert_trace_tells_the_metrics(ended)
+    trace = read_trace(ended.folder / "trace")
+    ends = trace[trace.done]
+    assert set(trace.track) == set(TRACKS)
+    for iteration, row in enumerate(ended.metrics):
+        assert row["best_lap_time_s"] is row["mean_lap_time_s"] is None
+        for name in TRACKS:
+            here = ends[(ends.iteration == iteration) & (ends.track == name)]
+            assert row[f"completion/{name}"] == (pytest.approx(here.progress.mean()) if len(here) else None)
+    counted = ends.groupby("track", observed=True).size()
+    assert {name: of["episodes"] for name, of in ended.summary["tracks"].items()} == dict(counted)
+    for name in ("best_lap.png", "learning.png"):
+        assert (ended.folder / name).exists()
+    assert (
+        ended.folder.name.split("-", 2)[2] == "reinvent_base_Oval_track_Straight_track-speed_on_track-seed0"
+    )
+    with_laps = ends[ends.episode_status == "lap_complete"].track.nunique()
+    assert f"laps on {with_laps} of 3 tracks" in ended.stdout
+    assert " · least " in ended.stderr
+
+
+def test_a_run_on_one_track_tells_nothing_of_tracks(trained):
+    ended = trained(*OVERRIDES)
+    assert not [key for key in ended.metrics[-1] if "/" in key]
+    assert "tracks" not in ended.summary
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -178,7 +214,7 @@ def test_the_stopping_rule_ends_the_run_once_enough_episodes_have_ended(trained)
         ("network=mlp_small_shared",),
         ("network=mlp_deep_shared", "action_space=continuous"),
         ("lr_schedule=adaptive_kl",),
-        ("randomization=action_noise",),
+        ("randomization=aws",),
         ("track=Straight_track",),
         ("track=Oval_track", "track.direction=reversed"),
         ("reward=racing_line",),

@@ -1,0 +1,40 @@
+"""`deepracer-exp export`: a trained policy, or what it was trained with, for other programs."""
+
+import argparse
+
+_EPILOG = """\
+  deepracer-exp export run=RUN format=onnx                  the network as one file, checked against itself
+  deepracer-exp export run=RUN format=onnx checkpoint=last -o policy.onnx
+  deepracer-exp export run=RUN format=aws -o custom_files   reward_function.py, model_metadata.json and
+                                                            hyperparameters.json
+"""
+
+
+def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    export = commands.add_parser(
+        "export",
+        help="write a trained policy, or what it was trained with, for other programs",
+        description="Write a run's policy as ONNX, or the files that AWS's console and deepracer-for-cloud train from.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    export.add_argument("overrides", nargs="*", metavar="run=RUN | format=onnx|aws | KEY=VALUE")
+    export.add_argument(
+        "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
+    )
+    export.set_defaults(command=_export)
+
+
+def _export(args: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from deepracer_exp.config.compose import compose_export
+
+    config, _ = compose_export(args.overrides)
+    args.debug = config.debug
+
+    from deepracer_exp.export.export import export
+
+    export(config, args.output, Console(highlight=False, markup=False))
+    return 0

@@ -1,0 +1,260 @@
+"""The files of a DeepRacer model as overrides: what is taken from them, and what is not applicable here."""
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats import hyperparameters, model_metadata
+from deepracer_exp.formats.hyperparameters import Hyperparameters, read_hyperparameters
+from deepracer_exp.formats.model_metadata import Action, ModelMetadata, read_model_metadata
+
+from .overrides import override_line
+
+KEY = "custom_files"
+
+PLACES = {
+    "reward_function.py": ("reward_function.py",),
+    "model_metadata.json": ("model_metadata.json", "model/model_metadata.json"),
+    "hyperparameters.json": ("hyperparameters.json", "ip/hyperparameters.json"),
+}
+"""Each file, in deepracer-for-cloud's `custom_files/` and in the folder of a trained model."""
+
+TAKEN = {
+    "lr": "algorithm.lr",
+    "batch_size": "algorithm.batch_size",
+    "num_epochs": "algorithm.epochs",
+    "discount_factor": "algorithm.discount",
+    "beta_entropy": "algorithm.entropy_coeff",
+    "loss_type": "algorithm.loss_type",
+    "num_episodes_between_training": "algorithm.episodes_per_iteration",
+    "term_cond_max_episodes": "budget.iterations",
+}
+"""Keys of hyperparameters.json and where their values go."""
+
+FRAMES = "algorithm.frames_per_iteration"
+"""Our other way to say how long an iteration is; null where the file's episodes decide."""
+
+NOT_APPLICABLE = {
+    "e_greedy_value": "for e-greedy exploration, and actions are drawn from the policy here",
+    "epsilon_steps": "for e-greedy exploration, and actions are drawn from the policy here",
+    "stack_size": "the service ignores it, too",
+    "term_cond_avg_score": "the service only stores it",
+    "sac_alpha": "for SAC only",
+    "sensor": "the policy sees features, no camera or lidar",
+    "neural_network": "for camera pictures; network=NAME chooses here",
+    "version": "the service's physics; car=NAME chooses here",
+    "lidar_config": "the policy sees features, no lidar",
+}
+"""Keys of both JSON files that have no effect, and why."""
+
+
+@dataclass(frozen=True)
+class CustomFiles:
+    """What a folder of DeepRacer files holds."""
+
+    folder: str
+    """As it was given."""
+    paths: Mapping[str, str]
+    """The files that are there, by their names in PLACES."""
+    metadata: ModelMetadata | None
+    hyperparameters: Hyperparameters | None
+
+    @property
+    def name(self) -> str:
+        """Return what a racer calls the folder."""
+        return Path(self.folder).resolve().name or self.folder
+
+    @property
+    def action_space(self) -> dict[str, Any]:
+        """Return the values of the group `action_space`; empty without a model_metadata.json."""
+        if self.metadata is None:
+            return {}
+        low, high = self.metadata.low, self.metadata.high
+        if low is None or high is None:
+            actions = [_in_the_files_words(action) for action in self.metadata.actions]
+            return {"kind": "discrete", "actions": actions}
+        return {
+            "kind": "continuous",
+            "steering_angle": {"low": low.steering_deg, "high": high.steering_deg},
+            "speed": {"low": low.speed_mps, "high": high.speed_mps},
+        }
+
+    @property
+    def learning(self) -> dict[str, Any]:
+        """Return value by key of hyperparameters.json for those that are taken; empty without the file."""
+        given = self.hyperparameters
+        if given is None:
+            return {}
+        # Without the key the service's limit is so far away that ours are better.
+        return {
+            key: getattr(given, key) for key in TAKEN if key != "term_cond_max_episodes" or key in given.given
+        }
+
+    def remarks(self) -> list[str]:
+        """Return a line for each key that is not taken, and for what else a racer should know."""
+        lines: list[str] = []
+        if self.metadata is not None:
+            lines += _remarks("model_metadata.json", self._metadata_remarks(self.metadata))
+        if self.hyperparameters is not None:
+            lines += _remarks("hyperparameters.json", self._learning_remarks(self.hyperparameters))
+        return lines
+
+    def _metadata_remarks(self, metadata: ModelMetadata) -> Iterable[tuple[str, str]]:
+        values = {
+            "sensor": ", ".join(metadata.sensor),
+            "neural_network": metadata.neural_network,
+            "version": metadata.version,
+        }
+        for key in metadata.given:
+            if key in NOT_APPLICABLE:
+                shown = f"{key}={values[key]}" if key in values else key
+                yield shown, f"not applicable: {NOT_APPLICABLE[key]}"
+        if metadata.renumbered:
+            yield "action_space: index", "not read: an action's number is its position, as in the service"
+        yield from _unknown(metadata.given, model_metadata.KEYS)
+
+    def _learning_remarks(self, given: Hyperparameters) -> Iterable[tuple[str, str]]:
+        missing = [f"{key}={value}" for key, value in self.learning.items() if key not in given.given]
+        if missing:
+            yield ", ".join(missing), "not in the file, so the service's default"
+        for key in given.beyond_console():
+            yield f"{key}={getattr(given, key)}", "taken; the AWS console would not accept it"
+        if given.exploration_type != "categorical":
+            yield (
+                f"exploration_type={given.exploration_type}",
+                "not applicable: actions are drawn from the policy here (categorical)",
+            )
+        for key in given.given:
+            if key in NOT_APPLICABLE:
+                yield f"{key}={getattr(given, key)}", f"not applicable: {NOT_APPLICABLE[key]}"
+        yield from _unknown(given.given, hyperparameters.KEYS)
+
+
+def read_custom_files(folder: str) -> CustomFiles:
+    """Read the JSON files of a folder and find its reward function.
+
+    Raises:
+        BadInput: there is no such folder, none of the files is in it, or one of them cannot be used.
+    """
+    accepted = "a folder with reward_function.py, model_metadata.json or hyperparameters.json"
+    if not folder:
+        raise BadInput(f"{KEY}='': no folder; accepted: {accepted}")
+    try:
+        names = [path.name for path in Path(folder).iterdir()]
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise BadInput(f"{folder}: cannot be read ({reason}); accepted: {accepted}") from error
+    paths = {}
+    for name, places in PLACES.items():
+        # A name that is there counts, whatever it is: its reader will say what is wrong with it.
+        there = [Path(folder, place) for place in places if os.path.lexists(Path(folder, place))]
+        if there:
+            paths[name] = str(there[0])
+    if not paths:
+        # A file's name may have line breaks.
+        held = [" ".join(name.split()) for name in sorted(names)[:5]] + ["..."] * (len(names) > 5)
+        raise BadInput(f"{folder}: holds {', '.join(held) or 'nothing'}; accepted: {accepted}")
+    metadata = paths.get("model_metadata.json")
+    learning = paths.get("hyperparameters.json")
+    files = CustomFiles(
+        folder,
+        paths,
+        read_model_metadata(metadata) if metadata else None,
+        read_hyperparameters(learning) if learning else None,
+    )
+    if files.metadata is not None and files.metadata.training_algorithm != "clipped_ppo":
+        raise BadInput(
+            f"{metadata}: training_algorithm: {files.metadata.training_algorithm}; accepted: clipped_ppo, the only "
+            "algorithm so far"
+        )
+    return files
+
+
+@dataclass(frozen=True)
+class Beneath:
+    """Overrides that a folder of files stands for; they go before the racer's own, which win."""
+
+    lines: tuple[str, ...]
+    names: Mapping[str, str]
+    """What a racer calls the reward and the action space that come from the folder."""
+    notes: tuple[str, ...]
+    """What was taken, what was not and why, a line each."""
+
+
+def beneath(files: CustomFiles, own: Mapping[str, str]) -> Beneath:
+    """Turn files into overrides.
+
+    Args:
+        files: what was found.
+        own: the racer's own overrides by key or group; where one of them chooses the same, nothing is taken.
+    """
+    lines: list[str] = []
+    names: dict[str, str] = {}
+    notes = [
+        f"{KEY}={files.folder}: {', '.join(os.path.relpath(p, files.folder) for p in files.paths.values())}"
+    ]
+
+    reward = files.paths.get("reward_function.py")
+    if reward is not None:
+        winner = _first(own, "reward", "reward.name", "reward.file")
+        if winner is None:
+            names["reward"] = files.name
+            lines += [override_line("reward.file", reward), override_line("reward.name", files.name)]
+            notes.append("reward_function.py: taken as reward.file")
+        else:
+            notes.append(f"reward_function.py: not used, {winner} takes its place")
+
+    if files.action_space:
+        winner = _first(own, "action_space", "action_space.kind", "action_space.file")
+        if winner is None:
+            # Values instead of the file's path: config.yaml then tells the actions when the file has gone.
+            values = dict(files.action_space)
+            lines.append(f"action_space={values.pop('kind')}")
+            lines += [override_line(f"action_space.{key}", value) for key, value in values.items()]
+            names["action_space"] = files.name
+            many = f"{len(values['actions'])} actions" if "actions" in values else "continuous"
+            notes.append(f"model_metadata.json: taken as action_space: {many}")
+        else:
+            notes.append(f"model_metadata.json: action_space: not used, {winner} takes its place")
+
+    taken = []
+    for key, value in files.learning.items():
+        target = TAKEN[key]
+        group = target.partition(".")[0]
+        winner = _first(own, group, target)
+        if key == "num_episodes_between_training":
+            frames = own.get(FRAMES)
+            if frames is not None and frames != f"{FRAMES}=null":
+                winner = winner or frames
+            elif group not in own:
+                lines.append(override_line(FRAMES, None))
+        if winner is None:
+            taken.append(f"{target}={value}")
+            lines.append(override_line(target, value))
+        else:
+            notes.append(f"hyperparameters.json: {key}={value}: not used, {winner} takes its place")
+    if taken:
+        notes.append(f"hyperparameters.json: taken as {', '.join(taken)}")
+    return Beneath(tuple(lines), names, (*notes, *files.remarks()))
+
+
+def _first(own: Mapping[str, str], *keys: str) -> str | None:
+    """Return the first of these overrides that the racer gave."""
+    return next((own[key] for key in keys if key in own), None)
+
+
+def _in_the_files_words(action: Action) -> dict[str, float]:
+    return {"steering_angle": action.steering_deg, "speed": action.speed_mps}
+
+
+def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, str]]:
+    unknown = [key for key in given if key not in known]
+    if unknown:
+        yield ", ".join(unknown), "not read, and not by the service either"
+
+
+def _remarks(file: str, findings: Iterable[tuple[str, str]]) -> list[str]:
+    return [f"{file}: {what}: {why}" for what, why in findings]

@@ -1,0 +1,24 @@
+"""The entry point that takes a trained policy out of the house."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from .evaluation import checkpoint_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig:
+    """What `deepracer-exp export` is asked for."""
+
+    run: Annotated[str, Field(min_length=1)]
+    """Folder, its name under `runs_dir` or the beginning of it, or MLflow's id of the run."""
+    format: Literal["onnx", "aws"]
+    """The network as a file, or what another training begins with on AWS."""
+    checkpoint: Annotated[str, AfterValidator(checkpoint_name)]
+    """`best`, `last` or an iteration; of the network alone."""
+    runs_dir: Annotated[str, Field(min_length=1)]
+    tracking_uri: str | None
+    """MLflow store in which an id is looked up; null: the one in `runs_dir`."""
+    debug: bool

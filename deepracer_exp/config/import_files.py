@@ -1,0 +1,211 @@
+"""The files of a DeepRacer model as option files of one's own."""
+
+import contextlib
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from deepracer_exp.errors import BadInput
+
+from .compose import Composition
+from .custom_files import CustomFiles
+from .experiment import safe_name
+from .options import conf_dirs
+from .overrides import parse_single
+
+_GROUPS = {
+    "reward_function.py": "reward",
+    "model_metadata.json": "action_space",
+    "hyperparameters.json": "algorithm",
+}
+
+_REWARD = """\
+# Brought from {source}.
+# A name to show; the file below is what is used.
+name: {name}
+# The reward function beside this file.
+file: {file}
+# Values for the constants in capitals of the module, e.g. reward.constants.NAME=2.
+constants: {constants}
+# Seconds one control step's reward calls may take, all cars together, before the run is failed.
+time_limit_s: {time_limit_s}
+"""
+
+_DISCRETE = """\
+# Brought from {source}.
+# discrete: the policy picks one of the actions below.
+kind: discrete
+# One line per action: steering_angle in degrees, positive to the left; speed in m/s.
+# The position in the list is the action's number.
+actions:
+{actions}
+# A model_metadata.json that takes the place of everything above; null: none.
+file: null
+"""
+
+_CONTINUOUS = """\
+# Brought from {source}.
+# continuous: the policy gives two numbers between -1 and 1 (steering, speed).
+kind: continuous
+# Steering angle in degrees, positive to the left: low at -1, high at 1.
+steering_angle: {steering_angle}
+# Speed in m/s: low at -1, high at 1.
+speed: {speed}
+# A model_metadata.json that takes the place of everything above; null: none.
+file: null
+"""
+
+_ALGORITHM = {
+    "lr": "Learning rate at the start; lr_schedule changes it on the way.",
+    "batch_size": "Steps per gradient step.",
+    "epochs": "Passes over each iteration's steps (num_epochs).",
+    "discount": "Worth of a reward one step (1/15 s) later (discount_factor).",
+    "entropy_coeff": "Reward for staying undecided (beta_entropy).",
+    "loss_type": "Loss of the value network: huber or mean squared error.",
+    "frames_per_iteration": "Control steps between two updates; null: episodes_per_iteration decides.",
+    "episodes_per_iteration": "Finished episodes between two updates (num_episodes_between_training).",
+}
+
+
+def import_files(files: CustomFiles, name: str, composition: Composition) -> list[Path]:
+    """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
+
+    Args:
+        files: what was found in a folder.
+        name: of the options.
+        composition: the experiment that the files make, checked.
+
+    Returns:
+        The files written, the experiment's last.
+
+    Raises:
+        BadInput: the name cannot be used or is taken, or a file cannot be written; nothing is left then.
+    """
+    _check_name(name)
+    texts = _texts(files, name, composition)
+    searched = conf_dirs()
+    for path in texts:
+        for folder in (Path("conf"), *searched):
+            taken = folder / path.relative_to("conf")
+            if os.path.lexists(taken):
+                raise BadInput(f"--name {name}: {taken} is there already; accepted: a name that is not taken")
+    _write_all(texts)
+    return list(texts)
+
+
+def _check_name(name: str) -> None:
+    try:
+        safe_name(name)
+        plain = parse_single(f"experiment={name}").value() == name == yaml.safe_load(name)
+    except ValueError as error:
+        raise BadInput(f"--name {name!r}: {error}") from error
+    if not plain or name.endswith(".yaml"):
+        raise BadInput(
+            f"--name {name}: would be read as something else than a name; accepted: a name that begins with a letter"
+        )
+
+
+def _texts(files: CustomFiles, name: str, composition: Composition) -> dict[Path, str | bytes]:
+    """Return what is to be written by path, `conf/...`."""
+    brought = [group for file, group in _GROUPS.items() if file in files.paths]
+    texts: dict[Path, str | bytes] = {}
+    for file, group in _GROUPS.items():
+        if file not in files.paths:
+            continue
+        # On one line whatever the folder is called: it goes into a comment.
+        source = re.sub(r"\s+", " ", str(Path(files.paths[file]).resolve()))
+        values = composition.mapping[group]
+        if group == "reward":
+            texts[Path("conf/reward", f"{name}.py")] = _read(files.paths[file])
+            text = _reward(source, name, values)
+        elif group == "action_space":
+            text = _action_space(source, values)
+        else:
+            text = _algorithm(source, values)
+        texts[Path("conf", group, f"{name}.yaml")] = text
+    iterations = files.learning.get("term_cond_max_episodes")
+    texts[Path("conf/experiment", f"{name}.yaml")] = _experiment(files, name, brought, iterations)
+    return texts
+
+
+def _reward(source: str, name: str, values: Mapping[str, Any]) -> str:
+    return _REWARD.format(
+        source=source,
+        name=_flow(name),
+        file=f"\"${{conf:'reward/{name}.py'}}\"",
+        constants=_flow(values["constants"]),
+        time_limit_s=values["time_limit_s"],
+    )
+
+
+def _action_space(source: str, values: Mapping[str, Any]) -> str:
+    if values["kind"] == "continuous":
+        ranges = {key: _flow(values[key]) for key in ("steering_angle", "speed")}
+        return _CONTINUOUS.format(source=source, **ranges)
+    actions = "\n".join(f"  - {_flow(action)}" for action in values["actions"])
+    return _DISCRETE.format(source=source, actions=actions)
+
+
+def _algorithm(source: str, values: Mapping[str, Any]) -> str:
+    lines = [f"# Brought from {source}; all other keys as in algorithm/ppo.yaml.", "defaults:", "  - ppo"]
+    for key, meaning in _ALGORITHM.items():
+        lines += [f"# {meaning}", f"{key}: {_flow(values[key])}"]
+    return "\n".join(lines) + "\n"
+
+
+def _experiment(files: CustomFiles, name: str, brought: list[str], iterations: int | None) -> str:
+    source = re.sub(r"\s+", " ", str(Path(files.folder).resolve()))
+    lines = ["# @package _global_", f"# What `deepracer-exp import` brought from {source}, on our defaults."]
+    lines += ["defaults:", *(f"  - override /{group}: {_flow(name)}" for group in brought)]
+    lines += ["# Folder under runs_dir, and experiment in MLflow.", f"name: {_flow(name)}"]
+    if iterations is not None:
+        lines += ["budget:", "  # Updates of the policy (term_cond_max_episodes, which counts them)."]
+        lines += [f"  iterations: {iterations}"]
+    return "\n".join(lines) + "\n"
+
+
+def _flow(value: Any) -> str:
+    """Return a value as YAML on one line."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=float("inf"))
+    return text.removesuffix("...\n").strip()
+
+
+def _read(path: str) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read ({error.strerror}); accepted: a Python file") from error
+
+
+def _write_all(texts: Mapping[Path, str | bytes]) -> None:
+    """Write all files or none; they are made aside first, so that the likely failures come before any is there."""
+    made: list[Path] = []
+    folders: list[Path] = []
+    try:
+        for path, text in texts.items():
+            for folder in (path.parent.parent, path.parent):
+                if not folder.is_dir():
+                    folder.mkdir()
+                    folders.append(folder)
+            aside = path.with_name(f".{path.name}.tmp")
+            made.append(aside)
+            aside.write_bytes(text if isinstance(text, bytes) else text.encode())
+        for path in texts:
+            path.with_name(f".{path.name}.tmp").replace(path)
+            made.append(path)
+    except BaseException as error:
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+        for folder in reversed(folders):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        if not isinstance(error, OSError):
+            raise
+        raise BadInput(
+            f"{error.filename}: cannot be written ({error.strerror}); options of your own go to ./conf"
+        ) from error

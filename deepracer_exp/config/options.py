@@ -1,0 +1,65 @@
+"""Where option files lie: the project's `conf/`, and `./conf` of the working folder beside it."""
+
+from functools import cache
+from pathlib import Path
+
+import yaml
+
+from deepracer_exp.errors import BadInput, nearest
+
+
+def conf_dir() -> Path:
+    """Return the project's folder: beside the code in an installed wheel, else the repository's."""
+    packaged = Path(__file__).parents[1] / "conf"
+    return packaged if packaged.is_dir() else Path(__file__).parents[2] / "conf"
+
+
+def conf_dirs() -> list[Path]:
+    """Return the absolute folders that are searched: the project's, then `./conf` where there is another one.
+
+    Raises:
+        BadInput: both have an option of the same name that is not the same.
+    """
+    project, own = conf_dir().resolve(), Path("conf")
+    try:
+        if not own.is_dir() or own.samefile(project):
+            return [project]
+        for group in sorted(folder.name for folder in project.iterdir() if folder.is_dir()):
+            for path in sorted((own / group).glob("*.yaml")):
+                namesake = project / group / path.name
+                if namesake.is_file() and namesake.read_bytes() != path.read_bytes():
+                    raise BadInput(f"{path}: the project has another {group} of that name; rename the file")
+        return [project, own.resolve()]
+    except OSError as error:
+        raise BadInput(
+            f"{error.filename}: cannot be read ({error.strerror}); ./conf is for options of your own"
+        ) from error
+
+
+def find(name: str) -> str:
+    """Return the path of a file that lies among the options, e.g. ``reward/mine.py``; the first folder's if any."""
+    paths = [folder / name for folder in conf_dirs()]
+    return str(next((path for path in paths if path.is_file()), paths[-1]))
+
+
+@cache
+def groups(entry: str = "train") -> list[str]:
+    """Return the names of the groups that an entry point (`conf/<entry>.yaml`) puts together, sorted."""
+    defaults = yaml.safe_load((conf_dir() / f"{entry}.yaml").read_text(encoding="utf-8"))["defaults"]
+    return sorted(group for item in defaults if isinstance(item, dict) for group in item)
+
+
+def options(group: str) -> list[str]:
+    """Return the names of a group's options, sorted."""
+    return sorted({path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")})
+
+
+def options_of(group: str) -> list[str]:
+    """Return the names of a group's options, sorted.
+
+    Raises:
+        BadInput: there is no such group.
+    """
+    if group not in groups():
+        raise BadInput(f"{group}: no such group{nearest(group, groups())}; groups: {', '.join(groups())}")
+    return options(group)

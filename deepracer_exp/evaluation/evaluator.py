@@ -1,0 +1,190 @@
+"""Drives a policy under a race protocol: all trials, tracks and conditions as one batch of cars."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.overrides import override_line
+from deepracer_exp.config.randomization import RandomizationConfig
+from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.courses import Course
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.reward_source import RewardSource
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.trace import PACKED
+from deepracer_exp.tracks.track import Track
+
+from .result import HELD_OUT, USUAL, Evaluation, Group
+from .stewards import Stewards
+
+OnStep = Callable[[Race, Stewards], None]
+
+# Nobody learns from an evaluation; the run's own reward function need not even be there any more.
+_NO_REWARD = RewardSource(
+    name="none",
+    path="none",
+    text="def reward_function(params):\n    return 0.0\n\n\ndef reward_batch(params):\n    return params['x'] * 0.0\n",
+    sha256="",
+    constants={},
+    overrides={},
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Where and how one car drives."""
+
+    course: int
+    """Place in the courses of the race."""
+    condition: str
+    start_ndist: float
+
+
+class Evaluator:
+    """The race of an experiment's car under a protocol, ready to be driven by one policy after another.
+
+    Every policy meets the same trials: what conditions draw depends on `config.seed` and the trial's place alone.
+
+    Attributes:
+        trials: what each row of the batch is.
+        race: the cars.
+    """
+
+    def __init__(self, experiment: Experiment, config: EvaluationConfig, threads: int = 0):
+        """Build tracks and cars.
+
+        Args:
+            experiment: car, action space, observation and rules, and the tracks and conditions the protocol leaves
+                to the run.
+            config: the protocol.
+            threads: physics threads; 0 means one per core.
+
+        Raises:
+            BadInput: a track, a condition or a file is unknown or malformed.
+        """
+        self.config = config
+        courses = _courses(tracks_of(experiment, config))
+        conditions = {USUAL: _conditions("usual", config.usual, experiment)}
+        if config.held_out is not None:
+            conditions[HELD_OUT] = _conditions("held_out", config.held_out, experiment)
+        self.trials = [
+            Trial(course=place, condition=condition, start_ndist=start)
+            for place, course in enumerate(courses)
+            for condition in conditions
+            for start in _starts(config, course.tracks[0].closed, condition)
+        ]
+        setup = RaceSetup(
+            courses=courses,
+            car=experiment.car,
+            actions=build_action_space(experiment.action_space),
+            observation=experiment.observation,
+            randomization=conditions[USUAL],
+            # Time is the stewards' business.
+            episode=replace(experiment.episode, max_steps=0),
+            reward=_NO_REWARD,
+            reward_time_limit_s=experiment.reward.time_limit_s,
+            seed=config.seed,
+        )
+        own = [conditions[trial.condition] for trial in self.trials]
+        self.race = Race(setup, len(self.trials), threads, randomizations=own)
+        self._course = np.array([trial.course for trial in self.trials])
+        self._start_ndist = np.array([trial.start_ndist for trial in self.trials])
+        self._closed = np.array([courses[trial.course].tracks[0].closed for trial in self.trials])
+
+    def __call__(self, policy: torch.nn.Module, on_step: OnStep | None = None) -> Evaluation:
+        """Let the policy drive all trials.
+
+        Args:
+            policy: reads `observation`, writes `action`.
+            on_step: called after every control step.
+
+        Raises:
+            RunFailed: an action or a car's state became NaN or infinite.
+        """
+        race, config = self.race, self.config
+        stewards = Stewards(config, self._closed, race.setup.car.control_period_s)
+        race.seed(config.seed)
+        race.reset(None, self._course, self._start_ndist)
+        how = ExplorationType.RANDOM if config.sample else ExplorationType.DETERMINISTIC
+        # A training that evaluates goes on with its random numbers as if it had not.
+        with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(how):
+            torch.manual_seed(config.seed)
+            while stewards.running.any():
+                seen = TensorDict({"observation": torch.from_numpy(race.observation)}, [race.n_cars])
+                race.step(policy(seen)["action"].numpy())
+                row = race.trace
+                back = stewards.follow(
+                    row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
+                )
+                if on_step is not None:
+                    on_step(race, stewards)
+                if len(back.cars):
+                    race.put_back(back.cars, back.progress)
+        return Evaluation(tuple(self._groups(stewards)))
+
+    def _groups(self, stewards: Stewards) -> list[Group]:
+        names = [course.name for course in self.race.setup.courses]
+        rows: dict[tuple[str, str], list[int]] = {}
+        for row, trial in enumerate(self.trials):
+            rows.setdefault((names[trial.course], trial.condition), []).append(row)
+        return [
+            Group(track, condition, tuple(own), tuple(a for a in stewards.attempts if a.trial in set(own)))
+            for (track, condition), own in rows.items()
+        ]
+
+
+def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, TrackConfig]:
+    """Return the tracks that are driven, by name.
+
+    Raises:
+        BadInput: there is no such track.
+    """
+    if config.tracks is None:
+        return experiment.tracks
+    names = config.tracks if isinstance(config.tracks, str) else list(config.tracks)
+    try:
+        return compose_experiment([override_line("track", names)])[0].tracks
+    except BadInput as error:
+        raise BadInput(f"evaluation.tracks: {error}") from None
+
+
+def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
+    """Build the tracks; one that is driven both ways counts as two."""
+    ways = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}
+    courses = []
+    for name, config in tracks.items():
+        for backwards in ways[config.direction]:
+            track = Track.from_config(config, backwards)
+            label = track.name if config.file is not None and len(tracks) == 1 else name
+            label += " reversed" * (backwards and config.direction == "alternate")
+            courses.append(Course(name=label, weight=1.0, tracks=(track,)))
+    return tuple(courses)
+
+
+def _conditions(key: str, option: str | None, experiment: Experiment) -> RandomizationConfig:
+    if option is None:
+        return experiment.randomization
+    try:
+        return compose_experiment([override_line("randomization", option)])[0].randomization
+    except BadInput as error:
+        raise BadInput(f"evaluation.{key}: {error}") from None
+
+
+def _starts(config: EvaluationConfig, closed: bool, condition: str) -> NDArray[np.float64]:
+    """Return where the laps of each trial begin, (trials,)."""
+    at = np.arange(config.trials)
+    if not closed:
+        return np.zeros(config.trials)
+    if config.starts is not None:
+        return np.array(config.starts)[at % len(config.starts)]
+    return (at + (0.5 if condition == HELD_OUT else 0.0)) / config.trials

@@ -1,0 +1,197 @@
+"""What an evaluation found: the laps tried on each track and each condition, and what they come to."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import bootstrap
+
+from .stewards import Attempt
+
+Metric = Literal["progress", "lap_time", "race_score"]
+Rank = tuple[float, float]
+"""Compared in order, higher is better."""
+Interval = tuple[float, float]
+
+USUAL, HELD_OUT = "usual", "held_out"
+"""Names of the conditions."""
+CONFIDENCE = 0.95
+_RESAMPLES = 9999
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Trials that belong together: those on one track and condition, or several such groups in one.
+
+    A lap that the end of the race cut off says nothing about the driver, so that it is left out, unless a trial has
+    no other.
+    """
+
+    track: str
+    condition: str
+    trials: tuple[int, ...]
+    """Their rows in the batch."""
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def decided(self) -> list[Attempt]:
+        """Return the laps that count."""
+        has = {attempt.trial for attempt in self.attempts if not attempt.cut_off}
+        return [a for a in self.attempts if not a.cut_off or a.trial not in has]
+
+    @property
+    def lap_times_s(self) -> NDArray[np.float64]:
+        """Return the times of the complete laps, penalties included."""
+        return np.array([attempt.time_s for attempt in self.attempts if attempt.complete])
+
+    @property
+    def completion(self) -> float:
+        """Return the share of the lap driven per lap tried, per cent, mean."""
+        return float(np.mean([attempt.progress for attempt in self.decided]))
+
+    @property
+    def mean_lap_time_s(self) -> float | None:
+        """Return the mean time of the complete laps, None without one."""
+        times = self.lap_times_s
+        return float(times.mean()) if len(times) else None
+
+    @property
+    def race_score_s(self) -> float | None:
+        """Return the seconds per complete lap, penalties and failed laps included; None without a complete lap."""
+        laps = len(self.lap_times_s)
+        return sum(attempt.time_s for attempt in self.decided) / laps if laps else None
+
+    def rank(self, metric: Metric) -> Rank:
+        """Return how good the policy is; without a complete lap times fall back to the progress."""
+        if metric == "progress":
+            mean = self.mean_lap_time_s
+            return self.completion, -math.inf if mean is None else -mean
+        score = self.mean_lap_time_s if metric == "lap_time" else self.race_score_s
+        return (0.0, self.completion) if score is None else (1.0, -score)
+
+    def statistics(self) -> dict[str, Any]:
+        """Return means and what else is reported, each mean with its bootstrap interval; JSON types.
+
+        Trials are drawn anew, not laps: the laps of a trial are no independent findings.
+        """
+        times = self.lap_times_s
+        decided = self.decided
+        count = self._per_trial(decided, lambda _: 1.0)
+        complete = self._per_trial(decided, lambda a: float(a.complete))
+        one = np.ones(len(self.trials))
+        return {
+            "trials": len(self.trials),
+            "laps_tried": len(decided),
+            "laps": len(times),
+            "completion": _mean(self._per_trial(decided, lambda a: a.progress), count),
+            "lap_share": _mean(complete, count),
+            "lap_time_s": {
+                **_mean(self._per_trial(decided, lambda a: a.time_s * a.complete), complete),
+                "median": _or_none(np.median, times),
+                "best": _or_none(np.min, times),
+                "std": _or_none(np.std, times),
+            },
+            "resets": _mean(self._per_trial(self.attempts, lambda a: float(a.resets)), one),
+            "penalty_s": _mean(self._per_trial(self.attempts, lambda a: a.penalty_s), one),
+            "race_score_s": self.race_score_s,
+        }
+
+    def _per_trial(self, attempts: Sequence[Attempt], value: Any) -> NDArray[np.float64]:
+        place = {trial: at for at, trial in enumerate(self.trials)}
+        sums = np.zeros(len(self.trials))
+        for attempt in attempts:
+            sums[place[attempt.trial]] += value(attempt)
+        return sums
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What one policy did."""
+
+    groups: tuple[Group, ...]
+    """One for each track and condition, track by track."""
+
+    @property
+    def tracks(self) -> list[str]:
+        """Return the names of the tracks."""
+        return list(dict.fromkeys(group.track for group in self.groups))
+
+    @property
+    def conditions(self) -> list[str]:
+        """Return the names of the conditions."""
+        return list(dict.fromkeys(group.condition for group in self.groups))
+
+    def on(self, condition: str) -> Group:
+        """Return the trials of a condition on all tracks."""
+        groups = [group for group in self.groups if group.condition == condition]
+        return Group(
+            "all tracks",
+            condition,
+            tuple(trial for group in groups for trial in group.trials),
+            tuple(attempt for group in groups for attempt in group.attempts),
+        )
+
+    def rank(self, metric: Metric) -> Rank:
+        """Return how good the policy is on the usual conditions.
+
+        On several tracks times are means over tracks, and one more track with a complete lap is worth more than any
+        time: lap times of tracks of different lengths could not be compared otherwise.
+        """
+        ranks = [group.rank(metric) for group in self.groups if group.condition == USUAL]
+        if metric == "progress":
+            first, second = np.mean(ranks, axis=0)
+            return float(first), float(second)
+        timed = [value for finished, value in ranks if finished]
+        return len(timed) / len(ranks), float(np.mean(timed or [value for _, value in ranks]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything, JSON types."""
+        return {
+            "groups": [
+                {
+                    "track": group.track,
+                    "condition": group.condition,
+                    **group.statistics(),
+                    "attempts": [asdict(attempt) for attempt in group.attempts],
+                }
+                for group in self.groups
+            ]
+        }
+
+
+def _mean(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the mean over all trials' values, and its interval if there are two trials that have any.
+
+    Args:
+        sums: of each trial's values, (n,).
+        counts: how many values these are, (n,).
+    """
+    has = counts > 0
+    sums, counts = sums[has], counts[has]
+    if not len(sums):
+        return {"mean": None, "interval": None}
+    return {"mean": float(sums.sum() / counts.sum()), "interval": _interval(sums, counts)}
+
+
+def _interval(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> Interval | None:
+    if len(sums) < 2:
+        return None
+    found = bootstrap(
+        (sums, counts),
+        lambda s, c, axis: s.sum(axis=axis) / c.sum(axis=axis),
+        paired=True,
+        vectorized=True,
+        n_resamples=_RESAMPLES,
+        confidence_level=CONFIDENCE,
+        # The corrected methods have no answer where all trials are alike.
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def _or_none(what: Any, values: NDArray[np.float64]) -> float | None:
+    return float(what(values)) if len(values) else None

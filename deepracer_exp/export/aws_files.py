@@ -1,0 +1,135 @@
+"""What AWS's console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from deepracer_exp.config.custom_files import TAKEN
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
+from deepracer_exp.formats.model_metadata import (
+    NEURAL_NETWORKS,
+    Action,
+    LidarConfig,
+    ModelMetadata,
+    model_metadata_text,
+)
+
+CONSOLE_ACTIONS = (2, 30)
+CONSOLE_STEERING_DEG = (-30.0, 30.0)
+CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
+_VERSION = 5  # what deepracer-for-cloud writes: the newest physics
+
+
+@dataclass(frozen=True)
+class AwsFiles:
+    """The files by their names, and what a racer should know of them."""
+
+    texts: dict[str, str]
+    notes: tuple[str, ...]
+    """What had to be changed, and what the console would refuse; a line each."""
+
+
+def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> AwsFiles:
+    """Put the files together.
+
+    Values that the console takes no higher or lower are brought into its range. The action space stays as it is, since
+    another one makes another car.
+
+    Args:
+        experiment: what was trained.
+        actions: its action space.
+        reward: text of the reward function, its constants in place.
+    """
+    metadata = _metadata(actions)
+    learning, changed = _hyperparameters(experiment)
+    return AwsFiles(
+        {
+            "reward_function.py": reward,
+            "model_metadata.json": model_metadata_text(metadata),
+            "hyperparameters.json": hyperparameters_text(learning),
+        },
+        (*_action_notes(metadata), *changed),
+    )
+
+
+def write_aws_files(files: AwsFiles, folder: Path) -> None:
+    """Write the files into a folder, over those of the same names.
+
+    Raises:
+        BadInput: the folder cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise BadInput(
+            f"{error.filename}: cannot be written: {error.strerror}; give another folder by -o"
+        ) from error
+
+
+def _metadata(actions: ActionSpace) -> ModelMetadata:
+    discrete = isinstance(actions, DiscreteActions)
+    listed: tuple[Action, ...] = ()
+    if isinstance(actions, DiscreteActions):
+        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
+        listed = tuple(Action(steering_deg, speed_mps) for steering_deg, speed_mps in pairs)
+    return ModelMetadata(
+        action_space_type="discrete" if discrete else "continuous",
+        actions=listed,
+        low=None if discrete else Action(*actions.low.tolist()),
+        high=None if discrete else Action(*actions.high.tolist()),
+        sensor=("FRONT_FACING_CAMERA",),
+        neural_network=NEURAL_NETWORKS[0],
+        version=_VERSION,
+        training_algorithm="clipped_ppo",
+        lidar_config=LidarConfig(),
+        given=(),
+        renumbered=False,
+    )
+
+
+def _action_notes(metadata: ModelMetadata) -> list[str]:
+    ends = (*metadata.actions, *(end for end in (metadata.low, metadata.high) if end is not None))
+    notes = []
+    fewest, most = CONSOLE_ACTIONS
+    if metadata.actions and not fewest <= len(metadata.actions) <= most:
+        notes.append(
+            f"model_metadata.json: {len(metadata.actions)} actions; the AWS console takes {fewest} to {most}"
+        )
+    for name, values, (low, high) in (
+        ("steering_angle", [end.steering_deg for end in ends], CONSOLE_STEERING_DEG),
+        ("speed", [end.speed_mps for end in ends], CONSOLE_SPEED_MPS[metadata.action_space_type]),
+    ):
+        if min(values) < low or max(values) > high:
+            notes.append(
+                f"model_metadata.json: {name} from {min(values):g} to {max(values):g}; the AWS console takes "
+                f"{low:g} to {high:g}"
+            )
+    return notes
+
+
+def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]]:
+    own = {}
+    for key, target in TAKEN.items():
+        group, name = target.split(".")
+        own[key] = getattr(getattr(experiment, group), name)
+    notes = []
+    learning = Hyperparameters()
+    if own["num_episodes_between_training"] is None:
+        notes.append(
+            f"hyperparameters.json: num_episodes_between_training={learning.num_episodes_between_training}, the "
+            f"service's own; {experiment.algorithm.frames_per_iteration} control steps decide here"
+        )
+    learning = replace(learning, **{key: value for key, value in own.items() if value is not None})
+    for key in learning.beyond_console():
+        value = getattr(learning, key)
+        low, high = CONSOLE_RANGES[key]
+        nearest = min(max(value, low), high)
+        if key == "batch_size":
+            nearest = 1 << (nearest.bit_length() - 1)  # a power of two
+        learning = replace(learning, **{key: nearest})
+        notes.append(f"hyperparameters.json: {key}={nearest}, as near to {value:g} as the AWS console takes")
+    return learning, notes

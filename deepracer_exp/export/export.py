@@ -1,0 +1,80 @@
+"""The command that takes a trained policy, or what it was trained with, to other programs."""
+
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from deepracer_exp.config.export import ExportConfig
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.run import StoredRun, read_run
+from deepracer_exp.validation.console import console_findings
+
+from .aws_files import aws_files, write_aws_files
+from .onnx_file import DeployedPolicy, write_onnx
+
+
+def export(config: ExportConfig, output: str | None, out: Console) -> Path:
+    """Write what is asked for and tell what was written.
+
+    Args:
+        config: validated.
+        output: file or folder to write; None: in the run's folder, under `export/`.
+        out: for the report.
+
+    Raises:
+        BadInput: the run, the checkpoint or the output cannot be used, or a package is missing.
+        RunFailed: the ONNX file computes something else than the network.
+    """
+    run = read_run(config.run, Path(config.runs_dir), config.tracking_uri)
+    if config.format == "onnx":
+        return _onnx(run, config.checkpoint, Path(output or run.path / "export" / "policy.onnx"), out)
+    return _aws(run, Path(output or run.path / "export" / "aws"), out)
+
+
+def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
+    if path.is_dir():
+        raise BadInput(f"--output {path}: is a folder; a file is wanted, e.g. {path / 'policy.onnx'}")
+    stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
+    actions = build_action_space(run.experiment.action_space)
+    torch.set_num_threads(1)
+    facts = {
+        "run": run.path.name,
+        "checkpoint": stored.path.name,
+        "control_period_s": run.experiment.car.control_period_s,
+    }
+    features = tuple(feature_names(run.experiment.observation))
+    comparison = write_onnx(DeployedPolicy(stored.networks, actions), features, facts, path)
+    out.print(f"{path}", soft_wrap=True)
+    out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
+    out.print(f"  observation  {len(features)} features, named in the file's metadata")
+    what = f"probabilities of {actions.n} actions" if actions.n else "mean steering and speed, -1 to 1"
+    out.print(f"  policy       {what}")
+    out.print("  command      steering in degrees, positive to the left; speed in m/s")
+    out.print(
+        f"  checked      largest difference to the network {comparison.largest_difference:.1e} "
+        f"on {comparison.observations:,} observations"
+    )
+    return path
+
+
+def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
+    source = run.path / "reward_function.py"
+    try:
+        reward = source.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(
+            f"{source}: cannot be read: {error}; this is the reward the run was trained with"
+        ) from error
+    files = aws_files(run.experiment, build_action_space(run.experiment.action_space), reward)
+    write_aws_files(files, folder)
+    for name in files.texts:
+        out.print(f"{folder / name}", soft_wrap=True)
+    for note in files.notes:
+        out.print(f"  {note}", soft_wrap=True)
+    for finding in console_findings(reward):
+        out.print(f"  reward_function.py: the AWS console would refuse it: {finding}", soft_wrap=True)
+    return folder

@@ -1,0 +1,106 @@
+"""A small JSON file written by people: read whole, its values checked, every complaint one line."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput, nearest
+
+MAX_BYTES = 2**20
+"""No settings file of DeepRacer comes near this; a larger one is another file."""
+
+
+class JsonObject:
+    """The object in one JSON file; of a key that is there twice the last one counts, as in the service."""
+
+    def __init__(self, path: str | Path, kind: str, accepted: str) -> None:
+        """Read the file.
+
+        Args:
+            path: the file.
+            kind: what it should be, e.g. ``a model_metadata.json``.
+            accepted: what its JSON should hold, e.g. ``a JSON object with action_space``.
+
+        Raises:
+            BadInput: it cannot be read, is no plain file, too large, not JSON, or holds something else.
+        """
+        self.path = Path(path)
+        text = self._text(kind)
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            reason = " ".join(str(error).split())
+            raise BadInput(f"{self.path}: not JSON ({reason}); accepted: {kind}") from error
+        if not isinstance(data, dict):
+            raise BadInput(f"{self.path}: holds a {type(data).__name__}; accepted: {accepted}")
+        self.data: Mapping[str, Any] = data
+
+    def bad(self, key: str, value: object, accepted: str) -> BadInput:
+        """Return the complaint about one value; None stands for a missing one."""
+        shown = "missing" if value is None else json.dumps(value, ensure_ascii=False, default=repr)
+        shown = shown if len(shown) <= 80 else shown[:79] + "…"
+        return BadInput(f"{self.path}: {key}: {shown}; accepted: {accepted}")
+
+    def choice(self, key: str, value: object, known: Sequence[str], lower: bool = True) -> str:
+        """Return the word that `value` is, stripped and by default lower-cased, as the service does.
+
+        Raises:
+            BadInput: it is none of `known`.
+        """
+        accepted = ", ".join(known)
+        if not isinstance(value, str):
+            raise self.bad(key, value, accepted)
+        word = value.strip().lower() if lower else value.strip()
+        if word not in known:
+            raise self.bad(key, value, accepted + nearest(word, known))
+        return word
+
+    def number(self, key: str, value: object, low: float, high: float, unit: str = "") -> float:
+        """Return a number, which may be written as a string.
+
+        Raises:
+            BadInput: it is none, or not from `low` to `high`.
+        """
+        accepted = f"a number from {low:g} to {high:g}{unit}"
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            raise self.bad(key, value, accepted)
+        try:
+            number = float(value)
+        except (ValueError, OverflowError) as error:
+            raise self.bad(key, value, accepted) from error
+        if not math.isfinite(number) or not low <= number <= high:
+            raise self.bad(key, value, accepted)
+        return number
+
+    def whole(self, key: str, value: object, low: int, high: int) -> int:
+        """Return a whole number, which may be written as a string.
+
+        Raises:
+            BadInput: it is none, or not from `low` to `high`.
+        """
+        number = self.number(key, value, low, high)
+        if number != int(number):
+            raise self.bad(key, value, f"a whole number from {low} to {high}")
+        return int(number)
+
+    def _text(self, kind: str) -> str:
+        try:
+            # A pipe or a device would never end, or never begin.
+            if self.path.exists() and not self.path.is_file():
+                raise BadInput(f"{self.path}: is no file; accepted: {kind}")
+            with self.path.open("rb") as file:
+                raw = file.read(MAX_BYTES + 1)
+        except (OSError, ValueError) as error:  # ValueError: a null character in the path
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise BadInput(f"{self.path}: cannot be read ({reason}); accepted: {kind}") from error
+        if len(raw) > MAX_BYTES:
+            raise BadInput(f"{self.path}: is larger than {MAX_BYTES // 2**20} MiB; accepted: {kind}")
+        try:
+            # Editors on Windows put a byte order mark before the JSON.
+            return raw.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise BadInput(
+                f"{self.path}: not JSON (byte {error.start} is no UTF-8); accepted: {kind}"
+            ) from error

@@ -1,0 +1,120 @@
+"""Recorded drives cut into windows; a model has to predict where the car goes in each."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ids = NDArray[np.intp]
+
+WARM_UP_STEPS = 15
+"""Recorded steps before a window, from which a model learns how the car moves: 1 s at 15 Hz."""
+_FIRST_MOVING_ROW = 1
+"""Row 0 of an episode is the prepare step: the car stands until the action of row 1 is sent."""
+_JUMP_M = 0.5
+"""Neighbouring rows are further apart than this only where the car was put elsewhere: 7.5 m/s."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """M windows of `steps` control steps, each after up to `WARM_UP_STEPS` steps of warm-up.
+
+    The pose of row t was read just after the action of row t was sent: action t moves the car from pose t to t + 1.
+    """
+
+    pose: Floats
+    """Chassis origin x_m, y_m and heading yaw_rad, (M, WARM_UP_STEPS + 1 + steps, 3)."""
+    action: Floats
+    """Commanded speed_mps and steering_rad, (M, WARM_UP_STEPS + steps, 2)."""
+    first: Ids
+    """The row from which on a window is recorded; the rows before it repeat it, (M,)."""
+    standing: NDArray[np.bool_]
+    """True where the car has just been put down at the start of the window, (M,). Its warm-up is the end of the
+    episode before: putting the car down does not turn its wheels straight."""
+    iteration: NDArray[np.int64]
+    """The iteration that a window is from, (M,)."""
+
+    @property
+    def steps(self) -> int:
+        """Control steps to predict."""
+        return self.action.shape[1] - WARM_UP_STEPS
+
+    @property
+    def start(self) -> Floats:
+        """Poses at the starts of the windows, (M, 3)."""
+        return self.pose[:, WARM_UP_STEPS]
+
+    @property
+    def truth(self) -> Floats:
+        """Poses after each step to predict, (M, steps, 3)."""
+        return self.pose[:, WARM_UP_STEPS + 1 :]
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def choose(self, chosen: Ids | NDArray[np.bool_]) -> "Windows":
+        """Return some of the windows, by numbers or by a mask."""
+        return Windows(
+            self.pose[chosen],
+            self.action[chosen],
+            self.first[chosen],
+            self.standing[chosen],
+            self.iteration[chosen],
+        )
+
+
+def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Windows:
+    """Cut every episode into windows of `steps` that begin every 15 rows, the first where the car begins to move.
+
+    Args:
+        recorded: rows of `formats.recorded.read_recorded`.
+        front_point_m: how far the recorded point is ahead of the chassis origin.
+        steps: control steps to predict.
+
+    Returns:
+        The windows in the order of the recording, without those during which the car was paused or put elsewhere.
+    """
+    yaw = np.deg2rad(recorded["yaw"].to_numpy(np.float64))
+    x = recorded["X"].to_numpy(np.float64) - front_point_m * np.cos(yaw)
+    y = recorded["Y"].to_numpy(np.float64) - front_point_m * np.sin(yaw)
+    speed = recorded["throttle"].to_numpy(np.float64)
+    steering = np.deg2rad(recorded["steer"].to_numpy(np.float64))
+    # From row t to t + 1 the car was not free: it was paused, or put elsewhere.
+    broken = np.hypot(np.diff(x), np.diff(y)) > _JUMP_M
+    broken |= (recorded["episode_status"] == "pause").to_numpy()[1:]
+    rows: list[Ids] = []
+    first: list[int] = []
+    standing: list[bool] = []
+    end_of_last, last_folder = np.zeros(0, np.intp), None
+    for (file, _, _), places in recorded.groupby(
+        ["file", "iteration", "episode"], sort=False
+    ).indices.items():
+        folder = Path(file).parent
+        for at in range(_FIRST_MOVING_ROW, len(places) - steps, WARM_UP_STEPS):
+            ahead = places[at : at + steps + 1]
+            if broken[ahead[:-1]].any():
+                continue
+            stands = at == _FIRST_MOVING_ROW
+            if stands:
+                before = end_of_last if folder == last_folder else end_of_last[:0]
+            else:
+                before = places[max(_FIRST_MOVING_ROW, at - WARM_UP_STEPS) : at]
+                before = before[int(np.max(np.flatnonzero(broken[before]) + 1, initial=0)) :]
+            missing = WARM_UP_STEPS - len(before)
+            known = np.concatenate([before, ahead])
+            rows.append(np.concatenate([np.full(missing, known[0]), known]))
+            first.append(missing)
+            standing.append(stands)
+        end_of_last, last_folder = places[-WARM_UP_STEPS:], folder
+    at_rows = np.array(rows, np.intp).reshape(len(rows), WARM_UP_STEPS + 1 + steps)
+    turned = np.unwrap(yaw[at_rows], axis=1)
+    return Windows(
+        pose=np.stack([x[at_rows], y[at_rows], turned], axis=-1),
+        action=np.stack([speed, steering], axis=-1)[at_rows[:, :-1]],
+        first=np.array(first, np.intp),
+        standing=np.array(standing, bool),
+        iteration=recorded["iteration"].to_numpy(np.int64)[at_rows[:, -1]],
+    )

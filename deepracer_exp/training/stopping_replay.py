@@ -1,0 +1,169 @@
+"""Where a stopping rule would have ended runs that went on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydantic import TypeAdapter, ValidationError
+from rich.table import Table
+
+from deepracer_exp.config.driving import ActionSpaceConfig
+from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.run_files import RunRecord
+
+from .stopping import Decision, Row, Stopping
+
+NOTHING = "\N{EN DASH}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A run and what a stopping rule would have made of it."""
+
+    run: str
+    rule: str
+    """The rule that was applied, in its overrides' words."""
+    decision: Decision | None
+    """None: it would not have stopped the run."""
+    iteration: int
+    """The iteration after which the run would have ended; its last one without a decision."""
+    iterations: int
+    """Of the whole run."""
+    env_steps: int
+    saved_steps: int
+    saved_s: float
+    completion: float | None
+    """Mean per cent of the lap over the last ten iterations before the end."""
+    completion_whole: float | None
+    lap_time_s: float | None
+    """Fastest lap up to the end: of the evaluations where the run has them, otherwise of the training. With several
+    tracks the mean of theirs, None while one has none."""
+    lap_time_whole_s: float | None
+
+    @property
+    def saved(self) -> float:
+        """Share of the run's steps that would have been saved."""
+        return self.saved_steps / (self.env_steps + self.saved_steps)
+
+    @property
+    def lap_loss(self) -> float | None:
+        """How much slower the fastest lap would have been, as a share of the whole run's."""
+        if self.lap_time_s is None or self.lap_time_whole_s is None:
+            return None
+        return self.lap_time_s / self.lap_time_whole_s - 1
+
+
+def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
+    """Apply a stopping rule to the metrics of a run.
+
+    Raises:
+        BadInput: the run has no iteration, or its files lack what the rule looks at.
+    """
+    rows = record.rows
+    if not rows:
+        raise BadInput(f"{record.path / 'metrics.jsonl'}: has no iteration; nothing to apply a rule to")
+    if isinstance(config, ReliableStopping):
+        _check_memory(record, config)
+    stopping = Stopping(config, _action_count(record))
+    decision, count = None, len(rows)
+    for number, row in enumerate(rows, 1):
+        decision = _observed(stopping, row, record, number)
+        if decision is not None:
+            count = number
+            break
+    last, end = rows[-1], rows[count - 1]
+    return Replay(
+        run=record.name,
+        rule=rule,
+        decision=decision,
+        iteration=end["iteration"],
+        iterations=last["iteration"],
+        env_steps=end["env_steps"],
+        saved_steps=last["env_steps"] - end["env_steps"],
+        saved_s=last["wall_clock_s"] - end["wall_clock_s"],
+        completion=_ended_with(rows[:count]),
+        completion_whole=_ended_with(rows),
+        lap_time_s=_fastest(rows[:count], rows),
+        lap_time_whole_s=_fastest(rows, rows),
+    )
+
+
+def table(replays: Sequence[Replay]) -> Table:
+    """Return the replays as a table, a line a run and rule, and for several runs the means of each rule."""
+    grid = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("run", "rule"):
+        grid.add_column(name, overflow="fold")
+    for name in ("ends after", "steps", "saved", "completion", "best lap", "lap lost"):
+        grid.add_column(name, justify="right", no_wrap=True)
+    for one in replays:
+        grid.add_row(
+            one.run,
+            f"{one.rule}\n{one.decision or 'goes on to the end'}",
+            f"{one.iteration} of {one.iterations}",
+            f"{one.env_steps:,}",
+            f"{one.saved:.0%}, {one.saved_s:.0f} s" if one.decision else NOTHING,
+            _of(one.completion, one.completion_whole, "{:.1f}", "%"),
+            _of(one.lap_time_s, one.lap_time_whole_s, "{:.2f}", "s"),
+            NOTHING if one.lap_loss is None else f"{one.lap_loss:.1%}",
+        )
+    for rule in dict.fromkeys(one.rule for one in replays):
+        of_rule = [one for one in replays if one.rule == rule]
+        losses = [one.lap_loss for one in of_rule if one.lap_loss is not None]
+        if len(of_rule) > 1:
+            saved = f"{sum(one.saved for one in of_rule) / len(of_rule):.0%}"
+            lost = f"{sum(losses) / len(losses):.1%}" if losses else NOTHING
+            grid.add_row("mean", rule, "", "", saved, "", "", lost)
+    return grid
+
+
+def _of(value: float | None, whole: float | None, number: str, unit: str) -> str:
+    if whole is None:
+        return NOTHING
+    return f"{NOTHING if value is None else number.format(value)} of {number.format(whole)} {unit}"
+
+
+def _observed(stopping: Stopping, row: Row, record: RunRecord, number: int) -> Decision | None:
+    try:
+        return stopping.observe(row)
+    except KeyError as error:
+        raise BadInput(
+            f"{record.path / 'metrics.jsonl'} line {number}: has no {error.args[0]}; this is no row of a training"
+        ) from error
+
+
+def _check_memory(record: RunRecord, config: ReliableStopping) -> None:
+    """Refuse a number of episodes that the run's lap_share was not taken of."""
+    own = record.config.get("stopping", {}).get("episodes", 50)
+    if own != config.episodes:
+        raise BadInput(
+            f"stopping.episodes={config.episodes}: {record.name} recorded the share of its last {own} episodes; "
+            f"accepted: {own}"
+        )
+
+
+def _action_count(record: RunRecord) -> int | None:
+    try:
+        adapter: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
+        space = adapter.validate_python(record.config.get("action_space"))
+    except ValidationError as error:
+        raise BadInput(
+            f"{record.path / 'config.yaml'}: action_space: {error.errors()[0]['msg'].lower()}"
+        ) from error
+    return build_action_space(space).n
+
+
+def _ended_with(rows: Sequence[Row]) -> float | None:
+    """Return the mean completion of the last ten iterations: single ones wobble."""
+    known = [row["completion"] for row in rows[-10:] if row["completion"] is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _fastest(rows: Sequence[Row], every: Sequence[Row]) -> float | None:
+    """Return the fastest lap in `rows`; `every` row of the run tells which columns have lap times."""
+    if any(row.get("eval_lap_time_s") is not None for row in every):
+        columns = ["eval_lap_time_s"]
+    else:
+        columns = [key for key in every[-1] if key.startswith("best_lap_time_s/")] or ["best_lap_time_s"]
+    known = [[row[key] for row in rows if row.get(key) is not None] for key in columns]
+    return sum(map(min, known)) / len(known) if all(known) else None

@@ -1,0 +1,239 @@
+"""The picture that shows what a reward function pays for."""
+
+from pathlib import Path
+
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, TwoSlopeNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+from matplotlib.patheffects import withStroke
+
+from deepracer_exp.env.action_space import DiscreteActions
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import BadInput
+
+from .scenes import middle_speed_mps
+from .survey import Memory, Survey, Surveyor
+
+INK, FAINT, GROUND = "#22262b", "#7b828c", "#ffffff"
+PAY = LinearSegmentedColormap.from_list("pay", ["#1f2a44", "#2f5d8c", "#37a08f", "#a8cf5a", "#fff3a3"])
+"""Little to much, where nothing is taken away."""
+TAKE_AND_PAY = LinearSegmentedColormap.from_list(
+    "take_and_pay", ["#7a1f3d", "#c2455b", "#f0a58f", "#f4f1ec", "#9fd3b4", "#2f9273", "#0f4a4a"]
+)
+"""Taken away, nothing, paid."""
+_BESIDE_M = 0.3
+"""How much of the ground beside the road is shown."""
+_DOTS_PER_INCH = 130
+_PIXELS = 16_000
+"""Points of the track that are asked about at detail 1."""
+
+
+def draw_reward_map(
+    setup: RaceSetup, surveyor: Surveyor, of: Survey, memory: Memory, detail: float, path: Path
+) -> None:
+    """Write the picture: the track coloured by the pay for driving along it, and four cuts through what is paid.
+
+    Args:
+        setup: the experiment's race.
+        surveyor: asks about the points of the track.
+        of: what was asked already.
+        memory: whether a reward depends on more than the params.
+        detail: 1, or less for functions that take long.
+        path: its ending chooses the format.
+
+    Raises:
+        BadInput: the picture cannot be written.
+    """
+    track = setup.track
+    low, high = (getattr(np.concatenate([track.inner, track.outer]), f)(axis=0) for f in ("min", "max"))
+    low, high = low - _BESIDE_M - 0.1, high + _BESIDE_M + 0.1
+    pixels, extent = _track_pixels(setup, surveyor, low, high, detail)
+    colors, norm, extend = _scale(of, pixels)
+
+    width_in, foot_in, head_in = 12.0, 3.9, 1.0
+    map_in = float(np.clip(10.6 * (high - low)[1] / (high - low)[0], 2.6, 7.2))
+    height_in = head_in + map_in + foot_in
+    figure = Figure(figsize=(width_in, height_in), dpi=_DOTS_PER_INCH, facecolor=GROUND)
+    FigureCanvasAgg(figure)
+    main = figure.add_axes((0.03, foot_in / height_in, 0.87, map_in / height_in))
+    main.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    main.set_axis_off()
+    image = main.imshow(
+        pixels, extent=extent, origin="lower", cmap=colors, norm=norm, interpolation="bilinear", zorder=1
+    )
+    image.set_clip_path(PathPatch(_outline(track.road.buffer(_BESIDE_M)), transform=main.transData))
+    _draw_course(main, setup)
+
+    bar = figure.colorbar(
+        ScalarMappable(norm, colors),
+        cax=figure.add_axes((0.925, (foot_in + 0.12 * map_in) / height_in, 0.014, 0.7 * map_in / height_in)),
+        extend=extend,
+    )
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(length=0, labelcolor=INK, labelsize=10)
+    bar.ax.set_title("reward\na step", fontsize=10, color=FAINT, loc="left", pad=10)
+
+    _draw_cuts(figure, setup, of, colors, norm, foot_in / height_in)
+    top = 1 - 0.42 / height_in
+    figure.text(0.035, top, setup.reward.name, fontsize=20, fontweight="bold", color=INK, va="center")
+    speed = f"{middle_speed_mps(setup):.1f} m/s"
+    lines = [
+        f"What it pays on {track.title}: the map for driving along the road at {speed}, steering straight"
+    ]
+    if memory == "earlier calls":
+        lines.append("It remembers earlier calls: each point follows one step of driving there")
+    elif memory == "chance":
+        lines.append("It pays by chance, too: this picture is one of many")
+    for k, line in enumerate(lines):
+        down_in = 0.34 + 0.24 * k
+        figure.text(0.035, top - down_in / height_in, line, fontsize=11, color=FAINT, va="center")
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise BadInput(f"--output {path}: cannot be written: {error}") from error
+
+
+def _track_pixels(
+    setup: RaceSetup, surveyor: Surveyor, low: np.ndarray, high: np.ndarray, detail: float
+) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """Return the pay at a grid of points on and beside the road, NaN elsewhere, and the grid's extent in metres."""
+    track = setup.track
+    area_m2 = float(track.road.buffer(_BESIDE_M).area)
+    cell_m = float(np.sqrt(area_m2 / (_PIXELS * detail**2)))
+    x = np.arange(low[0], high[0], cell_m) + cell_m / 2
+    y = np.arange(low[1], high[1], cell_m) + cell_m / 2
+    grid_x, grid_y = np.meshgrid(x, y)
+    near = shapely.contains_xy(track.road.buffer(_BESIDE_M + 1.5 * cell_m), grid_x, grid_y)
+    place = track.project(np.column_stack([grid_x[near], grid_y[near]]))
+    pixels = np.full(grid_x.shape, np.nan)
+    pixels[near], _ = surveyor.ask(place.ndist, place.offset_m, 0.0, middle_speed_mps(setup))
+    half_m = cell_m / 2
+    return pixels, (x[0] - half_m, x[-1] + half_m, y[0] - half_m, y[-1] + half_m)
+
+
+def _scale(of: Survey, pixels: np.ndarray) -> tuple[Colormap, Normalize, str]:
+    """Choose colours for what is paid on the road; what is beyond, such as a penalty for leaving it, is cut off."""
+    everything = np.concatenate([of.reward.ravel(), of.by_command.ravel(), pixels.ravel()])
+    everything = everything[np.isfinite(everything)]
+    on_road = np.concatenate([of.reward[~of.off_track], of.by_command.ravel()])
+    on_road = on_road[np.isfinite(on_road)]
+    if not len(on_road):
+        on_road = everything if len(everything) else np.zeros(1)
+    low, high = float(on_road.min()), float(on_road.max())
+    if high - low < 1e-9 * max(1.0, abs(high)):
+        low, high = low - 0.5, high + 0.5
+    if not len(everything):
+        everything = on_road
+    below, above = bool(everything.min() < low - 1e-9), bool(everything.max() > high + 1e-9)
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
+    if low < 0 < high and -low > 0.05 * high:
+        return TAKE_AND_PAY, TwoSlopeNorm(0.0, low, high), extend
+    return PAY, Normalize(low, high), extend
+
+
+def _outline(area: shapely.Geometry) -> Outline:
+    """Return an area's rings as one path; rings run in opposite directions, so holes stay empty."""
+    polygons = [
+        shapely.orient_polygons(part) for part in shapely.get_parts(area) if part.geom_type == "Polygon"
+    ]
+    rings = [shapely.get_coordinates(ring) for polygon in polygons for ring in shapely.get_rings(polygon)]
+    return Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
+
+
+def _draw_course(axes: Axes, setup: RaceSetup) -> None:
+    track = setup.track
+    for border in (track.inner, track.outer):
+        axes.plot(*border.T, color=GROUND, linewidth=3.6, solid_joinstyle="round", zorder=2)
+        axes.plot(*border.T, color=INK, linewidth=1.4, solid_joinstyle="round", zorder=3)
+    axes.plot(*track.waypoints.T, color=INK, linewidth=0.8, dashes=(6, 6), alpha=0.6, zorder=3)
+    halo = [withStroke(linewidth=5.5, foreground=GROUND)]
+    axes.plot(
+        *np.stack([track.inner[0], track.outer[0]]).T, color=INK, linewidth=3.0, zorder=4, path_effects=halo
+    )
+    # An arrow ahead of the start line shows which way round.
+    pose = track.start_pose(np.array([0.35, 0.9]) / track.length_m)
+    arrow = axes.annotate(
+        "",
+        (float(pose.x[1]), float(pose.y[1])),
+        (float(pose.x[0]), float(pose.y[0])),
+        arrowprops={"arrowstyle": "-|>,head_width=0.35,head_length=0.7", "color": INK, "linewidth": 2.2},
+        zorder=5,
+    )
+    if arrow.arrow_patch is not None:
+        arrow.arrow_patch.set_path_effects([*halo])
+
+
+def _draw_cuts(
+    figure: Figure, setup: RaceSetup, of: Survey, colors: Colormap, norm: Normalize, top: float
+) -> None:
+    half_m = setup.track.width_m / 2
+    bottom, height = 0.17 * top, 0.62 * top
+    left, width, gap = 0.062, 0.19, 0.022
+    for k, name in enumerate(("slow", "middle", "fast")):
+        axes = figure.add_axes((left + k * (width + gap), bottom, width, height))
+        _draw_cut(
+            axes,
+            np.nanmean(of.reward[k], axis=0) if np.isfinite(of.reward[k]).any() else of.reward[k][0],
+            (of.offsets_m, np.degrees(of.headings_rad)),
+            colors,
+            norm,
+        )
+        # Left of the road is on the left.
+        axes.set_xlim(*axes.get_xlim()[::-1])
+        for border in (-half_m, half_m):
+            axes.axvline(border, color=GROUND, linewidth=2.6)
+            axes.axvline(border, color=INK, linewidth=1.2)
+        axes.axhline(0.0, color=INK, linewidth=0.8, dashes=(6, 6), alpha=0.5)
+        axes.set_title(f"{name}, {of.speeds_mps[k]:.1f} m/s", fontsize=11, color=INK, loc="left")
+        axes.xaxis.set_major_formatter(lambda x, _: f"{abs(x):.1f}")
+        if k == 1:
+            axes.set_xlabel("left  ←  metres from the centre line  →  right", color=FAINT, fontsize=9)
+        axes.set_yticks([-180, -90, 0, 90, 180], ["back", "90° right", "ahead", "90° left", "back"])
+        if k:
+            axes.set_yticklabels([])
+    axes = figure.add_axes((left + 3 * (width + gap) + 0.075, bottom, width, height))
+    _draw_cut(axes, of.by_command, (of.steerings_deg, of.all_speeds_mps), colors, norm)
+    axes.set_xlim(*axes.get_xlim()[::-1])
+    if isinstance(setup.actions, DiscreteActions):
+        steering_deg, speed_mps = setup.actions.steering_deg, setup.actions.speed_mps
+        dots = axes.scatter(steering_deg, speed_mps, s=26, color=INK, edgecolor=GROUND, linewidth=1.0)
+        dots.set(clip_on=False, zorder=4)
+    axes.set_title("by command, on the centre line", fontsize=11, color=INK, loc="left")
+    axes.xaxis.set_major_formatter(lambda x, _: f"{abs(x):g}")
+    axes.set_xlabel("left  ←  steering, degrees  →  right", color=FAINT, fontsize=9)
+    axes.set_ylabel("speed, m/s", color=FAINT, fontsize=9)
+    figure.text(
+        0.035,
+        top * 0.93,
+        "By place across the road and heading against it, mean over the lap",
+        fontsize=12,
+        fontweight="bold",
+        color=INK,
+        va="center",
+    )
+
+
+def _draw_cut(
+    axes: Axes, reward: np.ndarray, at: tuple[np.ndarray, np.ndarray], colors: Colormap, norm: Normalize
+) -> None:
+    x, y = (np.array([v[0] - 0.5, v[0] + 0.5]) if len(v) == 1 else v for v in at)
+    step_x, step_y = (x[-1] - x[0]) / max(len(at[0]) - 1, 1) / 2, (y[-1] - y[0]) / max(len(at[1]) - 1, 1) / 2
+    axes.imshow(
+        reward,
+        extent=(x[0] - step_x, x[-1] + step_x, y[0] - step_y, y[-1] + step_y),
+        origin="lower",
+        aspect="auto",
+        cmap=colors,
+        norm=norm,
+        interpolation="bilinear",
+    )
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    axes.tick_params(length=0, labelcolor=FAINT, labelsize=9)
+    for side in axes.spines.values():
+        side.set_visible(False)

@@ -1,0 +1,154 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from matplotlib.image import imread
+
+from deepracer_exp.analysis.comparison import (
+    NOTHING,
+    best_lap_s,
+    differences,
+    final_mean,
+    results,
+    value_text,
+)
+from deepracer_exp.analysis.comparison_figure import comparison_figure
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.formats.run_files import RunRecord
+
+
+def row(iteration: int, lap_s: float | None = None, **more: object) -> dict:
+    return {
+        **{
+            "iteration": iteration,
+            "env_steps": 1000 * iteration,
+            "wall_clock_s": 6.0 * iteration,
+            "laps": iteration,
+        },
+        **{"completion": 5.0 * iteration, "mean_return": 2.0, "entropy": 1.5, "lap_share": 0.5},
+        **{"best_lap_time_s": lap_s, "mean_lap_time_s": lap_s and lap_s + 1},
+        **more,
+    }
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Callable[..., RunRecord]:
+    """Return a run of 20 iterations."""
+
+    def make(
+        name: str, *overrides: str, lap_s: float | None = 10.0, sha256: str = "00", **more: object
+    ) -> RunRecord:
+        config = compose_experiment(overrides)[1].mapping
+        rows = [row(iteration, lap_s, **more) for iteration in range(1, 21)]
+        return RunRecord(
+            tmp_path / name, config, rows, {}, {"reward": {"sha256": sha256}, "git_commit": None}
+        )
+
+    return make
+
+
+def test_configurations_differ_in_exactly_what_was_overridden(record):
+    found = differences([record("a"), record("b", "algorithm.lr=3e-4", "seed=7"), record("c", "seed=7")])
+    assert found == {"seed": [0, 7, 7], "algorithm.lr": [0.001, 0.0003, 0.001]}
+
+
+def test_a_key_that_only_some_runs_have_shows_nothing_at_the_others(record):
+    found = differences([record("a", "stopping=none"), record("b", "stopping=reliable")])
+    assert found["stopping.episodes"] == [NOTHING, 50]
+
+
+def test_tracks_differ_by_their_names_not_by_their_points(record):
+    found = differences([record("a"), record("b", "track=Oval_track")])
+    assert found == {"track": ["reinvent_base", "Oval_track"]}
+
+
+def test_what_does_not_change_the_driving_is_no_difference(record):
+    assert differences([record("a"), record("b", "runs_dir=elsewhere", "tracking=off", "debug=true")]) == {}
+
+
+def test_a_reward_function_that_was_edited_is_a_difference_though_its_file_has_the_same_name(record):
+    found = differences([record("a", sha256="1" * 64), record("b", sha256="2" * 64)])
+    assert found == {"reward_function.py": ["sha256 11111111", "sha256 22222222"]}
+
+
+def test_figures_are_means_over_the_last_iterations(record):
+    assert final_mean(record("a"), "completion") == pytest.approx(5.0 * 15.5)
+    assert final_mean(record("a", lap_s=None), "mean_lap_time_s") is None
+
+
+def test_lap_times_of_several_tracks_count_only_where_each_has_one(record):
+    both = record("a", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 12.0})
+    assert best_lap_s(both) == 10.0
+    assert best_lap_s(record("b", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": None})) is None
+
+
+def test_the_fastest_is_the_best_and_what_no_run_has_is_left_out(record):
+    table = {name: (texts, best) for name, texts, best in results([record("a"), record("b", lap_s=9.0)])}
+    assert table["best lap, s"] == (["10.00", "9.00"], 1)
+    assert table["laps"] == (["20", "20"], None)
+    assert table["control steps"][1] is None
+    assert "evaluated lap, s" not in table
+    assert "cost" not in table
+
+
+def test_long_values_are_shortened_in_their_middle():
+    text = value_text({"knots": list(range(100))})
+    assert len(text) <= 48
+    assert text.startswith('{"knots": [0, 1')
+    assert text.endswith("98, 99]}")
+    assert (value_text(None), value_text(True), value_text("reinvent_base")) == (
+        "null",
+        "true",
+        "reinvent_base",
+    )
+
+
+def test_the_picture_is_drawn_of_runs_of_any_kind(record, tmp_path):
+    records = {
+        "A": record("one"),
+        "B": record("without a lap", lap_s=None),
+        "C": record(
+            "tracks", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 9.0, "mean_lap_time_s/A": 8.5}
+        ),
+    }
+    comparison_figure(records).savefig(tmp_path / "picture.png")
+    assert imread(tmp_path / "picture.png").std() > 0.05
+    comparison_figure({"A": record("x", lap_s=None), "B": record("y", lap_s=None)}).savefig(
+        tmp_path / "none.png"
+    )
+
+
+def write(record: RunRecord) -> None:
+    record.path.mkdir(parents=True)
+    (record.path / "config.yaml").write_text(json.dumps(record.config))
+    (record.path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in record.rows))
+
+
+def test_the_command_shows_differences_and_results_and_writes_the_picture(record, call, tmp_path):
+    write(record("runs/e/first", "seed=1"))
+    write(record("runs/e/second", "seed=2", lap_s=9.25))
+    ended = call("compare", "first", "second", "-o", "out.png")
+    assert ended.code == 0, ended.stderr
+    words = [line.split() for line in ended.stdout.splitlines()]
+    assert ["A", "runs/e/first"] in words
+    assert ["seed", "1", "2"] in words
+    assert ["best", "lap,", "s", "10.00", "9.25"] in words
+    assert (tmp_path / "out.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["first"], "1 runs given; accepted: 2 to 26"),
+        (["first", "runs/e/first"], "1 runs given"),
+        (["first", "third"], "third: no such run"),
+        (["first", "second", "-o", "nowhere/out.png"], "--output nowhere/out.png: cannot be written"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(record, call, arguments, words):
+    write(record("runs/e/first"))
+    write(record("runs/e/second"))
+    ended = call("compare", *arguments)
+    assert ended.code == 2
+    assert words in ended.complaint

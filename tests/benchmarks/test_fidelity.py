@@ -1,0 +1,104 @@
+"""The measure of fidelity, on what a known car drove."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import fidelity
+from benchmarks.simple_cars import Formula, bicycle, fit_formula
+from deepracer_exp.sim.calibrate import car_named
+from deepracer_exp.sim.recordings import WARM_UP_STEPS, Windows
+from deepracer_exp.sim.replay import errors
+
+CAR = car_named("deepracer")
+TRACES = Path(__file__).parents[3] / "shared/reference/console_training/sim-trace"
+
+
+def windows(count: int, steps: int = 15) -> Windows:
+    """Return windows of cars that stand at the origin, with random actions to come."""
+    rng = np.random.default_rng(0)
+    rows = WARM_UP_STEPS + steps
+    return Windows(
+        pose=np.zeros((count, rows + 1, 3)),
+        action=np.stack(
+            [rng.choice([1.0, 2.0], (count, rows)), rng.choice([-0.5, 0.0, 0.3], (count, rows))], axis=-1
+        ),
+        first=np.full(count, WARM_UP_STEPS),
+        standing=np.full(count, True),
+        iteration=np.arange(count),
+    )
+
+
+def test_the_bicycle_drives_the_circle_of_its_wheelbase_and_steering():
+    some = windows(1, steps=60)
+    some.action[...] = (1.0, 0.3)
+    path = bicycle(CAR, some)[0]
+    # Three points of a circle give its radius; the origin is ahead of the rear axle by its distance to it.
+    a, b, c = (complex(*path[i, :2]) for i in (0, 25, 50))
+    area = 0.5 * abs(((b - a).conjugate() * (c - a)).imag)
+    radius_m = abs(a - b) * abs(b - c) * abs(c - a) / (4 * area)
+    assert radius_m == pytest.approx(np.hypot(CAR.wheelbase_m / np.tan(0.3), CAR.rear_axle_x_m), rel=1e-3)
+    # Its rear axle goes at the commanded speed.
+    assert (path[-1, 2] - path[0, 2]) * 15 / 59 == pytest.approx(np.tan(0.3) / CAR.wheelbase_m)
+
+
+def test_a_formula_without_lag_and_loss_turns_as_the_bicycle_does():
+    some = windows(1)
+    some.action[...] = (1.5, 0.1)
+    formula = Formula(speed_lag_s=1e-3, rate_lag_s=1e-3, gain=1.0, gain_loss=0.0)
+    turned = [np.diff(path[0, :, 2])[-1] for path in (formula.predict(CAR, some), bicycle(CAR, some))]
+    assert turned[0] == pytest.approx(turned[1])
+
+
+def test_fitting_the_formula_finds_the_formula_that_drove():
+    some = windows(60)
+    driven = Formula(gain=0.55, rate_lag_s=0.3, speed_lag_s=0.15, trim_rad=0.03)
+    some.truth[...] = driven.predict(CAR, some)
+    found = fit_formula(CAR, some)
+    assert np.median(errors(found.predict(CAR, some), some).distance_m) < 1e-3
+    assert found.rate_lag_s == pytest.approx(0.3, rel=0.02)
+
+
+@pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of the AWS console are not here")
+def test_the_benchmark_tells_the_documented_figures_for_any_folder_and_draws(tmp_path, capsys):
+    file = tmp_path / "figures.json"
+    arguments = ["--traces", str(TRACES / "evaluation"), "--json", str(file), "--threads", "1"]
+    assert fidelity.main(arguments) == 0
+    told = json.loads(file.read_text())
+    assert 0 < told["one_second_error_m"] < 0.08
+    assert told["one_second_error_m"] < told["three_second_error_m"]
+    assert told["one_second_error_m"] < 0.2 * told["bicycle"]["one_second_error_m"]["all"]
+    count = told["one_second_windows"]
+    assert count["all"] == count["under_way"] + count["standing"]
+    assert "standing" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of the AWS console are not here")
+def test_figures_are_drawn_of_what_is_held_out(tmp_path):
+    traces = TRACES / "training/training-simtrace"
+    for iteration in (10, 11):
+        (tmp_path / f"{iteration}-iteration.csv").write_text(
+            (traces / f"{iteration}-iteration.csv").read_text()
+        )
+    assert (
+        fidelity.main(["--traces", str(tmp_path), "--figures", str(tmp_path / "figures"), "--threads", "1"])
+        == 0
+    )
+    assert len(list((tmp_path / "figures").glob("fidelity_*.png"))) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--traces", "nowhere"], "nowhere: no such file or folder"),
+        (["--traces", ".", "--car", "lorry"], "lorry"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert fidelity.main(arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert told in error
+    assert "\n" not in error

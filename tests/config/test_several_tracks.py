@@ -1,0 +1,128 @@
+import re
+
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment, expand_grid
+from deepracer_exp.config.options import options
+from deepracer_exp.errors import BadInput
+
+TWO = "track=[Oval_track,Bowtie_track]"
+
+
+def tracks(*overrides: str) -> dict:
+    return compose_experiment(overrides)[0].tracks
+
+
+def refusal(*overrides: str) -> str:
+    with pytest.raises(BadInput) as caught:
+        compose_experiment(overrides)
+    assert "\n" not in str(caught.value)
+    assert "several_tracks" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_one_track_is_its_config_and_several_are_a_mapping_by_name():
+    experiment, composition = compose_experiment(["track=Oval_track"])
+    assert experiment.track.name == "Oval_track"
+    assert experiment.tracks == {"Oval_track": experiment.track}
+    several, of_several = compose_experiment([TWO])
+    assert list(several.track) == list(several.tracks) == ["Oval_track", "Bowtie_track"]
+    assert several.track["Oval_track"] == experiment.track
+    assert of_several.mapping["track"]["Oval_track"] == composition.mapping["track"]
+    assert of_several.choices["track"] == "[Oval_track,Bowtie_track]"
+    assert "several_tracks" not in of_several.mapping
+    assert list(of_several.mapping) == list(composition.mapping)
+
+
+def test_a_list_of_one_is_a_mapping_too():
+    assert list(compose_experiment(["track=[Oval_track]"])[0].track) == ["Oval_track"]
+
+
+def test_all_are_all_options():
+    assert list(tracks("track=all")) == options("track")
+
+
+def test_the_order_is_that_of_the_list():
+    assert list(tracks("track=[Oval_track,2022_summit_speedway,AWS_track]")) == [
+        "Oval_track",
+        "2022_summit_speedway",
+        "AWS_track",
+    ]
+
+
+def test_a_value_reaches_the_track_it_names_alone():
+    chosen = tracks(
+        "track=[Oval_track,2022_summit_speedway]",
+        "track.2022_summit_speedway.weight=2",
+        "track.Oval_track.floor.friction=0.5",
+        "track.Oval_track.file=/a,b/[c] d.npy",
+    )
+    assert [track.weight for track in chosen.values()] == [1, 2]
+    assert [track.floor.friction for track in chosen.values()] == [0.5, 1.0]
+    assert [track.file for track in chosen.values()] == ["/a,b/[c] d.npy", None]
+
+
+def test_a_value_without_a_name_reaches_every_track_but_those_with_one_of_their_own():
+    chosen = tracks(TWO, "track.Bowtie_track.direction=reversed", "track.direction=alternate")
+    assert [track.direction for track in chosen.values()] == ["alternate", "reversed"]
+
+
+def test_an_experiments_track_gives_way():
+    assert list(tracks("experiment=tiny", TWO)) == ["Oval_track", "Bowtie_track"]
+
+
+def test_a_list_in_an_experiments_file_is_refused(tmp_path, monkeypatch):
+    """Hydra would lay one track over the other."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "conf/experiment/mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("# @package _global_\ndefaults:\n  - override /track: [Oval_track, Monaco]\n")
+    assert refusal("experiment=mine").startswith("track: a list of tracks in a file")
+
+
+def test_the_last_choice_counts():
+    assert list(tracks("track=Monaco", TWO)) == ["Oval_track", "Bowtie_track"]
+    assert list(tracks(TWO, "track=Monaco")) == ["Monaco"]
+
+
+def test_a_sweep_over_tracks_stays_one_of_single_tracks():
+    assert expand_grid(["track=Oval_track,Bowtie_track"]) == [["track=Oval_track"], ["track=Bowtie_track"]]
+    assert expand_grid([TWO, "seed=0,1"]) == [[TWO, "seed=0"], [TWO, "seed=1"]]
+    lists = expand_grid(["track=[Oval_track,Monaco],all", "track.2022_summit_speedway.weight=2"])
+    assert [line for line, _ in lists] == ["track=[Oval_track,Monaco]", "track=all"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["track=[Oval_trak]"], r"no such track Oval_trak \(did you mean Oval_track\?\)"),
+        (["track=al"], "track=al: no such track"),
+        (["track=[]"], r"track=\[\]: no track; accepted: track=\[A,B\], track=all"),
+        (["track=[Monaco,Monaco]"], "Monaco stands there twice; track.Monaco.weight=2"),
+        ([TWO, "track.Ovl_track.weight=2"], r"Ovl_track is neither .* \(did you mean Oval_track\?\)"),
+        ([TWO, "track.Monaco.weight=2"], "Monaco is neither a chosen track nor a key of all tracks"),
+        ([TWO, "track.wieght=2"], r"wieght is neither .* \(did you mean weight\?\)"),
+        ([TWO, "track.floor.frction=2"], r"track.floor.frction: no such key \(did you mean friction\?\)"),
+        ([TWO, "track.Oval_track.wieght=2"], r"track.wieght: no such key with track=Oval_track"),
+        ([TWO, "track.Oval_track.weight=0"], "track.Oval_track.weight=0: input should be greater than 0"),
+        (
+            [TWO, "track.Oval_track.weight=abc"],
+            'track.Oval_track.weight="abc": input should be a valid number',
+        ),
+        ([TWO, "track.direction=sideways"], 'track.Oval_track.direction="sideways": input should be'),
+        (
+            [TWO, "track.Oval_track.width_m=[1,2]"],
+            "track.Oval_track.width_m has 2 values and track.Oval_track",
+        ),
+        ([TWO, "+track.Oval_track.foo=2"], "track.Oval_track.foo: no such key"),
+        (["track.Oval_track.weight=2"], r"accepted where several tracks are chosen .* it is track.weight"),
+        (["track.2022_summit_speedway.weight=2"], "accepted where several tracks are chosen"),
+        (["track.weight=abc"], 'track.weight="abc": input should be a valid number'),
+        (
+            [TWO, "collector.cars=1", "collector.processes=1"],
+            "collector.cars=1 with 2 tracks: every track needs",
+        ),
+    ],
+)
+def test_what_is_not_accepted_is_told_in_one_line(overrides, says):
+    assert re.search(says, refusal(*overrides))

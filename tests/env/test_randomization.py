@@ -1,0 +1,399 @@
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment, validate
+from deepracer_exp.config.randomization import OFF, QUANTITIES
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.setup import RaceSetup, build_setup
+from deepracer_exp.env.streams import CarStreams
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.trace import PACKED, RANDOMIZED
+from deepracer_exp.sim.batch import CarBatch
+
+DRAWN = [PACKED[name] for name in QUANTITIES]
+REST = [place for name, place in PACKED.items() if name not in QUANTITIES]
+
+
+@functools.cache
+def setup_of(*overrides: str) -> RaceSetup:
+    return build_setup(compose_experiment(overrides)[0])
+
+
+def race_of(
+    option: str = "none", *overrides: str, n_cars: int = 1, first_car: int = 0, max_steps: int = 20, **ranges
+) -> Race:
+    """Build a race whose cars stand at their starts, with other ranges than the option's."""
+    setup = setup_of(f"randomization={option}", "action_space=continuous", *overrides)
+    setup = dataclasses.replace(
+        setup,
+        randomization=dataclasses.replace(setup.randomization, **ranges),
+        episode=dataclasses.replace(setup.episode, max_steps=max_steps),
+    )
+    race = Race(setup, n_cars, first_car=first_car)
+    race.reset()
+    return race
+
+
+def drawn_of(race: Race, name: str) -> np.ndarray:
+    return race.randomization.values[:, QUANTITIES.index(name)]
+
+
+def random_actions(steps: int, cars: int) -> np.ndarray:
+    return np.random.default_rng(5).uniform(-1, 1, (steps, cars, 2))
+
+
+def drive(race: Race, actions: np.ndarray) -> np.ndarray:
+    """Drive, begin new episodes as they end, return traces (steps, cars, C)."""
+    rows = []
+    for action in actions:
+        race.step(action)
+        rows.append(race.trace.copy())
+        race.reset(np.flatnonzero(race.terminated | race.truncated))
+    return np.array(rows)
+
+
+def by_episode(trace: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+    """Return what each episode drew by (car, episode); an episode whose rows differ fails."""
+    drawn: dict[tuple[int, int], np.ndarray] = {}
+    for row in trace.reshape(-1, trace.shape[-1]):
+        key = int(row[PACKED["car"]]), int(row[PACKED["episode"]])
+        np.testing.assert_array_equal(drawn.setdefault(key, row[DRAWN]), row[DRAWN])
+    return drawn
+
+
+@pytest.fixture
+def sent(monkeypatch) -> Callable[[Race], list]:
+    """Write down what reaches the cars of a race: steering in degrees, speed, and whether they may move."""
+
+    def spy(race: Race) -> list:
+        log, through = [], race._batch.drive
+
+        def drive(speed_mps, steering_rad, moving):
+            log.append((np.degrees(steering_rad), np.array(speed_mps), np.array(moving)))
+            through(speed_mps, steering_rad, moving)
+
+        monkeypatch.setattr(race._batch, "drive", drive)
+        return log
+
+    return spy
+
+
+# --- What is drawn
+
+
+def test_the_columns_of_the_trace_are_the_quantities_in_their_order():
+    assert tuple(RANDOMIZED) == QUANTITIES
+    assert np.diff(DRAWN).tolist() == [1] * (len(DRAWN) - 1)
+
+
+def test_without_randomization_nothing_is_drawn(monkeypatch):
+    def forbidden(*_):
+        raise AssertionError("a random number was drawn")
+
+    monkeypatch.setattr(CarStreams, "at", forbidden)
+    race = race_of(n_cars=2, max_steps=5)
+    trace = drive(race, random_actions(12, 2))
+    np.testing.assert_array_equal(trace[:, :, DRAWN], np.broadcast_to(list(OFF.values()), (12, 2, len(OFF))))
+
+
+def test_an_episode_keeps_what_it_drew_and_the_next_one_draws_anew():
+    drawn = by_episode(drive(race_of("sim2real", n_cars=4), random_actions(100, 4)))
+    assert len(drawn) > 12
+    values, ranges = (
+        np.array(list(drawn.values())),
+        setup_of("randomization=sim2real", "action_space=continuous").randomization,
+    )
+    for column, name in enumerate(QUANTITIES):
+        low, high = getattr(ranges, name)
+        assert np.float32(low) <= values[:, column].min() <= values[:, column].max() <= np.float32(high)
+        if name != "action_delay_steps":
+            assert len(np.unique(values[:, column])) == len(drawn), name
+
+
+def test_a_written_trace_tells_the_draws_as_they_were():
+    values = race_of("sim2real", n_cars=4).randomization.values
+    np.testing.assert_array_equal(values.astype(np.float32).astype(np.float64), values)
+
+
+def test_eight_cars_draw_the_same_in_one_batch_as_in_two():
+    actions = random_actions(60, 8)
+    together = drive(race_of("sim2real", n_cars=8), actions)
+    parts = [race_of("sim2real", n_cars=4, first_car=first) for first in (0, 4)]
+    apart = [drive(race, actions[:, 4 * half : 4 * half + 4]) for half, race in enumerate(parts)]
+    assert together[:, :, PACKED["done"]].sum() > 8
+    np.testing.assert_array_equal(together, np.concatenate(apart, axis=1))
+
+
+def test_an_episode_draws_the_same_whatever_happened_before():
+    long, short = (
+        by_episode(drive(race_of("sim2real", max_steps=steps, n_cars=3), random_actions(60, 3)))
+        for steps in (20, 7)
+    )
+    both = long.keys() & short.keys()
+    assert len(both) >= 9
+    for key in both:
+        np.testing.assert_array_equal(long[key], short[key])
+
+
+def test_seeding_begins_the_draws_anew_and_another_seed_draws_others():
+    race, actions = race_of("sim2real", n_cars=2), random_actions(50, 2)
+    first = drive(race, actions)
+    race.seed(1)
+    race.reset()
+    assert not np.isin(drive(race, actions)[:, :, DRAWN[:4]], first[:, :, DRAWN[:4]]).any()
+    race.seed(0)
+    race.reset()
+    np.testing.assert_array_equal(drive(race, actions), first)
+
+
+def test_switching_one_quantity_off_leaves_the_draws_of_the_others():
+    all_on = race_of("sim2real", n_cars=5).randomization.values
+    off = {"mass_scale": (1.0, 1.0), "observation_noise": (0.0, 0.0)}
+    some = race_of("sim2real", n_cars=5, **off).randomization.values
+    same = [column for column, name in enumerate(QUANTITIES) if name not in off]
+    np.testing.assert_array_equal(some[:, same], all_on[:, same])
+
+
+def test_draws_are_uniform_and_every_delay_is_as_likely():
+    race = race_of(friction_scale=(0.5, 1.5), action_delay_steps=(1, 4), n_cars=3000)
+    friction, delay = drawn_of(race, "friction_scale"), drawn_of(race, "action_delay_steps")
+    deciles = np.quantile(friction, np.linspace(0, 1, 11))
+    np.testing.assert_allclose(deciles, np.linspace(0.5, 1.5, 11), atol=0.05)  # five standard errors
+    counts = np.bincount(delay.astype(int), minlength=6)
+    np.testing.assert_allclose(counts, [0, 750, 750, 750, 750, 0], atol=120)
+    assert abs(np.corrcoef(friction, delay)[0, 1]) < 0.08
+
+
+# --- What reaches the car
+
+
+def test_constant_noise_has_its_mean_and_deviation(sent):
+    race = race_of("aws", steering_offset_deg=(-1.5, -1.5), n_cars=500)
+    log, action = sent(race), np.zeros((500, 2))
+    commanded_deg, commanded_mps = race.setup.actions.commands(action)
+    for _ in range(8):
+        race.step(action)
+    steering = np.array([entry[0] for entry in log]) - commanded_deg
+    speed = np.array([entry[1] for entry in log]) / commanded_mps
+    # 4000 numbers: the mean is good to 1/63 of the deviation, the deviation to 1/90 of itself.
+    assert steering.mean() == pytest.approx(-1.5, abs=0.13)
+    assert steering.std() == pytest.approx(2.0, rel=0.05)
+    assert speed.mean() == pytest.approx(1.0, abs=0.005)
+    assert speed.std() == pytest.approx(0.07, rel=0.05)
+    assert abs(np.corrcoef(steering.ravel(), speed.ravel())[0, 1]) < 0.07
+
+
+def test_a_delayed_command_reaches_the_car_exactly_so_many_steps_later(sent):
+    race = race_of(action_delay_steps=(0, 4), max_steps=12, n_cars=12)
+    log, told, steps, delays = sent(race), [], [], []
+    for action in random_actions(40, 12):
+        told.append(race.setup.actions.commands(action))
+        delays.append(drawn_of(race, "action_delay_steps").astype(int))
+        race.step(action)
+        steps.append(race.trace[:, PACKED["steps"]].astype(int))
+        race.reset(np.flatnonzero(race.terminated | race.truncated))
+    assert len(np.unique(delays)) == 5
+    for t, car in itertools.product(range(40), range(12)):
+        delay, (steering, speed, moving) = delays[t][car], log[t]
+        assert moving[car] == (steps[t][car] > 1 + delay)
+        if moving[car]:
+            told_deg, told_mps = told[t - delay]
+            assert steering[car] == pytest.approx(told_deg[car], abs=1e-12)
+            assert speed[car] == told_mps[car]
+
+
+def test_a_late_car_stands_until_its_first_command_arrives():
+    race = race_of(action_delay_steps=(3, 3), n_cars=2)
+    start = race.referee.now.front.copy()
+    for _ in range(4):
+        race.step(np.zeros((2, 2)))
+        np.testing.assert_allclose(race.referee.now.front, start, atol=1e-6)
+    race.step(np.zeros((2, 2)))
+    assert (np.linalg.norm(race.referee.now.front - start, axis=1) > 1e-3).all()
+
+
+def test_the_largest_delay_that_is_accepted_lets_a_car_drive():
+    race = race_of(action_delay_steps=(13, 13), max_steps=0)
+    for _ in range(25):
+        race.step(np.zeros((1, 2)))
+        assert not race.terminated
+    with pytest.raises(BadInput, match=r"action_delay_steps reaches 14 .*immobilized_steps=15: .*up to 13"):
+        compose_experiment(["randomization.action_delay_steps=[0,14]"])
+    assert compose_experiment(["randomization.action_delay_steps=[0,15]", "episode.immobilized_steps=0"])
+
+
+def test_a_battery_loses_its_share_of_the_speed_over_twenty_seconds_and_no_more(sent):
+    race = race_of(battery_sag=(0.3, 0.3), max_steps=0)
+    log = sent(race)
+    told = race.setup.actions.commands(np.zeros((1, 2)))[1][0]
+    for _ in range(320):
+        race.step(np.zeros((1, 2)))
+    share = np.array([entry[1][0] for entry in log[1:]]) / told
+    assert share[0] == 1
+    np.testing.assert_allclose(np.diff(share[:301]), -0.3 / 300, atol=1e-7)
+    np.testing.assert_allclose(share[300:], 0.7, atol=1e-6)
+
+
+def test_half_the_friction_halves_the_grip_of_that_car_alone():
+    race = race_of("none", "track=reinvent_carpet", friction_scale=(0.5, 1.0), n_cars=6)
+    nominal = race_of("none", "track=reinvent_carpet")._batch._batch.get_model(0).pair_friction
+    for car, scale in enumerate(drawn_of(race, "friction_scale")):
+        friction = race._batch._batch.get_model(car).pair_friction
+        np.testing.assert_allclose(friction[:, :2], scale * nominal[:, :2])
+
+
+def test_each_car_has_the_mass_the_motors_and_the_servos_it_drew():
+    race = race_of(mass_scale=(0.5, 1.5), motor_scale=(0.5, 1.5), servo_scale=(0.5, 1.5), n_cars=5)
+    motors, servos, nominal = race._batch._motors, race._batch._servos, race._batch.model
+    for car in range(5):
+        own = race._batch._batch.get_model(car)
+        mass, motor, servo = (drawn_of(race, f"{part}_scale")[car] for part in ("mass", "motor", "servo"))
+        np.testing.assert_allclose(own.body_mass, mass * nominal.body_mass)
+        np.testing.assert_allclose(
+            own.actuator_forcerange[motors], motor * nominal.actuator_forcerange[motors]
+        )
+        np.testing.assert_allclose(own.actuator_gainprm[servos], servo * nominal.actuator_gainprm[servos])
+
+
+def test_a_heavy_car_with_weak_motors_is_slower_away():
+    speeds = []
+    for ranges in ({}, {"mass_scale": (1.5, 1.5), "motor_scale": (0.5, 0.5)}):
+        race = race_of(**ranges)
+        for _ in range(6):
+            race.step(np.array([[0.0, 1.0]]))
+        speeds.append(race.referee.now.speed_mps[0])
+    assert speeds[1] < 0.7 * speeds[0]
+
+
+def test_the_physics_bears_every_corner_of_what_is_accepted():
+    corners = np.array(list(itertools.product([0.1, 2.0], [0.5, 2.0], [0.5, 2.0], [0.5, 2.0])))
+    car = compose_experiment([])[0].car
+    cars, everyone = CarBatch(car, len(corners), 1), np.arange(len(corners))
+    cars.set_tyre_friction(everyone, car.tyre_friction * corners[:, 0])
+    for scale, apply in zip(
+        corners.T[1:], (cars.set_mass_scale, cars.set_motor_scale, cars.set_servo_scale), strict=True
+    ):
+        apply(everyone, scale)
+    draw = np.random.default_rng(3)
+    for _ in range(60):
+        cars.drive(draw.uniform(0.1, 4, len(corners)), np.radians(draw.uniform(-30, 30, len(corners))))
+        state = cars.read()
+        assert np.hypot(state.speed_mps, state.lateral_mps).max() < 4.5
+        assert np.abs(state.yaw_rate_radps).max() < 12
+
+
+# --- What the policy sees
+
+
+def test_what_is_seen_changes_nothing_of_what_is():
+    actions = random_actions(50, 4)
+    clear = drive(race_of(n_cars=4), actions)
+    blurred = drive(race_of(observation_noise=(0.0, 0.5), observation_dropout=(0.0, 1.0), n_cars=4), actions)
+    assert clear[:, :, PACKED["done"]].sum() > 4
+    np.testing.assert_array_equal(clear[:, :, REST], blurred[:, :, REST])
+
+
+def test_noise_is_on_what_is_measured_and_not_on_what_was_commanded():
+    noisy, clear = race_of(observation_noise=(0.1, 0.1), n_cars=400), race_of(n_cars=400)
+    away = [noisy.observation - clear.observation]
+    for action in random_actions(9, 400):
+        for race in (noisy, clear):
+            race.step(action)
+        away.append(noisy.observation - clear.observation)
+    names = clear.feature_names
+    known = [names.index("last_steering"), names.index("last_speed")]
+    difference = np.array(away)
+    assert not difference[:, :, known].any()
+    measured = np.delete(difference, known, axis=2)
+    # The first observation of an episode is as noisy as the others.
+    for part in (measured[0], measured[1:]):
+        assert part.mean() == pytest.approx(0, abs=0.006)
+        assert part.std() == pytest.approx(0.1, rel=0.05)
+    flat = measured.transpose(0, 2, 1).reshape(-1, 400)
+    np.fill_diagonal(correlation := np.corrcoef(flat), 0)
+    assert np.abs(correlation).max() < 0.35  # 14,365 pairs of 400: seven standard errors
+
+
+def test_a_dropout_shows_the_last_observation_again_but_never_that_of_another_episode():
+    race = race_of(observation_dropout=(1.0, 1.0), n_cars=3, max_steps=6)
+    clear = race_of(n_cars=3, max_steps=6)
+    for action in random_actions(20, 3):
+        before = race.observation.copy()
+        for each in (race, clear):
+            each.step(action)
+        np.testing.assert_array_equal(race.observation, before)
+        ended = np.flatnonzero(race.terminated | race.truncated)
+        for each in (race, clear):
+            each.reset(ended)
+        np.testing.assert_array_equal(race.observation[ended], clear.observation[ended])
+        if len(ended):
+            assert (race.observation[ended] != before[ended]).any()
+
+
+def test_dropouts_come_as_often_as_was_drawn():
+    race = race_of(observation_dropout=(0.0, 0.6), n_cars=60, max_steps=0)
+    seen = [race.observation]
+    for _ in range(200):
+        race.step(np.zeros((60, 2)))
+        seen.append(race.observation)
+    repeated = (np.diff(np.array(seen), axis=0) == 0).all(axis=2)[2:]  # a standing car repeats itself
+    expected = drawn_of(race, "observation_dropout")
+    np.testing.assert_allclose(repeated.mean(axis=0), expected, atol=0.15)
+    assert repeated.mean() == pytest.approx(expected.mean(), abs=0.02)
+
+
+def test_an_observation_that_was_handed_out_stays_as_it_was():
+    race = race_of("sim2real", observation_dropout=(0.5, 0.5), n_cars=4)
+    handed = [(race.observation, race.observation.copy())]
+    for action in random_actions(50, 4):
+        race.step(action)
+        handed.append((race.observation, race.observation.copy()))
+        race.reset(np.flatnonzero(race.terminated | race.truncated))
+        handed.append((race.observation, race.observation.copy()))
+    for observation, copy in handed:
+        assert observation.dtype == np.float32
+        np.testing.assert_array_equal(observation, copy)
+
+
+# --- What is refused
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("friction_scale", [0, 1], r"\.0=0: .*greater"),
+        ("friction_scale", [1, 2.5], r"\.1=2.5: .*less"),
+        ("mass_scale", [1, 1e9], r"\.1=1000000000.0: .*less"),
+        ("motor_scale", [1.2, 0.8], r"=\[1.2, 0.8\]: the first number of a range is the lowest"),
+        ("servo_scale", [0.9], r"=\[0.9\]: .* at least 2 items"),
+        ("servo_scale", [0.9, 1, 1.1], r"=\[0.9, 1, 1.1\]: .* at most 2 items"),
+        ("servo_scale", 0.9, "=0.9: "),
+        ("servo_scale", None, "=null: "),
+        ("battery_sag", [0, 1.1], r"\.1=1.1: .*less"),
+        ("action_delay_steps", [0, 16], r"\.1=16: .*less"),
+        ("action_delay_steps", [-1, 1], r"\.0=-1: .*greater"),
+        ("action_delay_steps", [0, 1.5], r"\.1=1.5: .*integer"),
+        ("steering_offset_deg", [-20, 0], r"\.0=-20: .*greater"),
+        ("steering_noise_deg", [-1, 0], r"\.0=-1: .*greater"),
+        ("speed_noise", [0, float("nan")], r"\.1=NaN: .*finite"),
+        ("observation_noise", [0, float("inf")], r"\.1=Infinity: .*finite"),
+        ("observation_dropout", [0, 2], r"\.1=2: .*less"),
+        ("observation_dropout", [0, "much"], r"\.1=\"much\": .*number"),
+        ("camera_pitch_deg", [14, 16], "no such key"),
+    ],
+)
+def test_a_silly_range_is_refused_in_one_line(mapping, name, value, complaint):
+    silly = {**mapping, "randomization": {**mapping["randomization"], name: value}}
+    with pytest.raises(BadInput, match=rf"^randomization\.{name}(: )?{complaint}") as caught:
+        validate(silly)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def mapping():
+    return compose_experiment([])[1].mapping

@@ -1,0 +1,228 @@
+"""The environment's rules on what the real service recorded: its poses go through the very code a race uses."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from deepracer_exp.env.referee import Referee
+from deepracer_exp.env.reward import RewardFunction
+from deepracer_exp.env.reward_source import RewardSource
+from deepracer_exp.formats.recorded import read_recorded
+from deepracer_exp.formats.trace import EPISODE_STATUS
+from deepracer_exp.sim.batch import CarState
+
+REFERENCE = Path(__file__).parents[2] / "../shared/reference"
+TRACES = REFERENCE / "console_training/sim-trace"
+FRONT_M = 0.14
+JUDGED = (
+    "progress",
+    "all_wheels_on_track",
+    "status",
+    "done",
+    "closest_waypoint",
+    "reward",
+    "steps",
+    "width_m",
+)
+
+# The console's sample for following the centre line, in our words.
+FOLLOW = """
+def reward_function(params):
+    share = params["distance_from_center"] / params["track_width"]
+    return 1.0 if share <= 0.1 else 0.5 if share <= 0.25 else 0.1 if share <= 0.5 else 1e-3
+"""
+FOLLOW_MANY = """
+import numpy as np
+
+def reward_batch(params):
+    share = params["distance_from_center"] / params["track_width"]
+    return np.select([share <= 0.1, share <= 0.25, share <= 0.5], [1.0, 0.5, 0.1], 1e-3)
+"""
+
+
+def recorded(folder: str) -> pd.DataFrame:
+    """Return the recorded steps with their poses; episodes are numbered over all files."""
+    if not (TRACES / folder).is_dir():
+        pytest.skip("the recordings of the real service are not on this machine")
+    rows = read_recorded(TRACES / folder)
+    rows["episode"] = rows.groupby(["file", "episode"], sort=False).ngroup()
+    return rows.sort_values(["episode", "steps"], kind="stable", ignore_index=True)
+
+
+def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
+    """Judge every recorded pose, all episodes side by side, one car each; row by row beside `rows`."""
+    car, step = rows["episode"].to_numpy(), rows["steps"].to_numpy(np.int64) - 1
+    cars, steps = car.max() + 1, step.max() + 1
+    yaw_rad = np.radians(rows["yaw"].to_numpy())
+    recorded_pose = np.array(
+        [rows["X"] - FRONT_M * np.cos(yaw_rad), rows["Y"] - FRONT_M * np.sin(yaw_rad), yaw_rad]
+    )
+    # A car whose episode is over waits where it ended.
+    poses = np.repeat(recorded_pose[:, rows.groupby("episode")["steps"].idxmax()][:, None], steps, axis=1)
+    poses[:, step, car] = recorded_pose
+    referee = Referee(setup, cars)
+    source = RewardSource("follow", "follow.py", FOLLOW + FOLLOW_MANY, "", {}, {})
+    reward = RewardFunction(source, cars, 30.0, None)
+    # The service does not write where an episode began: it is where the first progress says.
+    first = rows.groupby("episode").first()
+    begun = setup.track.project(first[["X", "Y"]].to_numpy()).ndist - first["progress"].to_numpy() / 100
+    referee.reset(start_ndist=begun % 1)
+    out = np.empty((steps, cars, len(JUDGED)))
+    for at in range(steps):
+        referee.see(CarState(*poses[:, at], *np.zeros((3, cars))))
+        verdict = referee.judge()
+        paid = reward(referee.params(verdict, np.zeros(cars), np.zeros(cars)), referee.roads, verdict.running)
+        out[at] = np.column_stack(
+            [
+                verdict.progress,
+                verdict.all_wheels_on_track,
+                verdict.status,
+                verdict.terminated,
+                referee.nearer_waypoint(),
+                paid,
+                referee.steps,
+                verdict.now.track_width_m,
+            ]
+        )
+    table = pd.DataFrame(out[step, car], columns=JUDGED)
+    table["status"] = [EPISODE_STATUS[int(code)] for code in table["status"]]
+    return table.assign(start=(begun % 1)[car])
+
+
+@pytest.fixture(scope="module")
+def setup():
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.env.setup import build_setup
+
+    route = f"track.file={REFERENCE / 'routes/reinvent_base.npy'}"
+    if not (REFERENCE / "routes").is_dir():
+        pytest.skip("the routes of the real service are not on this machine")
+    return build_setup(compose_experiment([route, "episode.max_steps=0"])[0])
+
+
+@pytest.fixture(scope="module")
+def training(setup) -> tuple[pd.DataFrame, pd.DataFrame]:
+    rows = recorded("training")
+    return rows, judged(rows, setup)
+
+
+@pytest.fixture(scope="module")
+def evaluation(setup) -> tuple[pd.DataFrame, pd.DataFrame]:
+    rows = recorded("evaluation")
+    return rows, judged(rows, setup)
+
+
+@pytest.fixture(params=["training", "evaluation"])
+def both(request) -> tuple[pd.DataFrame, pd.DataFrame]:
+    return request.getfixturevalue(request.param)
+
+
+def test_nothing_of_the_training_is_left_out(training):
+    assert len(training[0]) == 44_247
+    assert training[0]["episode"].nunique() == 560
+
+
+def test_every_row_has_the_services_progress(both):
+    rows, ours = both
+    np.testing.assert_allclose(ours["progress"], rows["progress"], rtol=0, atol=1e-9)
+
+
+def test_every_row_has_the_services_closest_waypoint(both):
+    rows, ours = both
+    np.testing.assert_array_equal(ours["closest_waypoint"], rows["closest_waypoint"])
+
+
+def test_every_row_has_the_services_reward(both):
+    rows, ours = both
+    np.testing.assert_array_equal(ours["reward"], rows["reward"])
+    assert {0.0, 0.1, 0.5, 1.0} <= set(rows["reward"])
+
+
+def test_a_rewards_scalar_and_batch_form_pay_the_recorded_rows_alike(training, setup):
+    rows, ours = training
+    some = np.random.default_rng(3).choice(np.flatnonzero(rows["steps"] > 1), 2000, replace=False)
+    away_m = setup.track.project(rows[["X", "Y"]].to_numpy()[some]).offset_m
+    namespace: dict = {}
+    exec(FOLLOW, namespace)
+    scalar = [
+        namespace["reward_function"]({"distance_from_center": abs(away), "track_width": width})
+        for away, width in zip(away_m, ours["width_m"].to_numpy()[some], strict=True)
+    ]
+    np.testing.assert_array_equal(scalar, rows["reward"].to_numpy()[some])
+
+
+def test_the_wheels_are_on_the_track_but_for_the_lean_of_the_car(both):
+    rows, ours = both
+    assert (ours["all_wheels_on_track"].astype(bool) != rows["all_wheels_on_track"]).sum() <= 5
+
+
+def test_episodes_end_where_and_why_they_ended(both):
+    rows, ours = both
+    differs = ours["status"] != rows["episode_status"]
+    assert differs.sum() <= 5
+    # Only a wheel on the border can be seen otherwise: the log has no lean of the car.
+    assert set(rows["episode_status"][differs]) | set(ours["status"][differs]) <= {"off_track", "in_progress"}
+    np.testing.assert_array_equal(ours["done"].astype(bool)[~differs], rows["done"][~differs])
+
+
+def test_the_first_row_of_an_episode_is_the_prepare_step_and_pays_nothing(both):
+    rows, ours = both
+    first = rows["steps"] == 1
+    np.testing.assert_array_equal(rows["episode_status"] == "prepare", first)
+    np.testing.assert_array_equal(ours["status"] == "prepare", first)
+    assert not ours["reward"][first].any()
+    assert not rows["reward"][first].any()
+    np.testing.assert_array_equal(ours["steps"], rows["steps"])
+
+
+def test_lengths_of_the_course_are_the_same(both, setup):
+    assert set(both[0]["track_len"]) == {setup.track.length_m}
+
+
+def test_training_episodes_start_where_our_cars_start(training, setup):
+    """The service moves the start on by a twentieth of a lap after every episode of training."""
+    rows, ours = training
+    recorded_start = ours["start"][rows["steps"] == 1].to_numpy()
+    assert len(recorded_start) == 560
+    one = Referee(setup, 1)
+    own_start = []
+    for _ in recorded_start:
+        one.reset()
+        own_start.append(one.start_ndist[0])
+    away = (recorded_start - own_start + 0.5) % 1 - 0.5
+    np.testing.assert_allclose(away, 0, atol=1e-9)
+
+
+def test_evaluation_episodes_start_at_the_start_line(evaluation):
+    rows, ours = evaluation
+    start = ours["start"][rows["steps"] == 1].to_numpy()
+    np.testing.assert_allclose((start + 0.5) % 1 - 0.5, 0, atol=1e-9)
+
+
+def test_a_car_stands_at_its_start_until_it_is_released(training, setup):
+    """The pose of the prepare step is the start pose of the rule, but for a few millimetres of settling."""
+    rows, ours = training
+    first = rows["steps"] == 1
+    pose = setup.track.start_pose(ours["start"][first].to_numpy())
+    x_m, y_m = pose.x + FRONT_M * np.cos(pose.yaw_rad), pose.y + FRONT_M * np.sin(pose.yaw_rad)
+    away_m = np.hypot(rows["X"][first] - x_m, rows["Y"][first] - y_m)
+    assert away_m.max() < 0.02
+    turned = (np.radians(rows["yaw"][first]) - pose.yaw_rad + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(turned).max() < np.radians(3)
+
+
+def test_poses_from_the_middle_of_a_lap_are_judged_as_in_the_whole_lap(training, setup):
+    rows, ours = training
+    steps = rows.groupby("episode")["steps"].transform("max")
+    middle = rows.index[(rows["steps"] == 30) & (steps > 31)].to_numpy()[:50]
+    referee = Referee(setup, len(middle))
+    referee.reset(start_ndist=ours["start"].to_numpy()[middle])
+    referee.resume(rows["steps"].to_numpy()[middle], rows["progress"].to_numpy()[middle])
+    after = rows.iloc[middle + 1]
+    yaw_rad = np.radians(after["yaw"].to_numpy())
+    x_m, y_m = after["X"] - FRONT_M * np.cos(yaw_rad), after["Y"] - FRONT_M * np.sin(yaw_rad)
+    referee.see(CarState(x_m.to_numpy(), y_m.to_numpy(), yaw_rad, *np.zeros((3, len(middle)))))
+    np.testing.assert_allclose(referee.judge().progress, after["progress"], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(referee.steps, after["steps"])

@@ -1,0 +1,45 @@
+import dataclasses
+import re
+
+import pytest
+import yaml
+
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.evaluation import EvaluateConfig
+from deepracer_exp.config.options import conf_dir, groups, options
+
+PROTOCOLS = options("evaluation")
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_protocol_composes_and_has_the_keys_of_its_dataclass(name):
+    overrides = ["run=x", f"evaluation={name}"]
+    config, composition = compose_evaluation(overrides)
+    assert composition.choices == {"evaluation": name}
+    assert list(composition.mapping["evaluation"]) == list(dataclasses.asdict(config.evaluation))
+    assert set(composition.mapping) == {field.name for field in dataclasses.fields(EvaluateConfig)}
+
+
+@pytest.mark.parametrize("file", ["evaluate", *(f"evaluation/{name}" for name in PROTOCOLS)])
+def test_every_key_is_explained(file):
+    lines = (conf_dir() / f"{file}.yaml").read_text().splitlines()
+    for above, line in zip(["", *lines], lines, strict=False):
+        if re.match(r"(?!defaults)\w+:", line):
+            assert above.startswith("#"), f"{file}: {line} has no comment above it"
+
+
+def test_the_entry_point_is_its_group_and_a_few_keys():
+    assert groups("evaluate") == ["evaluation"]
+    entry = yaml.safe_load((conf_dir() / "evaluate.yaml").read_text())
+    assert set(entry) - {"defaults"} == {f.name for f in dataclasses.fields(EvaluateConfig)} - {"evaluation"}
+
+
+def test_a_run_may_look_like_a_number():
+    assert compose_evaluation(["run=12e45678"])[0].run == "12e45678"
+    assert compose_evaluation(["run=x", "checkpoint=000012"])[0].checkpoint == "000012"
+
+
+@pytest.mark.parametrize("tracks", ["Oval_track", "all", "[Oval_track,AWS_track]"])
+def test_tracks_are_one_or_several_or_all(tracks):
+    found = compose_evaluation(["run=x", f"evaluation.tracks={tracks}"])[0].evaluation.tracks
+    assert found in ("Oval_track", "all", ("Oval_track", "AWS_track"))

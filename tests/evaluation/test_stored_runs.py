@@ -1,0 +1,227 @@
+"""Runs and checkpoints read back, by function and by command."""
+
+import io
+import json
+import os
+import pickle
+import re
+import shutil
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from rich.console import Console
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.report import table
+from deepracer_exp.evaluation.result import Evaluation, Group
+from deepracer_exp.evaluation.run import read_run
+from deepracer_exp.evaluation.stewards import Attempt
+
+
+@pytest.fixture
+def run_dir(trained, tmp_path) -> Path:
+    """A copy of a trained run of one's own, under `runs/tiny/`."""
+    original = trained().folder
+    return Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
+
+
+@pytest.fixture
+def read(tmp_path):
+    def go(run: object, checkpoint: str = "best"):
+        stored = read_run(str(run), tmp_path / "runs", None)
+        return read_checkpoint(stored.experiment, stored.checkpoints, checkpoint)
+
+    return go
+
+
+def archive_of(run_dir: Path) -> Path:
+    (file,) = (run_dir / "checkpoints" / "best").resolve().rglob("state.tdz")
+    return file
+
+
+def weights(stored) -> torch.Tensor:
+    return torch.cat([value.flatten() for value in stored.networks.state_dict().values()])
+
+
+def refusal(read, *arguments) -> str:
+    with pytest.raises(BadInput) as refused:
+        read(*arguments)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def test_a_run_is_found_by_folder_name_beginning_and_path_under_runs_dir(run_dir, read):
+    name = run_dir.name
+    found = [read(run) for run in (run_dir, name, f"tiny/{name}", name[:11])]
+    assert all(torch.equal(weights(found[0]), weights(stored)) for stored in found)
+    assert found[0].counters["env_steps"] > 0
+
+
+def test_best_last_and_the_number_lead_to_checkpoints(run_dir, read):
+    last = read(run_dir, "last")
+    again = read(run_dir, last.path.name)
+    short = read(run_dir, last.path.name.lstrip("0"))
+    assert last.path == again.path == short.path
+    assert torch.equal(weights(last), weights(again))
+
+
+def test_a_beginning_that_several_runs_have_is_refused(run_dir, read):
+    shutil.copytree(run_dir, run_dir.with_name(f"{run_dir.name}-2"), symlinks=True)
+    assert "2 runs are meant" in refusal(read, run_dir.name[:8])
+    assert read(run_dir.name).path.parents[1] == run_dir
+
+
+def test_a_missing_run_is_told_the_nearest(run_dir, read):
+    assert run_dir.name in refusal(read, run_dir.name.replace("seed0", "seed1"))
+    assert "mlflow.db" in refusal(read, "0" * 32)
+
+
+def test_a_missing_checkpoint_is_told_those_that_are_there(run_dir, read):
+    assert "best, last" in refusal(read, run_dir, "77")
+
+
+def test_a_flipped_byte_in_a_tensor_is_noticed(run_dir, read):
+    file = archive_of(run_dir)
+    with zipfile.ZipFile(file) as archive:
+        member = archive.getinfo("tensor_00000002.memmap")
+    content = bytearray(file.read_bytes())
+    content[member.header_offset + 1000] ^= 1
+    file.write_bytes(content)
+    assert "torn: checksum of tensor_00000002.memmap is wrong" in refusal(read, run_dir)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_a_truncated_checkpoint_is_refused(run_dir, read, share):
+    file = archive_of(run_dir)
+    os.truncate(file, int(file.stat().st_size * share))
+    assert "torn" in refusal(read, run_dir)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "state.json", "state.tdz"])
+def test_a_checkpoint_without_one_of_its_files_is_refused(run_dir, read, name):
+    (file,) = (run_dir / "checkpoints" / "best").resolve().rglob(name)
+    file.unlink()
+    assert name in refusal(read, run_dir)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"format": 1}', b"\xff\xfe"])
+def test_a_manifest_that_is_none_is_refused(run_dir, read, content):
+    (run_dir / "checkpoints" / "best" / "manifest.json").write_bytes(content)
+    refusal(read, run_dir)
+
+
+class Trap:
+    """Tells when it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("unpickled",)
+
+
+def test_a_pickle_is_never_loaded(run_dir, read, monkeypatch):
+    monkeypatch.chdir(run_dir)
+    trap = pickle.dumps(Trap())
+    file = archive_of(run_dir)
+    beside = file.with_name("state.pt")
+    beside.write_bytes(trap)
+    assert "pickle is never loaded" in refusal(read, run_dir)
+    beside.unlink()
+    with zipfile.ZipFile(file, "a") as archive:
+        archive.writestr("other.pickle", trap)
+    assert "pickle is never loaded" in refusal(read, run_dir)
+    folder = run_dir / "checkpoints"
+    shutil.rmtree(folder)
+    folder.mkdir()
+    (folder / "best").write_bytes(trap)
+    assert "pickle is never loaded" in refusal(read, run_dir)
+    assert not Path("unpickled").exists()
+
+
+def change_config(run_dir: Path, group: str, **values: object) -> None:
+    file = run_dir / "config.yaml"
+    mapping = yaml.safe_load(file.read_text())
+    mapping[group] |= values
+    file.write_text(yaml.safe_dump(mapping))
+
+
+def test_a_checkpoint_of_another_network_is_refused(run_dir, read):
+    change_config(run_dir, "network", hidden=[32])
+    assert "does not fit" in refusal(read, run_dir)
+
+
+def test_an_unknown_key_in_a_run_s_configuration_is_refused(run_dir, read):
+    change_config(run_dir, "network", wings=2)
+    text = refusal(read, run_dir)
+    assert "config.yaml: network.wings: no such key" in text
+
+
+@pytest.mark.parametrize("text", ["", "- a", "a: [", "\x00"])
+def test_a_configuration_that_is_none_is_refused(run_dir, read, text):
+    (run_dir / "config.yaml").write_text(text)
+    assert "config.yaml" in refusal(read, run_dir)
+
+
+def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
+    ended = call("evaluate", f"run={run_dir.name}", "evaluation.trials=2", "evaluation.held_out=aws")
+    assert ended.code == 0, ended.stderr
+    assert re.search(r"reinvent_base +usual +\d of 2", ended.stdout)
+    assert re.search(r"reinvent_base +held out +\d of 2", ended.stdout)
+    (file,) = (run_dir / "evaluations").iterdir()
+    assert str(file.relative_to(run_dir)) in ended.stdout
+    found = json.loads(file.read_text())
+    assert found["checkpoint"]["env_steps"] > 0
+    assert found["evaluation"]["trials"] == 2
+    assert [group["condition"] for group in found["groups"]] == ["usual", "held_out"]
+    assert all(len(group["attempts"]) == 2 for group in found["groups"])
+    low, high = found["groups"][0]["completion"]["interval"]
+    assert low <= found["groups"][0]["completion"]["mean"] <= high
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), ("run: missing",)),
+        (("run=nowhere",), ("run=nowhere: no such run",)),
+        (("run=x", "checkpoint=newest"), ("checkpoint", "best, last")),
+        (("run=x", "evaluation=sumit"), ("sumit", "summit")),
+        (("run=x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
+        (("run=x", "evaluation.trials=0"), ("evaluation.trials=0",)),
+        (("run=x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
+    ],
+)
+def test_bad_input_is_one_line(call, arguments, words):
+    ended = call("evaluate", *arguments)
+    assert ended.code == 2
+    assert all(word in ended.complaint for word in words)
+    assert ended.stdout == ""
+
+
+def test_a_video_needs_a_library_to_draw_with(call, monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    monkeypatch.setattr("sys.platform", "linux")
+    ended = call("evaluate", "run=x", "--video", "lap.mp4")
+    assert ended.code == 2
+    assert "EGL nor OSMesa" in ended.complaint
+
+
+@pytest.mark.parametrize(
+    ("width", "median", "intervals"), [(200, True, True), (90, False, True), (60, False, False)]
+)
+def test_a_narrow_table_leaves_out_columns_but_cuts_no_figure(protocol, width, median, intervals):
+    laps = [
+        Attempt(
+            trial=at, begin_s=0, time_s=10.25 + at, penalty_s=0, resets=at, progress=100, end="lap_complete"
+        )
+        for at in range(3)
+    ]
+    evaluation = Evaluation((Group("reinvent_base", "usual", (0, 1, 2), tuple(laps)),))
+    console = Console(width=width, file=io.StringIO())
+    console.print(table(evaluation, protocol("summit"), ["reinvent_base"], console))
+    text = console.file.getvalue()
+    assert "11.25" in text
+    assert ("median" in text, "(10.25" in text) == (median, intervals)
+    assert "\N{HORIZONTAL ELLIPSIS}" not in text

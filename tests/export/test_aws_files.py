@@ -1,0 +1,85 @@
+import json
+
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.errors import BadInput
+from deepracer_exp.export.aws_files import AwsFiles, aws_files, write_aws_files
+from deepracer_exp.formats.hyperparameters import read_hyperparameters
+
+REWARD = "def reward_function(params):\n    return params['speed']\n"
+
+
+def files(*overrides: str) -> AwsFiles:
+    experiment, _ = compose_experiment(overrides)
+    return aws_files(experiment, build_action_space(experiment.action_space), REWARD)
+
+
+@pytest.mark.parametrize("space", ["console", "discrete", "grid_fine", "continuous"])
+def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
+    overrides = (
+        *(f"action_space={space}", "algorithm.lr=5e-4", "algorithm.batch_size=128", "algorithm.epochs=7"),
+        *("algorithm.discount=0.97", "algorithm.entropy_coeff=0.02", "budget.iterations=33"),
+        *("algorithm.episodes_per_iteration=40", "algorithm.frames_per_iteration=null"),
+        "algorithm.loss_type='mean squared error'",
+    )
+    exported = files(*overrides)
+    write_aws_files(exported, tmp_path / "aws")
+    sent, _ = compose_experiment(overrides)
+    back, _ = compose_experiment([f"custom_files={tmp_path / 'aws'}"])
+    assert back.algorithm == sent.algorithm
+    assert back.budget.iterations == 33
+    ours, theirs = (build_action_space(experiment.action_space) for experiment in (sent, back))
+    assert type(ours) is type(theirs)
+    for field in vars(ours):
+        assert getattr(ours, field).tolist() == getattr(theirs, field).tolist()
+    assert (tmp_path / "aws" / "reward_function.py").read_text() == REWARD
+    assert exported.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "value"),
+    [
+        ("algorithm.batch_size=1024", "batch_size", 512),
+        ("algorithm.batch_size=100", "batch_size", 64),
+        ("algorithm.batch_size=16", "batch_size", 32),
+        ("algorithm.lr=0.01", "lr", 0.001),
+        ("algorithm.epochs=20", "num_epochs", 10),
+        ("algorithm.epochs=1", "num_epochs", 3),
+    ],
+)
+def test_what_the_console_does_not_take_is_brought_into_its_range_and_told(tmp_path, override, key, value):
+    exported = files("algorithm.batch_size=64", override)
+    write_aws_files(exported, tmp_path)
+    learning = read_hyperparameters(tmp_path / "hyperparameters.json")
+    assert getattr(learning, key) == value
+    assert learning.beyond_console() == ()
+    assert any(note.startswith(f"hyperparameters.json: {key}={value}, as near to") for note in exported.notes)
+
+
+def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_told():
+    exported = files("algorithm.batch_size=64")
+    assert json.loads(exported.texts["hyperparameters.json"])["num_episodes_between_training"] == 20
+    assert "num_episodes_between_training=20" in exported.notes[0]
+    assert "8192 control steps" in exported.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["action_space=grid", "action_space.steering_levels=17"], "34 actions"),
+        (
+            ["action_space=continuous", "action_space.speed.low=0.3"],
+            "speed from 0.3 to 3; the AWS console takes 0.5",
+        ),
+    ],
+)
+def test_an_action_space_beyond_the_console_stays_as_it_is_and_is_told(overrides, words):
+    assert any(words in note for note in files(*overrides).notes)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match=r"file.*cannot be written"):
+        write_aws_files(files(), tmp_path / "file")

@@ -1,0 +1,72 @@
+"""What ends a run, and what is told of it: stopping rules and budgets in real trainings."""
+
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.formats.run_files import read_run
+from deepracer_exp.training.stopping_replay import replay
+
+HOPELESS = (
+    *("stopping=entropy", "stopping.window=1", "stopping.converged=null", "stopping.collapsed=null"),
+    *("stopping.not_learning.warmup=0", "stopping.not_learning.patience=2", "algorithm.lr=1e-9"),
+    *("stopping.not_learning.completion_gain=50", "stopping.not_learning.completion_poor=100"),
+)
+
+
+def test_a_run_that_does_not_learn_is_ended_and_called_hopeless(trained):
+    ended = trained(*HOPELESS)
+    assert ended.code == 0, ended.stderr
+    assert ended.summary["status"] == "hopeless"
+    assert ended.summary["reason"].startswith("not learning: entropy still at 100.0%")
+    assert ended.summary["iteration"] == 3
+    assert ended.stdout.startswith("\nhopeless: not learning: ")
+    stopping = ended.summary["stopping"]
+    assert (stopping["rule"], stopping["hopeless"]) == ("not_learning", True)
+    assert stopping["thresholds"]["patience"] == 2
+    assert 0.99 < stopping["values"]["entropy"] <= 1
+
+
+def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained):
+    ended = trained(*HOPELESS)
+    found = replay(read_run(ended.folder), compose_experiment(HOPELESS)[0].stopping, "")
+    assert found.iteration == ended.summary["iteration"]
+    assert found.decision.as_dict() == ended.summary["stopping"]
+    assert found.saved_steps == 0
+
+
+def test_a_run_that_its_budget_ends_has_no_decision(trained):
+    ended = trained("stopping=entropy")
+    assert ended.summary["reason"] == "budget reached: env_steps"
+    assert ended.summary["stopping"] is None
+
+
+def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
+    command = tmp_path / "alert.sh"
+    command.write_text('#!/bin/sh\necho "$1" >> told.txt\n')
+    command.chmod(0o755)
+    ended = trained(f"budget.alert_command={command}")
+    # Commands run beside the training and each other.
+    told = sorted((ended.cwd / "told.txt").read_text().splitlines())
+    assert told == [
+        "100 % of budget.env_steps used: 4,096 steps of 4,096 steps",
+        "50 % of budget.env_steps used: 2,048 steps of 4,096 steps",
+    ]
+    log = (ended.folder / "log.txt").read_text()
+    assert all(message in log for message in told)
+
+
+def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
+    shared = ("budget.experiment_env_steps=6144", "budget.price_per_hour=3600")
+    first = train_here(*shared)
+    assert (first.summary["reason"], first.summary["env_steps"]) == ("budget reached: env_steps", 4096)
+    assert first.summary["cost"] == pytest.approx(first.summary["wall_clock_s"], abs=0.1)  # 1 a second
+    both = train_here(*shared)
+    second = read_run(both.folders[1]).summary
+    assert (second["reason"], second["env_steps"]) == ("budget reached: experiment_env_steps", 2048)
+    third = train_here(*shared)
+    assert third.code == 2
+    assert (
+        "budget.experiment_env_steps=6144: the runs in runs/tiny have used 6,144 already" in third.complaint
+    )
+    assert len(third.folders) == 2
+    assert train_here(*shared, "name=another").code == 0

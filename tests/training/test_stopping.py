@@ -1,0 +1,284 @@
+import functools
+import json
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.stopping import StoppingConfig
+from deepracer_exp.training.stopping import Decision, Stopping, entropy_share
+
+ACTIONS = 15
+LONG = 400
+"""Iterations of a history."""
+
+
+@functools.cache
+def rule(*overrides: str, option: str = "entropy") -> StoppingConfig:
+    return compose_experiment([f"stopping={option}", *overrides])[0].stopping
+
+
+def stopped_at(
+    rows: Sequence[dict], config: StoppingConfig, actions: int | None = ACTIONS
+) -> tuple[int, Decision] | tuple[None, None]:
+    stopping = Stopping(config, actions)
+    for number, row in enumerate(rows, 1):
+        decision = stopping.observe(row)
+        if decision is not None:
+            return number, decision
+    return None, None
+
+
+def history(
+    length: int = LONG,
+    *,
+    completion=50.0,
+    entropy=0.5,
+    mean_return=10.0,
+    laps_per_iteration=5.0,
+    lap_share=None,
+    held_out=None,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> list[dict]:
+    """Rows of metrics.jsonl; each value a number or a function of the iteration, entropy as a share of chance."""
+    random = np.random.default_rng(seed)
+
+    def at(value, iteration: int) -> float | None:
+        return value(iteration) if callable(value) else value
+
+    rows, laps = [], 0.0
+    for iteration in range(1, length + 1):
+        laps += at(laps_per_iteration, iteration)
+        row = {
+            "iteration": iteration,
+            "env_steps": 8192 * iteration,
+            "wall_clock_s": 0.5 * iteration,
+            "laps": round(laps),
+            "best_lap_time_s": None,
+            "completion": min(100.0, at(completion, iteration) + noise * random.normal()),
+            "mean_return": at(mean_return, iteration) * (1 + 0.01 * noise * random.normal()),
+            "entropy": at(entropy, iteration) * math.log(ACTIONS),
+            "lap_share": at(lap_share, iteration),
+        }
+        if held_out is not None and iteration % 5 == 0:
+            row["held_out_completion"] = at(held_out, iteration)
+        rows.append(row)
+    return rows
+
+
+def learned(until: int):
+    """Rises from 10 to 98 until an iteration, and stays."""
+    return lambda iteration: 10 + 88 * min(1.0, iteration / until)
+
+
+def converging(until: int, **more) -> list[dict]:
+    return history(
+        **{
+            "completion": learned(until),
+            "mean_return": learned(until),
+            "laps_per_iteration": lambda i: 20 * min(1.0, i / until),
+            "entropy": lambda i: 1 - 0.7 * min(1.0, i / until),
+        }
+        | more
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+@pytest.mark.parametrize("until", [30, 120])
+def test_a_run_that_has_learned_ends_as_converged_when_patience_is_over(until, noise):
+    number, decision = stopped_at(converging(until, noise=noise), rule())
+    assert decision.rule == "converged"
+    assert not decision.hopeless
+    assert number == pytest.approx(until + 80, abs=10)
+
+
+@pytest.mark.parametrize(
+    "still",
+    [
+        {"completion": learned(LONG)},
+        {"mean_return": learned(LONG)},
+        {"laps_per_iteration": lambda i: 20 * i / LONG},
+        {"entropy": lambda i: 1 - 0.7 * i / LONG},
+    ],
+    ids=lambda still: next(iter(still)),
+)
+def test_a_run_in_which_anything_still_moves_has_not_converged(still):
+    assert stopped_at(converging(30, **still), rule()) == (None, None)
+
+
+def test_a_run_that_drives_worse_than_it_did_has_not_converged():
+    worse = converging(30, completion=lambda i: 98.0 if i < 60 else 80.0)
+    assert stopped_at(worse, rule()) == (None, None)
+
+
+def test_a_policy_that_stays_random_is_not_learning():
+    number, decision = stopped_at(history(completion=11.0, entropy=0.999, laps_per_iteration=0.0), rule())
+    assert decision.rule == "not_learning"
+    assert decision.hopeless
+    assert number == pytest.approx(42, abs=3)
+
+
+@pytest.mark.parametrize(
+    "sign",
+    [{"completion": lambda i: 11 + 0.3 * i}, {"entropy": lambda i: 1 - 0.005 * i}, {"completion": 60.0}],
+    ids=["moves", "decides", "drives"],
+)
+def test_a_policy_that_shows_any_sign_of_learning_goes_on(sign):
+    rows = history(60, **{"completion": 11.0, "entropy": 0.999, "laps_per_iteration": 0.0} | sign)
+    assert stopped_at(rows, rule()) == (None, None)
+
+
+def test_a_policy_without_entropy_that_drives_badly_has_collapsed():
+    number, decision = stopped_at(history(completion=20.0, entropy=lambda i: max(0.01, 1 - 0.1 * i)), rule())
+    assert decision.rule == "collapsed"
+    assert decision.hopeless
+    assert number == pytest.approx(31, abs=3)
+
+
+def test_a_policy_without_entropy_that_drives_well_has_not_collapsed():
+    _, decision = stopped_at(history(completion=95.0, entropy=0.01), rule("stopping.converged=null"))
+    assert decision is None
+
+
+def falling(best_at: int = 50, **more) -> list[dict]:
+    """Held-out completion rises to 90 and falls to 50, as the return rises on."""
+    return history(
+        **{
+            "completion": learned(LONG),
+            "mean_return": learned(LONG),
+            "held_out": lambda i: 90 * min(1.0, i / best_at) if i <= best_at else max(50.0, 140 - i),
+        }
+        | more
+    )
+
+
+def test_a_fall_on_held_out_conditions_while_the_return_rises_is_overfitting():
+    number, decision = stopped_at(falling(), rule())
+    assert decision.rule == "overfitting"
+    assert not decision.hopeless
+    assert decision.values["held_out_completion_before"] > 85
+    assert 90 < number < 130
+
+
+@pytest.mark.parametrize(
+    "innocent",
+    [
+        {"held_out": None},
+        {"held_out": learned(LONG)},
+        {"held_out": 80.0},
+        {"held_out": lambda i: 80.0 + 4 * (-1) ** (i // 5)},
+        {"mean_return": lambda i: 100 - 0.2 * i},
+    ],
+    ids=["no evaluations", "rises", "holds", "wobbles", "the return falls, too"],
+)
+def test_without_such_a_fall_nothing_is_called_overfitting(innocent):
+    _, decision = stopped_at(falling(**innocent), rule())
+    assert decision is None
+
+
+def test_no_verdict_comes_before_its_warm_up():
+    lazy = [
+        f"stopping.{name}.warmup=200" for name in ("converged", "overfitting", "collapsed", "not_learning")
+    ]
+    for rows in (
+        converging(30),
+        history(completion=11.0, entropy=0.999),
+        history(completion=5.0, entropy=0.0),
+    ):
+        assert stopped_at(rows, rule(*lazy))[0] == 201
+
+
+def test_a_rule_of_null_never_stops_a_run():
+    rows = history(completion=11.0, entropy=0.999, laps_per_iteration=0.0)
+    assert stopped_at(rows, rule("stopping.not_learning=null", "stopping.converged=null")) == (None, None)
+
+
+def test_the_thresholds_that_are_given_decide():
+    rows = converging(30)
+    early, _ = stopped_at(rows, rule("stopping.converged.patience=40", "stopping.converged.warmup=0"))
+    late, _ = stopped_at(rows, rule("stopping.converged.patience=120"))
+    assert early + 70 < late
+
+
+def test_decisions_depend_on_the_rows_alone_so_that_a_resumed_run_ends_where_it_would_have():
+    rows, config = converging(60, noise=0.5), rule()
+    number, decision = stopped_at(rows, config)
+    from_file = [json.loads(json.dumps(row)) for row in rows]
+    assert stopped_at(from_file, config) == (number, decision)
+
+
+def test_iterations_in_which_no_episode_ended_break_nothing():
+    rows = [
+        row | ({"completion": None, "mean_return": None} if i % 3 else {})
+        for i, row in enumerate(converging(30))
+    ]
+    number, decision = stopped_at(rows, rule())
+    assert decision.rule == "converged"
+    assert number == pytest.approx(112, abs=10)
+    never = [row | {"completion": None, "mean_return": None} for row in converging(30)]
+    assert stopped_at(never, rule()) == (None, None)
+
+
+def test_the_entropy_of_a_choice_by_chance_is_one_whatever_the_number_of_actions():
+    for actions in (2, 5, 27):
+        assert entropy_share(math.log(actions), math.nan, actions) == pytest.approx(1)
+    assert entropy_share(0.0, math.nan, 1) == 0.0
+
+
+@pytest.mark.parametrize("std_at_start", [1.0, 0.5, 0.05])
+def test_a_continuous_policy_is_measured_by_its_scatter_at_the_start(std_at_start):
+    def entropy(std: float) -> float:
+        return 2 * (0.5 * math.log(2 * math.pi * math.e) + math.log(std))
+
+    start = entropy(std_at_start)
+    for share in (1.5, 1.0, 0.5, 0.01):
+        assert entropy_share(entropy(share * std_at_start), start, None) == pytest.approx(share)
+
+
+def test_a_continuous_policy_that_keeps_its_scatter_is_not_learning():
+    rows = history(completion=11.0, entropy=-0.3, laps_per_iteration=0.0)
+    assert stopped_at(rows, rule(), None)[1].rule == "not_learning"
+
+
+def test_reliable_looks_at_the_share_of_laps():
+    rows = history(lap_share=lambda i: None if i < 5 else i / 100)
+    number, decision = stopped_at(rows, rule("stopping.episodes=20", option="reliable"))
+    assert number == 90
+    assert str(decision) == "reliable: 90% of the last 20 episodes completed the lap"
+    assert stopped_at(rows, rule(option="none")) == (None, None)
+
+
+@pytest.mark.parametrize("metric", ["completion", "mean_return", "held_out_completion"])
+def test_plateau_looks_at_one_number(metric):
+    rows = falling(completion=learned(100), mean_return=learned(200))
+    number, decision = stopped_at(rows, rule(f"stopping.metric={metric}", option="plateau"))
+    last_growth = {"completion": 100, "mean_return": 200, "held_out_completion": 50}[metric]
+    assert number == pytest.approx(last_growth + 80, abs=12)
+    assert decision.rule == "plateau"
+
+
+def every_decision() -> Iterator[Decision]:
+    for rows in (
+        *(converging(30), falling()),
+        *(history(completion=11.0, entropy=0.999), history(completion=5.0, entropy=0.0)),
+    ):
+        yield stopped_at(rows, rule())[1]
+    yield stopped_at(converging(30), rule(option="plateau"))[1]
+
+
+def test_a_decision_tells_rule_values_and_thresholds_as_json_and_tags():
+    rules = set()
+    for decision in every_decision():
+        told = json.loads(json.dumps(decision.as_dict()))
+        assert told["rule"] in str(decision).replace(" ", "_")
+        assert told["values"]
+        assert told["thresholds"]["patience"] > 0
+        assert all(math.isfinite(value) for value in told["values"].values())
+        tags = decision.tags()
+        assert tags["stopping.rule"] == decision.rule
+        assert {f"stopping.threshold.{key}" for key in decision.thresholds} <= tags.keys()
+        rules.add(decision.rule)
+    assert rules == {"converged", "overfitting", "collapsed", "not_learning", "plateau"}

@@ -1,0 +1,87 @@
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import RewardConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.reward_source import load_reward_source
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.tracks.track import Track
+from deepracer_exp.validation import check as checking
+from deepracer_exp.validation import reward_map
+from deepracer_exp.validation.check import Check, look_closer, other_direction, read, try_scenes
+from deepracer_exp.validation.laps import Lap, action_space_laps
+from deepracer_exp.validation.probe import Probe
+from deepracer_exp.validation.survey import Surveyor, memory_of
+
+
+@pytest.fixture(scope="session")
+def experiment() -> Experiment:
+    return compose_experiment([])[0]
+
+
+@pytest.fixture(scope="session")
+def race(experiment: Experiment) -> RaceSetup:
+    return read(experiment).setup
+
+
+@pytest.fixture(scope="session")
+def against(experiment: Experiment) -> Track:
+    return other_direction(experiment)
+
+
+@pytest.fixture(scope="session")
+def laps(race: RaceSetup) -> list[Lap]:
+    return action_space_laps(race)
+
+
+@pytest.fixture
+def race_with(race: RaceSetup, tmp_path: Path) -> Callable[..., RaceSetup]:
+    """Return the race with the reward function of a text."""
+
+    def build(text: str, time_limit_s: float = 60.0) -> RaceSetup:
+        file = tmp_path / "mine.py"
+        file.write_text(text, encoding="utf-8")
+        config = RewardConfig(name="", file=str(file), constants={}, time_limit_s=time_limit_s)
+        return dataclasses.replace(race, reward=load_reward_source(config), reward_time_limit_s=time_limit_s)
+
+    return build
+
+
+@pytest.fixture
+def surveyor_of() -> Callable[[RaceSetup], Surveyor]:
+    def build(race: RaceSetup) -> Surveyor:
+        return Surveyor(race, memory_of(race, Probe(race.reward, race.reward_time_limit_s)))
+
+    return build
+
+
+@pytest.fixture
+def coarsely(laps: list[Lap], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ask fewer questions than a racer would want asked, and drive the laps once."""
+
+    def driven(setup: RaceSetup) -> list[Lap]:
+        same = (setup.track.name, setup.track.reversed, setup.actions.n) == ("reinvent_base", False, 15)
+        return laps if same else action_space_laps(setup)
+
+    monkeypatch.setattr(checking, "action_space_laps", driven)
+    monkeypatch.setattr(checking, "_DETAILS", ((float("inf"), 0.2),))
+    monkeypatch.setattr(checking, "_SAMPLES", ((float("inf"), 400),))
+    monkeypatch.setattr(reward_map, "_DOTS_PER_INCH", 40)
+
+
+@pytest.fixture
+def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None) -> Callable[..., Check]:
+    """Find out everything about the reward function of a text."""
+
+    def build(text: str, time_limit_s: float = 60.0) -> Check:
+        check = Check(setup=race_with(text, time_limit_s), console=[])
+        try_scenes(check, against)
+        if not check.failures:
+            look_closer(check, against)
+        return check
+
+    return build

@@ -1,0 +1,176 @@
+import pytest
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.validation.check import read
+from deepracer_exp.validation.probe import NOT_CALLED, Probe
+from deepracer_exp.validation.survey import memory_of
+
+
+def function(body: str, before: str = "") -> str:
+    return f"{before}def reward_function(params):\n    " + body.replace("\n", "\n    ") + "\n"
+
+
+DELTA = """\
+last = {"progress": 0.0, "steps": 0.0}
+def reward_function(params):
+    gained = params["progress"] - last["progress"] if params["steps"] == last["steps"] + 1 else 0.0
+    last["progress"], last["steps"] = params["progress"], params["steps"]
+    return gained
+"""
+GOOD = function('return params["speed"] - 5.0 * params["is_offtrack"] + params["progress"] / params["steps"]')
+
+
+def test_a_good_function_is_told_nothing(check_of):
+    check = check_of(GOOD)
+    assert check.failures == []
+    assert check.warnings == []
+    assert [tried.name for tried in check.tried][2] == "off the track"
+    assert check.tried[2].answer.reward < 0 < check.tried[1].answer.reward
+    assert all(tried.microseconds > 0 for tried in check.tried)
+    assert check.lowest < 0 < check.highest
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ('return 1 / (params["progress"] != 100)', "raised ZeroDivisionError: division by zero in line 2 of"),
+        (
+            "x = 1\nif params['is_offtrack']:\n    x = params['nothing']\nreturn x",
+            "raised KeyError: 'nothing' in line 4",
+        ),
+        ("exit(1)", "raised SystemExit: 1 in line 2"),
+        ("pass", "line 2 returned None; a finite number"),
+        ("x = 1j\nreturn x", "line 3 returned 1j; a finite number"),
+        ('return float("nan")', "line 2 returned nan; a finite number"),
+        ("return 100001", "line 2 returned 100001; a finite number from -100000 to 100000"),
+        ('return "1"', "line 2 returned '1'; a finite number"),
+    ],
+)
+def test_what_would_end_a_training_is_told_with_its_line(check_of, body, words):
+    check = check_of(function(body))
+    assert words in check.failures[0]
+    assert check.warnings == []
+
+
+def test_a_failure_in_one_situation_names_it(check_of):
+    (failure,) = check_of(function('return 1 / (not params["is_offtrack"])')).failures
+    assert failure.endswith(", at off the track")
+
+
+def test_a_failure_outside_the_named_situations_is_found_and_described(check_of):
+    (failure,) = check_of(function('return 1 / (params["steering_angle"] < 25)')).failures
+    assert "raised ZeroDivisionError" in failure
+    assert "steering 30" in failure
+    assert "situations)" in failure
+
+
+def test_a_function_that_hangs_is_called_once(check_of):
+    check = check_of(function("while True:\n    pass"), time_limit_s=0.3)
+    (failure,) = check.failures
+    assert "took longer than the time limit of 0.3 s" in failure
+    assert [tried.answer.failure == NOT_CALLED for tried in check.tried] == [False, *[True] * 5]
+
+
+def test_whatever_aws_turns_into_a_float_is_fine(check_of):
+    values = '[numpy.float32(1.5), numpy.array(1.5), True, 3][int(params["x"] * 100) % 4]'
+    assert check_of(function(f"return {values}", "import numpy\n")).failures == []
+
+
+def test_prints_and_changed_params_do_no_harm(check_of, capsys):
+    check = check_of(
+        function(
+            'print(params["x"])\nparams["waypoints"].clear()\nparams["steps"] = 0\nreturn params["speed"]'
+        )
+    )
+    assert check.failures == []
+    assert capsys.readouterr().out == ""
+
+
+def test_branches_that_are_never_taken_are_told_with_their_lines(check_of):
+    loop = 'for d in params["objects_distance"]:\n    r -= d'
+    body = f'r = params["speed"]\nif r > 100:\n    r = 7\n    r += 1\n{loop}\nreturn r'
+    told = [line for line in check_of(function(body)).warnings if "never gets to" in line]
+    assert "lines 4 to 5 in 406 situations: r = 7" in told[0]
+    assert "line 7" in told[1]
+    assert told[1].endswith("(there are no objects on the road here)")
+
+
+CONDITIONS = [
+    'params["steps"] == 2',
+    'params["progress"] == 100',
+    'params["is_offtrack"]',
+    'not params["all_wheels_on_track"]',
+    'params["is_reversed"]',
+    'params["is_left_of_center"]',
+    'params["closest_waypoints"][1] == 0',
+    'params["speed"] >= 3',
+    'abs(params["steering_angle"]) > 25',
+]
+
+
+def test_what_happens_in_a_training_is_no_unreachable_branch(check_of):
+    branches = "".join(f"if {condition}:\n    r += {i}\n" for i, condition in enumerate(CONDITIONS))
+    told = check_of(function(f'r = params["speed"]\n{branches}return r')).warnings
+    assert not any("never gets to" in line for line in told)
+
+
+def test_a_constant_is_told_in_one_line(check_of):
+    (told,) = check_of(function("return 1.0")).warnings
+    assert "pays 1 whatever the car does" in told
+
+
+def test_a_reward_of_chance_is_told(check_of):
+    told = check_of(function("return random.random()", "import random\n")).warnings
+    assert any("draws random numbers" in line for line in told)
+
+
+def test_a_function_that_divides_by_the_length_between_waypoints_is_warned_of_the_seam(check_of):
+    body = (
+        'a, b = (params["waypoints"][i] for i in params["closest_waypoints"])\n'
+        'return params["speed"] / math.hypot(b[0] - a[0], b[1] - a[1]) - 9 * params["is_offtrack"]'
+    )
+    check = check_of(function(body, "import math\n"))
+    assert check.failures == []
+    assert "which are one place: raised ZeroDivisionError" in check.warnings[0]
+
+
+def test_a_module_that_cannot_be_run_is_bad_input(check_of):
+    with pytest.raises(BadInput, match="cannot be run: raised NameError"):
+        check_of("x = nothing\n" + GOOD)
+
+
+def test_a_reward_batch_that_fails_is_a_failure(check_of):
+    check = check_of(GOOD + "\n\ndef reward_batch(params):\n    return 1.0\n")
+    assert "one number a car" in check.failures[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "memory"),
+    [
+        (GOOD, "none"),
+        (DELTA, "earlier calls"),
+        ("n = [0]\n" + function("n[0] += 1\nreturn n[0]"), "earlier calls"),
+        (function("return random.random()", "import random\n"), "chance"),
+    ],
+)
+def test_memory_and_chance_are_told_apart(race_with, text, memory):
+    race = race_with(text)
+    assert memory_of(race, Probe(race.reward, 60.0)) == memory
+
+
+def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with, monkeypatch):
+    from deepracer_exp.validation import check as checking
+
+    first = "done = []\n" + function(
+        "if not done:\n    done.append(sum(i % 3 for i in range(2000000)))\nreturn params['speed']"
+    )
+    race = race_with(first)
+    cost_s = checking._cpu_s_per_call(Probe(race.reward, 60.0), race)
+    assert cost_s < checking._SAMPLES[0][0]
+
+
+def test_several_tracks_are_refused_in_one_line():
+    from deepracer_exp.config.compose import compose_experiment
+
+    with pytest.raises(BadInput, match="on one track; accepted"):
+        read(compose_experiment(["track=[reinvent_base,Oval_track]"])[0])

@@ -1,0 +1,146 @@
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from deepracer_exp.env.reward_source import zoo_names
+from deepracer_exp.validation import check as checking
+from deepracer_exp.validation.check import read
+
+pytestmark = pytest.mark.usefixtures("coarsely")
+
+REWARD = "def reward_function(params):\n    return {pay}\n"
+
+
+def write(folder: Path, pay: str, name: str = "mine.py") -> str:
+    (folder / name).write_text(REWARD.format(pay=pay), encoding="utf-8")
+    return f"reward.file={name}"
+
+
+def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
+    ended = call("validate", "reward=progress_gain")
+    assert ended.code == 0
+    assert "AWS console: would take it" in ended.stdout
+    assert ended.stdout.splitlines()[-1].startswith("Verdict: can be trained")
+    picture = tmp_path / "progress_gain-reinvent_base.png"
+    assert picture.name in ended.stdout
+    assert imread(picture).shape[1] > 400
+
+
+def test_pictures_of_other_rewards_are_other_pictures(call, tmp_path):
+    for name, pay in (("a", "params['speed']"), ("b", "1.0")):
+        assert call("validate", write(tmp_path, pay), "-o", f"{name}.png").code == 0
+    pictures = [imread(tmp_path / f"{name}.png") for name in "ab"]
+    digests = {hashlib.sha256(picture.tobytes()).hexdigest() for picture in pictures}
+    assert len(digests) == 2
+    for picture in pictures:
+        assert np.ptp(picture[..., :3]) > 0.5
+
+
+def test_what_aws_would_refuse_is_told_and_refused_if_asked(call, tmp_path):
+    (tmp_path / "mine.py").write_text("import os\n\n\n" + REWARD.format(pay="params['speed'] + len(os.sep)"))
+    for extra, code in ((), 0), (("--strict",), 2):
+        ended = call("validate", "reward.file=mine.py", *extra)
+        assert ended.code == code
+        assert "line 1: import of os" in ended.stdout
+        assert "the AWS console would refuse it: 1 finding" in ended.stdout.splitlines()[-1]
+
+
+def test_what_cannot_be_used_here_exits_with_2_and_draws_nothing(call, tmp_path):
+    ended = call("validate", write(tmp_path, "1 / (not params['is_offtrack'])"))
+    assert ended.code == 2
+    assert "failed" in ended.stdout
+    assert ended.stdout.splitlines()[-1].startswith("Verdict: cannot be used: raised ZeroDivisionError")
+    assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("reward.file=nowhere.py",), ("nowhere.py", "No such file")),
+        (("reward=progress_gian",), ("progress_gain",)),
+        (("reward.file=no_function.py",), ("no function reward_function", "reward_functoin")),
+        (("reward.file=two_arguments.py",), ("must take one argument",)),
+        (("reward.file=syntax.py",), ("line 1", "not valid Python")),
+        (("trial=soon",), ("trial=soon", "trial=60s")),
+        (("track=[reinvent_base,Oval_track]",), ("one track",)),
+        (("track=nowhere",), ("no such track",)),
+    ],
+)
+def test_bad_input_is_one_line(call, tmp_path, arguments, words):
+    (tmp_path / "no_function.py").write_text("def reward_functoin(params):\n    return 1.0\n")
+    (tmp_path / "two_arguments.py").write_text("def reward_function(a, b):\n    return 1.0\n")
+    (tmp_path / "syntax.py").write_text("def reward_function(params)\n    return 1.0\n")
+    call("validate", *arguments).assert_bad_input(*words)
+
+
+def test_nothing_is_run_of_a_file_with_a_syntax_error(call, tmp_path):
+    (tmp_path / "mine.py").write_text("open('ran', 'w')\n\n\ndef reward_function(params):\n    return (\n")
+    call("validate", "reward.file=mine.py").assert_bad_input("not valid Python")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(call):
+    ended = call("validate", "reward=speed_on_track", "-o", "no/such/folder/map.png")
+    assert ended.code == 2
+    assert "--output no/such/folder/map.png: cannot be written" in ended.complaint
+
+
+@pytest.mark.parametrize("track", ["Straight_track", "Bowtie_track"])
+def test_open_and_crossing_tracks_are_drawn_too(call, tmp_path, track):
+    ended = call("validate", "reward=follow_center_line", f"track={track}", "track.direction=reversed")
+    assert ended.code == 0
+    assert (tmp_path / f"follow_center_line-{track}.png").exists()
+
+
+def test_a_continuous_action_space_and_a_single_action_are_fine(call, tmp_path):
+    assert call("validate", "reward=speed_on_track", "action_space=continuous").code == 0
+    one = "action_space.actions=[{steering_angle: 0, speed: 1}]"
+    assert call("validate", "reward=speed_on_track", one).code == 0
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_the_console_would_take_every_reward_of_the_zoo(name):
+    from deepracer_exp.config.compose import compose_experiment
+
+    assert read(compose_experiment([f"reward={name}"])[0]).console == []
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_every_reward_of_the_zoo_can_be_trained(race_of_zoo, against, name):
+    check = race_of_zoo(name)
+    checking.try_scenes(check, against)
+    checking.look_closer(check, against)
+    assert check.failures == []
+    assert not any("reward_batch" in line or "one place" in line for line in check.warnings)
+    if name != "progress_delta":
+        assert check.memory == "none"
+
+
+@pytest.fixture
+def race_of_zoo(race):
+    import dataclasses
+
+    from deepracer_exp.config.driving import RewardConfig
+    from deepracer_exp.env.reward_source import load_reward_source
+
+    def build(name: str) -> checking.Check:
+        source = load_reward_source(RewardConfig(name=name, file=None, constants={}, time_limit_s=60.0))
+        setup = dataclasses.replace(race, reward=source, reward_time_limit_s=60.0)
+        return checking.Check(setup=setup, console=[])
+
+    return build
+
+
+def test_a_trial_trains_and_says_whether_anything_rises(call, tmp_path):
+    ended = call(
+        *("validate", write(tmp_path, "params['speed'] - 9 * params['is_offtrack']"), "trial=3s"),
+        *("experiment=tiny", "collector=in_process", "collector.threads=1"),
+    )
+    assert ended.code == 0, ended.stderr
+    assert "Trial: " in ended.stdout
+    assert "runs/validate/" in ended.stdout
+    assert len(list(tmp_path.glob("runs/validate/*/metrics.jsonl"))) == 1
+    assert "rise" in ended.stdout

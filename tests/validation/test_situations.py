@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from deepracer_exp.validation.laps import drive_laps
+from deepracer_exp.validation.scenes import sample, scenes, seam
+from deepracer_exp.validation.situations import poses, situations
+
+
+def test_situations_are_where_they_were_asked_for(race):
+    at = poses(race, [0.25, 0.5], [0.2, -0.3], [0.1, 0.0], 2.0, 10.0)
+    columns = situations(race, at).columns
+    np.testing.assert_allclose(columns["distance_from_center"], [0.2, 0.3], atol=0.02)
+    np.testing.assert_allclose(columns["progress"], [25, 50], atol=0.5)
+    assert columns["speed"].tolist() == [2.0, 2.0]
+    assert columns["steering_angle"].tolist() == [10.0, 10.0]
+    assert columns["all_wheels_on_track"].tolist() == [True, False] or columns["all_wheels_on_track"][0]
+    lap_steps = race.track.length_m / 2.0 * 15
+    np.testing.assert_allclose(columns["steps"], [2 + lap_steps / 4, 2 + lap_steps / 2], atol=1)
+    np.testing.assert_allclose(columns["sim_time"], columns["steps"] / 15)
+
+
+def test_the_named_situations_are_what_they_are_called(race, against):
+    named = {scene.name: {k: v[0] for k, v in scene.now.columns.items()} for scene in scenes(race, against)}
+    assert list(named) == ["start", "mid-lap", "off the track", "finish", "wrong way", "reversed track"]
+    assert named["start"]["steps"] == 2
+    assert named["start"]["progress"] < 2
+    assert named["mid-lap"]["progress"] == pytest.approx(50)
+    assert named["off the track"]["is_offtrack"]
+    assert [name for name, columns in named.items() if columns["is_offtrack"]] == ["off the track"]
+    assert named["finish"]["progress"] == 100
+    turned = abs(named["wrong way"]["heading"] - named["mid-lap"]["heading"])
+    assert turned == pytest.approx(180)
+    reverse = {scene.name: scene.now.road for scene in scenes(race, against)}
+    assert reverse["reversed track"].is_reversed
+    assert reverse["reversed track"].waypoints == reverse["mid-lap"].waypoints[::-1]
+
+
+def test_the_step_before_is_a_step_behind(race, against):
+    scene = scenes(race, against)[1]
+    assert scene.before is not None
+    now, before = scene.now.columns, scene.before.columns
+    assert now["steps"] - before["steps"] == 1
+    moved_m = np.hypot(now["x"] - before["x"], now["y"] - before["y"])
+    assert moved_m == pytest.approx(now["speed"] / 15, rel=0.05)
+
+
+def test_the_sample_is_the_same_at_every_call_and_holds_every_kind_of_place(race):
+    one, two = (situations(race, sample(race, 500)).columns for _ in range(2))
+    for key, column in one.items():
+        np.testing.assert_array_equal(column, two[key])
+    assert 0.05 < one["is_offtrack"].mean() < 0.4
+    assert 0.4 < one["all_wheels_on_track"].mean() < 0.95
+    assert set(one["speed"]) == set(race.actions.speed_mps)
+    assert one["steps"].min() >= 2
+
+
+def test_the_seam_names_the_closing_waypoint_and_its_repetition(race):
+    (pair,) = seam(race).columns["closest_waypoints"].tolist()
+    assert pair == [len(race.track.waypoints) - 1, 0]
+
+
+def test_laps_are_complete_stay_on_the_road_and_are_the_faster_the_higher_the_speed(race, laps):
+    assert len(laps) >= 2
+    for lap in laps:
+        columns = lap.paid.columns
+        assert columns["progress"][-1] == 100
+        assert (columns["progress"][:-1] < 100).all()
+        assert columns["steps"][0] == 2
+        assert columns["all_wheels_on_track"].all()
+        assert columns["speed"].max() <= lap.speed_mps
+        assert (np.diff(columns["steps"]) == 1).all()
+    times = [lap.time_s for lap in laps]
+    assert times == sorted(times, reverse=True)
+
+
+def test_the_whole_range_of_the_action_space_gets_round_on_the_default_track(race, laps):
+    assert (laps[0].speed_mps, laps[-1].speed_mps) == (race.actions.low[1], race.actions.high[1])
+
+
+def test_a_bend_taken_too_fast_gives_no_lap(race):
+    assert drive_laps(race, np.array([4.0]), np.array([50.0])) == []
