@@ -40,6 +40,8 @@ class RunHeader:
     track: str
     track_labels: tuple[str, ...]
     """What each of several tracks is called in the rows; empty with one track."""
+    remembered: int
+    """How many of the last finished episodes `lap_share` looks at."""
     reward: str
     network: str
     actions: str
@@ -148,7 +150,7 @@ class _View:
             _format(row, "env_steps_per_s", ",.0f", "/s"),
             f"return {_format(row, 'mean_return', ',.2f')}",
             f"completion {_format(row, 'completion', '.1f', ' %')}",
-            f"laps {_format(row, 'laps', ',.0f')} ({_share(row)} of last 50)",
+            f"laps {_format(row, 'laps', ',.0f')} ({_share(row)} of last {self.header.remembered})",
             self._tracks.least()
             if self._tracks
             else f"best lap {_format(row, 'best_lap_time_s', '.2f', ' s')}",
@@ -228,7 +230,7 @@ class _View:
         ]
         laps = [
             cell("laps", _format(row, "laps", ",.0f"), room=right),
-            cell("of last 50", _share(row), room=right),
+            cell(f"of last {self.header.remembered}", _share(row), room=right),
         ]
         rate = _format(row, "lr", ".2g")
         if self._tracks:  # lap times stand at each track

@@ -31,8 +31,8 @@ class Results:
             stopping: its rule says of how many episodes `lap_share` is taken.
         """
         self._names = names
-        remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else _REMEMBERED
-        self.book = EpisodeBook(n_cars, len(names), remembered, step_s)
+        self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else _REMEMBERED
+        self.book = EpisodeBook(n_cars, len(names), self.remembered, step_s)
         self.labels = track_labels(names) if len(names) > 1 else []
         self._last: list[dict[str, float | None]] = [{} for _ in self.labels]
 

@@ -304,6 +304,7 @@ class Training:
             name=self.folder.name,
             track=joined([course.tracks[0].title for course in self.setup.courses], " + "),
             track_labels=tuple(self.results.labels),
+            remembered=self.results.remembered,
             reward=self.names["reward"],
             network=self.names["network"],
             actions=self.names["action_space"],

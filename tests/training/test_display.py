@@ -17,6 +17,7 @@ HEADER = RunHeader(
     name="default",
     track="re:Invent 2018",
     track_labels=(),
+    remembered=50,
     reward="progress_gain",
     network="mlp_small",
     actions="15 actions",
@@ -249,3 +250,13 @@ def test_a_rising_curve_has_rising_bars(values: list[float]) -> None:
 def test_fixed_bounds_make_a_small_value_a_low_bar() -> None:
     assert sparkline([2.0, 3.0], 5, (0.0, 100.0)) == "▁▁"
     assert sparkline([0.0, 100.0, 250.0], 5, (0.0, 100.0)) == "▁██"
+
+
+def test_the_view_says_how_many_episodes_the_share_of_laps_is_of() -> None:
+    for width in (60, 120):
+        file = io.StringIO()
+        header = dataclasses.replace(HEADER, remembered=20)
+        with ProgressDisplay(Console(file=file, width=width), header, lambda: 0.0) as display:
+            display.update(ROW, 0.5, 10.0)
+        assert "of last 20" in file.getvalue()
+        assert "of last 50" not in file.getvalue()
