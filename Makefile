@@ -19,7 +19,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 race: $(STAMP)  ## train the default experiment until the car drives reliably
-	@$(BIN)/deepracer-exp train
+	@$(BIN)/deepracer-exp train stopping=reliable
 
 # One process a core, and a file's tests together: they share what the file trains.
 test: $(STAMP)  ## the tests

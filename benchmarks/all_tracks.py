@@ -30,7 +30,7 @@ from .report import number, table, write_json
 def measure(option: str, track: Track, overrides: Sequence[str]) -> dict[str, Any]:
     """Train on one track."""
     with tempfile.TemporaryDirectory() as folder:
-        summary = read_summary(train([f"track={option}", *overrides], Path(folder)))
+        summary = read_summary(train([f"track={option}", "stopping=reliable", *overrides], Path(folder)))
     reliable = summary["reliable"] or {}
     return {
         "track": option,

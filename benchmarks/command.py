@@ -1,26 +1,45 @@
-"""The real `deepracer-exp train`, run as a racer runs it."""
+"""The real `deepracer-exp`, run as a racer runs it."""
 
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
 
 
-def train(overrides: Sequence[str], folder: Path) -> Path:
-    """Run `deepracer-exp train` in `folder` and return the run's folder.
+def command_line(*arguments: str) -> list[str]:
+    """Return `deepracer-exp ARGUMENTS` of the environment this Python is of."""
+    return [str(Path(sys.executable).with_name("deepracer-exp")), *arguments]
+
+
+def train(overrides: Sequence[str], folder: Path, command: str = "train") -> Path:
+    """Run `deepracer-exp train` (or `clone`) in `folder` and return the run's folder.
 
     Raises:
         SystemExit: the command did not end with exit code 0; the message is its own.
     """
-    command = [str(Path(sys.executable).with_name("deepracer-exp")), "train", *overrides]
+    line = command_line(command, *overrides)
     before = set(folder.glob("runs/*/*/summary.json"))
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise SystemExit(f"{' '.join(command)}: exit code {done.returncode}\n{done.stderr}")
+        raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr}")
     (summary,) = set(folder.glob("runs/*/*/summary.json")) - before
     return summary.parent
+
+
+def at_once(jobs: int, calls: Sequence[Callable[[], Result]]) -> list[Result]:
+    """Make the calls, so many at once, and return their results in order; the first failure calls off the rest."""
+    with ThreadPoolExecutor(jobs) as pool:
+        waiting = [pool.submit(call) for call in calls]
+        try:
+            return [one.result() for one in waiting]
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def read_summary(run: Path) -> dict[str, Any]:

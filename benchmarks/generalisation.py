@@ -85,7 +85,13 @@ def training_overrides(tracks: Sequence[str], seed: int, steps: int) -> list[str
     return [
         f"track=[{','.join(tracks)}]" if len(tracks) > 1 else f"track={tracks[0]}",
         *alternate,
-        *("stopping=none", "tracking=off", f"budget.env_steps={steps}", f"seed={seed}"),
+        *(
+            "stopping=none",
+            "checkpoints.every=null",
+            "tracking=off",
+            f"budget.env_steps={steps}",
+            f"seed={seed}",
+        ),
     ]
 
 

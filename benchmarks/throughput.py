@@ -40,7 +40,7 @@ from typing import Any
 import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.cli import _start_workers_early
+from deepracer_exp.commands.starting import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import feature_names
@@ -217,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     args = parser.parse_args(arguments)
     experiment, _ = compose_experiment(args.overrides)
-    _start_workers_early(True)  # as the command does
+    start_workers_early(True)  # as the command does
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

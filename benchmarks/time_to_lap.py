@@ -2,13 +2,13 @@
 
     python -m benchmarks.time_to_lap [--seeds 3] [--json FILE] [OVERRIDE...]
 
-For each seed, `deepracer-exp train seed=K` runs as a process of its own in an empty folder, with everything the
-default has: MLflow, trace, checkpoints. Times count from the start of that process (imports and start of the workers
-included) and are read from its summary.json:
+For each seed, `deepracer-exp train stopping=reliable seed=K` runs as a process of its own in an empty folder, with
+everything the default has: MLflow, trace, evaluations, checkpoints. Times count from the start of that process (imports
+and start of the workers included) and are read from its summary.json:
 
 - `first_lap_s`, `first_lap_steps`: the first complete lap. It is noticed at the end of the training iteration in
   which it was driven, so both figures are up to one iteration too large.
-- `reliable_s`, `reliable_steps`: 90 per cent of the last 50 training episodes completed the lap (the default stopping
+- `reliable_s`, `reliable_steps`: 90 per cent of the last 50 training episodes completed the lap (the stopping
   rule, which then ends the run). null where the budget ended the run before.
 
 Steps are control steps over all cars. The median counts null as longer than anything.
@@ -33,7 +33,7 @@ FIGURES = ("first_lap_s", "first_lap_steps", "reliable_s", "reliable_steps")
 def measure(seed: int, overrides: Sequence[str]) -> dict[str, Any]:
     """Train with one seed."""
     with tempfile.TemporaryDirectory() as folder:
-        summary = read_summary(train([*overrides, f"seed={seed}"], Path(folder)))
+        summary = read_summary(train(["stopping=reliable", *overrides, f"seed={seed}"], Path(folder)))
     first_lap, reliable = summary["first_lap"] or {}, summary["reliable"] or {}
     return {
         "seed": seed,

@@ -2,26 +2,34 @@
 
 import argparse
 import os
-import shlex
-import shutil
-import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from deepracer_exp import __version__
-from deepracer_exp.commands import compare, export, stopping
+from deepracer_exp.commands import (
+    checkpoints,
+    clean,
+    clone,
+    compare,
+    export,
+    lineage,
+    promote,
+    resume,
+    stopping,
+)
+from deepracer_exp.commands.ending import tell, tell_all
+from deepracer_exp.commands.starting import start_workers_early
+from deepracer_exp.commands.stderr_warnings import warnings_on_stderr
 from deepracer_exp.errors import BadInput, RunFailed
-
-if TYPE_CHECKING:
-    from deepracer_exp.training.run import Outcome
 
 _TRAIN_EPILOG = """\
 An experiment is one option of each group, and any value in it can be set:
 
-  deepracer-exp train                                       the default: re:Invent 2018, PPO, stops when reliable
+  deepracer-exp train                                       the default: re:Invent 2018, PPO, stops when
+                                                            there is nothing more to gain
+  deepracer-exp train stopping=reliable                     stops as soon as the car laps reliably
   deepracer-exp train track=Oval_track reward=racing_line   other options
   deepracer-exp train algorithm.lr=3e-4 seed=7              other values
   deepracer-exp train experiment=fast_lap                   a set of choices from conf/experiment/
@@ -33,7 +41,7 @@ An experiment is one option of each group, and any value in it can be set:
   deepracer-exp train track=Oval_track --cfg                print the experiment and stop
 
 groups: track car action_space observation randomization episode reward network algorithm lr_schedule
-        collector stopping budget tracking experiment
+        collector evaluation checkpoints stopping budget tracking experiment
   deepracer-exp train --options GROUP                       the options of a group
 """
 
@@ -48,8 +56,8 @@ exit code: 0 it can be trained, whatever the warnings; 2 it cannot, or --strict 
 
 
 _EVALUATE_EPILOG = """\
-  deepracer-exp evaluate run=RUN                            RUN: a run's folder, its name or the beginning of it, or
-                                                            MLflow's id
+  deepracer-exp evaluate run=RUN                            RUN: a run's folder, its name or the beginning of it,
+                                                            MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS
   deepracer-exp evaluate run=RUN evaluation=summit          three_trials, four_minutes, summit or aws_virtual
   deepracer-exp evaluate run=RUN checkpoint=last evaluation.trials=20
   deepracer-exp evaluate run=RUN evaluation.tracks=[Oval_track,Bowtie_track]
@@ -174,9 +182,15 @@ def _parser() -> argparse.ArgumentParser:
     ui.add_argument("--uri", help="another MLflow store, as given to tracking.uri")
     ui.set_defaults(command=_ui)
 
+    resume.register(commands)
+    clone.register(commands)
+    checkpoints.register(commands)
     stopping.register(commands)
     compare.register(commands)
     export.register(commands)
+    promote.register(commands)
+    lineage.register(commands)
+    clean.register(commands)
     return parser
 
 
@@ -197,7 +211,7 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     # The imports to come take seconds, and the first start after an installation compiles for longer.
     print("starting", file=sys.stderr, flush=True)
-    _start_workers_early(any(experiment.collector.mode != "in_process" for experiment, _ in composed))
+    start_workers_early(any(experiment.collector.mode != "in_process" for experiment, _ in composed))
 
     from rich.console import Console
 
@@ -212,11 +226,11 @@ def _train(args: argparse.Namespace) -> int:
         outcomes.append(outcome)
         if experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
-        _tell(outcome, None if experiment.tracking.kind == "off" else experiment.runs_dir)
+        tell(outcome, None if experiment.tracking.kind == "off" else experiment.runs_dir)
         if outcome.status == "interrupted":
             break
     if args.multirun:
-        _tell_all(outcomes)
+        tell_all(outcomes)
     return max(outcome.exit_code for outcome in outcomes)
 
 
@@ -236,7 +250,7 @@ def _validate(args: argparse.Namespace) -> int:
     _tell_notes(composition.notes)
     trial = None if seconds is None else compose_experiment([*overrides, *trial_overrides(seconds)])
     if trial is not None:
-        _start_workers_early(experiment.collector.mode != "in_process")
+        start_workers_early(experiment.collector.mode != "in_process")
 
     from rich.console import Console
 
@@ -265,7 +279,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     video = None if args.video is None else (Path(args.video), args.view)
     out = Console(width=None if sys.stdout.isatty() else 160)
-    evaluate(config, video, out, Console(stderr=True))
+    with warnings_on_stderr():
+        evaluate(config, video, out, Console(stderr=True))
     return 0
 
 
@@ -290,66 +305,6 @@ def _import(args: argparse.Namespace) -> int:
 def _tell_notes(notes: Iterable[str]) -> None:
     for note in dict.fromkeys(notes):
         print(note, file=sys.stderr)
-
-
-def _start_workers_early(wanted: bool) -> None:
-    """Let a server process import torch while this one does, so that workers fork from it at once."""
-    if not wanted or not sys.platform.startswith("linux"):
-        return
-    import multiprocessing
-    from multiprocessing import forkserver
-
-    multiprocessing.set_start_method("forkserver", force=True)
-    multiprocessing.set_forkserver_preload(["deepracer_exp.training.fork_server"])
-    # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    # Signals to the process group are for the training process alone; what is ignored now stays so in the server.
-    handlers = {signum: signal.signal(signum, signal.SIG_IGN) for signum in (signal.SIGINT, signal.SIGTERM)}
-    forkserver.ensure_running()
-    for signum, handler in handlers.items():
-        signal.signal(signum, handler)
-    if before is None:
-        del os.environ["OMP_NUM_THREADS"]
-    else:
-        os.environ["OMP_NUM_THREADS"] = before
-
-
-def _tell(outcome: "Outcome", tracked_in: str | None) -> None:
-    summary = outcome.summary
-    if outcome.status == "failed":
-        print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
-        print(f"  what is known: {outcome.folder}", file=sys.stderr)
-        return
-    print(f"\n{outcome.status}: {outcome.reason}")
-    print(
-        f"  {summary['env_steps']:,} steps, {summary['episodes']:,} episodes, {summary['laps']:,} laps in "
-        f"{summary['wall_clock_s']:.0f} s, {_laps(summary)}"
-    )
-    print(f"\n  results       {outcome.folder}")
-    for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):
-        if (outcome.folder / name).exists():
-            print(f"    {name}  {what}")
-    if tracked_in is not None:
-        # `make race` calls us by a path that a newcomer's shell does not know.
-        command = "deepracer-exp" if shutil.which("deepracer-exp") else sys.argv[0]
-        where = "" if tracked_in == "runs" else f" --runs-dir {shlex.quote(tracked_in)}"
-        print(f"  compare runs  {command} ui{where}")
-
-
-def _tell_all(outcomes: "Sequence[Outcome]") -> None:
-    print(f"\n{len(outcomes)} runs:")
-    for outcome in outcomes:
-        print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
-
-
-def _laps(summary: Mapping[str, Any]) -> str:
-    """Say what a run's laps came to."""
-    tracks = summary.get("tracks")
-    if tracks is not None:
-        return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
-    best = summary["best_lap_time_s"]
-    return f"best lap {best:.2f} s" if best is not None else "no lap yet"
 
 
 def _tracks(args: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ def differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
     configs = [
         {key: value for key, value in record.config.items() if key not in _NO_MATTER} for record in records
     ]
-    courses = [_courses(config.get("track")) for config in configs]
+    courses = [course_names(config.get("track")) for config in configs]
     if len(set(courses)) > 1:  # the points of a track say less than its name
         for config, course in zip(configs, courses, strict=True):
             config["track"] = course
@@ -31,7 +31,7 @@ def differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
     return _differences(configs)
 
 
-def _courses(track: Any) -> str:
+def course_names(track: Any) -> str:
     """Return the name of the track of a configuration, or those of several."""
     known = isinstance(track, Mapping)
     return str(track["name"]) if known and "name" in track else ", ".join(track) if known else NOTHING

@@ -2,9 +2,12 @@
 
 import argparse
 
+from .stderr_warnings import warnings_on_stderr
+
 _EPILOG = """\
   deepracer-exp export run=RUN format=onnx                  the network as one file, checked against itself
   deepracer-exp export run=RUN format=onnx checkpoint=last -o policy.onnx
+  deepracer-exp export run=champion format=onnx             the checkpoint of that alias (deepracer-exp promote)
   deepracer-exp export run=RUN format=aws -o custom_files   reward_function.py, model_metadata.json and
                                                             hyperparameters.json
 """
@@ -36,5 +39,6 @@ def _export(args: argparse.Namespace) -> int:
 
     from deepracer_exp.export.export import export
 
-    export(config, args.output, Console(highlight=False, markup=False))
+    with warnings_on_stderr():
+        export(config, args.output, Console(highlight=False, markup=False))
     return 0

@@ -97,7 +97,8 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
 def _require_run(composition: Composition) -> None:
     if composition.mapping["run"] is None:
         raise BadInput(
-            "run: missing; write run=RUN: a run's folder, its name or the beginning of it, or MLflow's id"
+            "run: missing; write run=RUN: a run's folder, its name or the beginning of it, MLflow's id, "
+            "best:EXPERIMENT, MODEL@ALIAS or ALIAS"
         )
 
 

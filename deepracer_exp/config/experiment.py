@@ -8,7 +8,9 @@ from pydantic import AfterValidator, Field
 
 from .budget import BudgetConfig
 from .car import CarConfig
+from .checkpoints import CheckpointsConfig
 from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RewardConfig
+from .evaluation import EvaluationConfig
 from .learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
 from .randomization import RandomizationConfig
 from .running import CollectorConfig, TrackingConfig
@@ -54,6 +56,9 @@ class Experiment:
     algorithm: AlgorithmConfig
     lr_schedule: LRScheduleConfig
     collector: CollectorConfig
+    evaluation: EvaluationConfig
+    """Of the policy, while it is being trained."""
+    checkpoints: CheckpointsConfig
     stopping: StoppingConfig
     budget: BudgetConfig
     tracking: TrackingConfig

@@ -13,12 +13,14 @@ class ExportConfig:
     """What `deepracer-exp export` is asked for."""
 
     run: Annotated[str, Field(min_length=1)]
-    """Folder, its name under `runs_dir` or the beginning of it, or MLflow's id of the run."""
+    """Folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias of a
+    registered model."""
     format: Literal["onnx", "aws"]
     """The network as a file, or what another training begins with on AWS."""
-    checkpoint: Annotated[str, AfterValidator(checkpoint_name)]
-    """`best`, `last` or an iteration; of the network alone."""
+    checkpoint: Annotated[str, AfterValidator(checkpoint_name)] | None
+    """`best`, `last` or an iteration; null: what the alias names that the run is given by, else `best`. Of the network
+    alone."""
     runs_dir: Annotated[str, Field(min_length=1)]
     tracking_uri: str | None
-    """MLflow store in which an id is looked up; null: the one in `runs_dir`."""
+    """MLflow store in which ids and aliases are looked up; null: the one in `runs_dir`."""
     debug: bool

@@ -1,6 +1,8 @@
 """Where cars are, measured against the track."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +10,12 @@ from numpy.typing import NDArray
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.tracks import Tracks, Which
 
+from .state import fitting
+
 Floats = NDArray[np.float64]
+
+_PAIRS = ("front", "closest_waypoints")
+"""What has two numbers a car."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +78,24 @@ class Measures:
             heading_error_rad=np.mod(error + np.pi, 2 * np.pi) - np.pi,
             track_width_m=track_width_m,
             is_left=is_left,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all arrays."""
+        return {field.name: getattr(self, field.name).copy() for field in fields(self)}
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any], n_cars: int) -> "Measures":
+        """Return what `state_dict` was taken of.
+
+        Raises:
+            BadInput: it is of another number of cars.
+        """
+        return cls(
+            **{
+                field.name: fitting(state, field.name, (n_cars, 2) if field.name in _PAIRS else (n_cars,))
+                for field in fields(cls)
+            }
         )
 
     def replace(self, ids: NDArray[np.intp], those: "Measures") -> None:

@@ -1,11 +1,12 @@
 """N cars on their tracks under the service's rules; NumPy only, so that any learning library can drive them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from deepracer_exp.config.randomization import RandomizationConfig
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.formats.trace import PACKED, RANDOMIZED
 from deepracer_exp.sim.batch import CarBatch, CarState
 
@@ -16,9 +17,17 @@ from .randomization import Randomization
 from .referee import Referee, Verdict
 from .reward import RewardFunction
 from .setup import RaceSetup
+from .state import fitting
 
 _RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
 """Their columns lie side by side in packed rows."""
+
+
+_KEPT = (
+    *("_return", "_steering_deg", "_commanded_mps"),
+    *("observation", "reward", "terminated", "truncated", "trace"),
+)
+"""A race's own arrays that belong into a checkpoint."""
 
 
 class NonFinite(RunFailed):
@@ -169,6 +178,42 @@ class Race:
             raise self._lost_car(error, action) from error
         self._observe()
         self._require_finite("observation", self.observation, self.feature_names, action)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all that the cars' future depends on, once they were reset: arrays and plain values.
+
+        What a reward function's module remembers is no part of it.
+        """
+        return {
+            "physics": self._batch.state,
+            "cars": self.cars.copy(),
+            "referee": self.referee.state_dict(),
+            "randomization": self.randomization.state_dict(),
+            **{name.lstrip("_"): getattr(self, name).copy() for name in _KEPT},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state_dict`: what follows is what followed there, bit for bit.
+
+        Args:
+            state: of a race with the same setup and the same cars.
+
+        Raises:
+            BadInput: it is of another number of cars, of other cars, tracks or features; these cars are lost then.
+        """
+        physics = fitting(state, "physics", self._batch.state.shape)
+        if not np.array_equal(fitting(state, "cars", self.cars.shape), self.cars):
+            raise BadInput(
+                f"the checkpoint does not fit: its cars begin with number {state['cars'][0]}; accepted here: "
+                f"{self.cars[0]}"
+            )
+        for name in _KEPT:
+            setattr(self, name, fitting(state, name.lstrip("_"), getattr(self, name).shape))
+        self.referee.load_state_dict(state["referee"])
+        self.randomization.load_state_dict(state["randomization"])
+        self._batch.set_floor_friction(self._everyone, self._floors[self.referee.course])
+        # Last: giving a car its mass computes with the physics.
+        self._batch.state = physics
 
     def state_arrays(self) -> dict[str, np.ndarray]:
         """Return copies of the cars' full physics state and counters, for looking into a fault."""

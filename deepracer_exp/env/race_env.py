@@ -1,6 +1,7 @@
 """The one TorchRL environment: N cars stepped together."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ class RaceEnv(EnvBase):
         super().__init__(device="cpu", batch_size=[race.n_cars])
         self.race = race
         self._on_step = on_step
+        self._goes_on = False
         n_cars, size = race.observation.shape
         n_actions = race.setup.actions.n
         self.observation_spec = Composite(
@@ -77,11 +79,23 @@ class RaceEnv(EnvBase):
         )
         return tensordict, root
 
+    def go_on(self, state: Mapping[str, Any]) -> None:
+        """Put the cars where a `Race.state_dict` has them; the next reset of all cars leaves them there.
+
+        Raises:
+            BadInput: the state does not fit.
+        """
+        self.race.load_state_dict(state)
+        self._goes_on = True
+
     def _reset(self, tensordict: TensorDictBase | None, **_: object) -> TensorDictBase:
         ids = None
         if tensordict is not None and "_reset" in tensordict:
             ids = np.flatnonzero(tensordict.get("_reset").numpy())
-        self.race.reset(ids)
+        if ids is None and self._goes_on:
+            self._goes_on = False
+        else:
+            self.race.reset(ids)
         return TensorDict(
             {"observation": torch.from_numpy(self.race.observation), **self._flags(self._no)},
             batch_size=self.batch_size,

@@ -1,6 +1,7 @@
 """What each car suffers in each of its episodes, drawn from its own random streams."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from scipy.special import ndtr
 from deepracer_exp.config.randomization import OFF, QUANTITIES, RandomizationConfig
 from deepracer_exp.sim.batch import CarBatch
 
+from .state import fitting
 from .streams import CarStreams, Purpose, StepNoise
 
 Floats = NDArray[np.float64]
@@ -79,12 +81,42 @@ class Randomization:
 
     def seed(self, seed: int) -> None:
         """Begin all streams anew."""
+        self._seed = seed
         acts = self._on & {"steering_noise_deg", "speed_noise"}
         sees = self._on & {"observation_noise", "observation_dropout"}
         self._episodes = CarStreams(seed, self._cars, Purpose.EPISODE)
         self._action = self._step_noise(seed, Purpose.ACTION, 2) if acts else None
         width = 1 + len(self._measured)
         self._observation = self._step_noise(seed, Purpose.OBSERVATION, width) if sees else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the cars are in their episodes, commands on their way, and how far the noise has come."""
+        return {
+            "seed": self._seed,
+            "values": self.values.copy(),
+            "sent": self._sent.copy(),
+            "deaf_until": self._deaf_until.copy(),
+            "first_noise": self._first_noise.copy(),
+            "action_steps": 0 if self._action is None else self._action.steps,
+            "observation_steps": 0 if self._observation is None else self._observation.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state_dict`, and make the cars' physics what they drew.
+
+        Raises:
+            BadInput: it is of another number of cars or features, or of another longest delay.
+        """
+        self.values = fitting(state, "values", self.values.shape)
+        self._sent = fitting(state, "sent", self._sent.shape)
+        self._deaf_until = fitting(state, "deaf_until", self._deaf_until.shape)
+        self._first_noise = fitting(state, "first_noise", self._first_noise.shape)
+        for name, apply in self._varying_physics.items():
+            apply(self._rows, self._of(name))
+        self.seed(state["seed"])
+        for noise, steps in ((self._action, "action_steps"), (self._observation, "observation_steps")):
+            if noise is not None:
+                noise.steps = state[steps]
 
     def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
         """Draw what the cars `ids` are in their new episodes, whose numbers are counted per car from 0."""

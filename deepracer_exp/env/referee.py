@@ -1,6 +1,8 @@
 """What is said of the cars' poses: progress, wheels on the road, the rules' verdict, params of a reward function."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +17,17 @@ from .measures import Floats, Measures
 from .params import Road
 from .rules import EpisodeRules
 from .setup import RaceSetup
+from .state import fitting
 
 Ids = NDArray[np.intp]
 Bools = NDArray[np.bool_]
+
+
+_KEPT = (
+    *("episode", "steps", "clock_steps", "start_ndist", "course", "which"),
+    *("_driven", "_previous", "_last_progress", "_last_front"),
+)
+"""A referee's arrays that the future depends on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +168,26 @@ class Referee:
         self.steps[:] = steps
         self._previous[:] = progress
         self._last_progress[:] = progress
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all that the next verdicts depend on, once poses were seen.
+
+        The poses are part of it as they were measured: those of some cars are measured without the others, and
+        NumPy does not promise the same last bit for an array of another length.
+        """
+        own = {name.lstrip("_"): getattr(self, name).copy() for name in _KEPT}
+        return {**own, "rules": self._rules.state_dict(), "now": self.now.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a `state_dict`.
+
+        Raises:
+            BadInput: it is of another number of cars or tracks.
+        """
+        for name in _KEPT:
+            setattr(self, name, fitting(state, name.lstrip("_"), getattr(self, name).shape))
+        self._rules.load_state_dict(state["rules"])
+        self.now = Measures.from_state_dict(state["now"], self.n_cars)
 
     def see(self, cars: CarState) -> Measures:
         """Measure the poses of all cars."""

@@ -1,9 +1,14 @@
 """What ends an episode, as the service's simulator decides it."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.formats.trace import STATUS_CODE
+
+from .state import fitting
 
 PENALTY_S = {"off_track": 2.0, "crashed": 5.0, "reversed": 2.0, "immobilized": 0.0}
 """Seconds a car waits where an evaluation resets it; in training each of these ends the episode instead.
@@ -28,6 +33,19 @@ class EpisodeRules:
         """Forget what the cars `ids` did before."""
         self._still[ids] = 0
         self._falling[ids] = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the counters."""
+        return {"still": self._still.copy(), "falling": self._falling.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on counting from a `state_dict`.
+
+        Raises:
+            BadInput: it is of another number of cars.
+        """
+        self._still = fitting(state, "still", self._still.shape)
+        self._falling = fitting(state, "falling", self._falling.shape)
 
     def judge(
         self,

@@ -1,5 +1,6 @@
-"""Checkpoints read back: tensors and JSON only, and nothing of a file that is not whole."""
+"""Checkpoints read back: tensors and JSON only, and nothing of one that is not whole."""
 
+import logging
 import re
 import zipfile
 from dataclasses import dataclass
@@ -14,10 +15,15 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.checkpoint_files import HASHES, verify
 
-_COMPONENT = "agent"
-_FILES = {"state.json", "state.tdz"}
+logger = logging.getLogger("deepracer_exp")
+
+_AGENT, _TRAINING = "agent", "training"
+_MANIFEST = "manifest.json"
+_STATE = {"state.json", "state.tdz"}
 _MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
+LINKS = ("best", "last")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +38,7 @@ class StoredPolicy:
 
 
 def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
-    """Read the networks of a checkpoint.
+    """Read the networks of a checkpoint, or of the newest intact one in place of a torn `best` or `last`.
 
     Args:
         experiment: what was trained.
@@ -40,16 +46,118 @@ def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPo
         name: `best`, `last` or the number of an iteration.
 
     Raises:
-        BadInput: there is no such checkpoint, it is torn, of another kind, or does not fit the experiment. Whatever
+        BadInput: as for `intact_checkpoint` and `read_policy`.
+    """
+    return read_policy(experiment, intact_checkpoint(folder, name))
+
+
+def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Path:
+    """Return the folder of a checkpoint all of whose files are as they were written.
+
+    Where `best` or `last` is torn, or `last` is missing, the newest intact checkpoint takes its place, and a warning
+    says so.
+
+    Args:
+        folder: `checkpoints/` of a run.
+        name: `best`, `last` or the number of an iteration.
+        resumable: only one that a training can go on from will do.
+
+    Raises:
+        BadInput: there is no such checkpoint, it lies elsewhere, or it is torn and none can take its place. Whatever
             could hold a pickle is refused unread.
     """
-    path = folder / (f"{int(name):06d}" if name.isdigit() else name)
+    path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
+    kept = kept_checkpoints(folder)
+    if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
+        known = ", ".join(
+            [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
+        )
+        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known or 'none'}")
+    if path.exists() and path.resolve().parent != folder.resolve():
+        raise BadInput(
+            f"checkpoint={name}: {path} leads out of its folder to {path.resolve()}; give a number"
+        )
+    try:
+        return check(path, resumable=resumable)
+    except BadInput as error:
+        if name.isdecimal():
+            raise
+        reasons = [str(error)]
+    for other in kept:
+        if path.exists() and other.samefile(path):
+            continue
+        try:
+            found = check(other, resumable=resumable)
+        except BadInput as error:
+            reasons.append(str(error))
+            continue
+        logger.warning(
+            "checkpoint=%s: %s; %s, the newest intact one, takes its place",
+            name,
+            "; ".join(reasons),
+            other.name,
+        )
+        return found
+    raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; none in {folder} is intact")
+
+
+def kept_checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run, not the links to them, newest first."""
+    if not folder.is_dir():
+        return []
+    own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
+    # `best` is a folder of its own where links were followed as the run was copied.
+    known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
+    return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
+
+
+def check(path: Path, *, resumable: bool = False) -> Path:
+    """Return the resolved folder of a checkpoint of ours that is whole, and can be resumed where that is asked for.
+
+    Raises:
+        BadInput: any other.
+    """
     if not path.is_dir():
-        known = ", ".join(checkpoint_names(folder)) or "none"
-        what = "no folder" if path.exists() else "not there"
-        raise BadInput(f"checkpoint={name}: {path} is {what}; a pickle is never loaded; checkpoints: {known}")
+        what = "leads nowhere" if path.is_symlink() else "is no folder" if path.exists() else "is not there"
+        raise BadInput(f"{path}: {what}; a pickle is never loaded")
     path = path.resolve()
-    manifest = _check(path)
+    files = {file.name: file for file in path.rglob("*") if not file.is_dir()}
+    foreign = sorted(files.keys() - _STATE - {_MANIFEST, HASHES})
+    if foreign:
+        raise BadInput(
+            f"{path}: holds {foreign[0]}, which no checkpoint of ours does: wanted are tensors and JSON; a pickle is "
+            "never loaded"
+        )
+    if _MANIFEST not in files:
+        raise BadInput(f"{path}: torn: has no {_MANIFEST}")
+    if HASHES not in files:
+        raise BadInput(
+            f"{path}: has no {HASHES}: torn, or made by an older version, whose checkpoints cannot be used"
+        )
+    verify(path)
+    try:
+        components = Checkpoint.manifest(path)["components"]
+    except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
+        raise BadInput(f"{path}: no checkpoint of ours: {' '.join(str(error).split())}") from error
+    if _AGENT not in components or not components.keys() <= {_AGENT, _TRAINING}:
+        raise BadInput(f"{path}: no checkpoint of ours: holds {', '.join(components) or 'nothing'}")
+    for name, record in components.items():
+        folder = path / record["path"]
+        there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
+        if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
+            raise BadInput(f"{path}: no checkpoint of ours: {name} is not {' and '.join(sorted(_STATE))}")
+        _check_archive(folder / "state.tdz")
+    if resumable and _TRAINING not in components:
+        raise BadInput(f"{path}: holds the policy only, no training can go on from it")
+    return path
+
+
+def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
+    """Read the networks of a checkpoint that `check` has let pass.
+
+    Raises:
+        BadInput: it does not fit the experiment, or a weight is not finite.
+    """
     networks = build_actor_critic(
         experiment.network,
         len(feature_names(experiment.observation)),
@@ -57,27 +165,17 @@ def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPo
         torch.Generator(),
     )
     target = Checkpoint().register(
-        _COMPONENT, _NetworksOf(networks), adapter=StateDictCheckpointAdapter("archive")
+        _AGENT, _NetworksOf(networks), adapter=StateDictCheckpointAdapter("archive")
     )
     try:
-        target.load(path)
+        found = target.load(path)
     except (CheckpointError, OSError) as error:
         reason = " ".join(str(error).split())
-        raise BadInput(
-            f"{path}: does not fit the run's config.yaml, or is torn: {reason[:300]}; choose another checkpoint"
-        ) from error
+        raise BadInput(f"{path}: does not fit the run's config.yaml: {reason[:300]}") from error
     for key, value in networks.state_dict().items():
         if not torch.isfinite(value).all():
             raise BadInput(f"{path}: {key} is not finite; choose another checkpoint")
-    return StoredPolicy(networks, path, manifest["metadata"])
-
-
-def checkpoint_names(folder: Path) -> list[str]:
-    """Return what a run has kept, `best` and `last` first."""
-    if not folder.is_dir():
-        return []
-    found = [path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    return sorted(found, key=lambda name: (name.isdigit(), name))
+    return StoredPolicy(networks, path, found.manifest["metadata"])
 
 
 class _NetworksOf:
@@ -93,41 +191,12 @@ class _NetworksOf:
         self._networks.load_state_dict(state["networks"])
 
 
-def _check(path: Path) -> dict[str, Any]:
-    """Return the manifest of a whole checkpoint of ours; refuse any other."""
-    try:
-        manifest: dict[str, Any] = Checkpoint.manifest(path)
-    except FileNotFoundError:
-        raise BadInput(
-            f"{path}: has no manifest.json, so it is no whole checkpoint of ours; a pickle is never loaded"
-        ) from None
-    except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
-        raise BadInput(f"{path}: torn: manifest.json: {' '.join(str(error).split())}") from error
-    record = manifest["components"].get(_COMPONENT)
-    folder = path / record["path"] if record else path
-    there = {entry.name for entry in folder.iterdir()} if record and folder.is_dir() else set()
-    if not record or record["adapter"] != StateDictCheckpointAdapter.adapter_id or there - _FILES:
-        raise BadInput(
-            f"{path}: no checkpoint of ours ({', '.join(sorted(there - _FILES)) or 'no agent'}); wanted are tensors "
-            f"and JSON, {' and '.join(sorted(_FILES))}; a pickle is never loaded"
-        )
-    if there != _FILES:
-        raise BadInput(
-            f"{path}: torn: {', '.join(sorted(_FILES - there))} is missing; choose another checkpoint"
-        )
-    _check_archive(folder / "state.tdz")
-    return manifest
-
-
 def _check_archive(file: Path) -> None:
-    """Refuse an archive with a damaged tensor (each has a checksum), or with anything but tensors."""
+    """Refuse an archive with anything but tensors."""
     try:
         with zipfile.ZipFile(file) as archive:
             foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
-            if foreign:
-                raise BadInput(f"{file}: holds {foreign[0]}, which is no tensor; a pickle is never loaded")
-            damaged = archive.testzip()
     except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise BadInput(f"{file}: torn: {error}; choose another checkpoint") from error
-    if damaged is not None:
-        raise BadInput(f"{file}: torn: checksum of {damaged} is wrong; choose another checkpoint")
+        raise BadInput(f"{file}: torn: {error}") from error
+    if foreign:
+        raise BadInput(f"{file}: holds {foreign[0]}, which is no tensor; a pickle is never loaded")

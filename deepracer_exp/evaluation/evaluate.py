@@ -35,7 +35,7 @@ def evaluate(
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
     run = read_run(config.run, Path(config.runs_dir), config.tracking_uri)
-    stored = read_checkpoint(run.experiment, run.checkpoints, config.checkpoint)
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.meant(config.checkpoint))
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, config.evaluation)
     film = _film(evaluator, *video) if video is not None else None

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.training.files import write_whole
+from deepracer_exp.formats.whole_file import write_whole
 
 from .checkpoint import StoredPolicy
 from .result import CONFIDENCE, Evaluation

@@ -1,6 +1,5 @@
 """What an evaluation found: the laps tried on each track and each condition, and what they come to."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -68,7 +67,7 @@ class Group:
         """Return how good the policy is; without a complete lap times fall back to the progress."""
         if metric == "progress":
             mean = self.mean_lap_time_s
-            return self.completion, -math.inf if mean is None else -mean
+            return self.completion, 0.0 if mean is None else 1 / mean
         score = self.mean_lap_time_s if metric == "lap_time" else self.race_score_s
         return (0.0, self.completion) if score is None else (1.0, -score)
 

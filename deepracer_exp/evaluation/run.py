@@ -1,14 +1,17 @@
 """Runs read back from their folders."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from deepracer_exp.config.compose import validate
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.tracking.lookup import folder_of, is_run_id
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.run_files import read_config
+
+from .references import resolve
+
+logger = logging.getLogger("deepracer_exp")
 
 
 @dataclass(frozen=True)
@@ -17,36 +20,57 @@ class StoredRun:
 
     path: Path
     experiment: Experiment
+    checkpoint: str | None
+    """Name of the checkpoint that is meant, if the run was given by a registered model's alias."""
+    registered: str | None
+    """That alias, as MODEL@ALIAS."""
 
     @property
     def checkpoints(self) -> Path:
         """Return the folder of its checkpoints."""
         return self.path / "checkpoints"
 
+    def meant(self, given: str | None) -> str:
+        """Return the name of the checkpoint that is meant.
+
+        Args:
+            given: `best`, `last` or an iteration; None: what the alias names, or the best. A run that ended before its
+                first evaluation has no best: its last is taken, and a warning says so.
+        """
+        name = given or self.checkpoint
+        if (
+            name is None
+            and not (self.checkpoints / "best").is_symlink()
+            and (self.checkpoints / "last").exists()
+        ):
+            logger.warning(
+                "%s: ended before its policy was evaluated, so checkpoint=last is used", self.path.name
+            )
+            return "last"
+        return name or "best"
+
 
 def read_run(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     """Find a run and read its configuration.
 
     Args:
-        run: its folder, the folder's name or the beginning of it, or MLflow's id.
+        run: its folder, the folder's name or the beginning of it; MLflow's id; `best:EXPERIMENT`; or the alias of a
+            registered model, `MODEL@ALIAS` or, where exactly one model has it, `ALIAS`.
         runs_dir: where runs are.
-        tracking_uri: where ids are looked up; None: in `runs_dir`.
+        tracking_uri: where ids and aliases are looked up; None: in `runs_dir`.
 
     Raises:
-        BadInput: no run, or several, are meant, or its configuration is not one of this version.
+        BadInput: no run, or several, are meant, its configuration is not one of this version, or a registered
+            checkpoint is not what it was.
     """
-    path = find_run(run, runs_dir, tracking_uri)
-    file = path / "config.yaml"
+    meant = resolve(run, runs_dir, tracking_uri)
+    mapping = read_config(meant.path)
     try:
-        mapping = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise BadInput(f"{file}: cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(mapping, dict):
-        raise BadInput(f"{file}: holds no keys; wanted is the config.yaml of a run")
-    try:
-        return StoredRun(path, validate(mapping))
+        experiment = validate(mapping)
     except BadInput as error:
+        file = meant.path / "config.yaml"
         raise BadInput(f"{file}: {error}; was the run made by another version?") from None
+    return StoredRun(meant.path, experiment, meant.checkpoint, meant.registered)
 
 
 def find_run(run: str, runs_dir: Path, tracking_uri: str | None) -> Path:
@@ -55,26 +79,4 @@ def find_run(run: str, runs_dir: Path, tracking_uri: str | None) -> Path:
     Raises:
         BadInput: no run, or several, are meant.
     """
-    for folder in (Path(run).expanduser(), runs_dir / run):
-        if (folder / "config.yaml").is_file():
-            return folder
-    if is_run_id(run):
-        folder = folder_of(run, tracking_uri, runs_dir)
-        moved = runs_dir / folder.parent.name / folder.name
-        found = next((place for place in (folder, moved) if (place / "config.yaml").is_file()), None)
-        if found is None:
-            raise BadInput(f"run={run}: its folder {folder} is gone; give the folder where it is now")
-        return found
-    folders = sorted(file.parent for file in runs_dir.glob("*/*/config.yaml"))
-    meant = [folder for folder in folders if folder.name == run]
-    meant = meant or [folder for folder in folders if folder.name.startswith(run)]
-    if len(meant) == 1:
-        return meant[0]
-    if meant:
-        names = ", ".join(str(folder.relative_to(runs_dir)) for folder in meant[:3])
-        raise BadInput(f"run={run}: {len(meant)} runs are meant: {names}{', ...' * (len(meant) > 3)}")
-    close = nearest(run, [folder.name for folder in folders])
-    raise BadInput(
-        f"run={run}: no such run in {runs_dir} ({len(folders)} there){close}; accepted: a run's folder, its name or "
-        "the beginning of it, or MLflow's id"
-    )
+    return resolve(run, runs_dir, tracking_uri).path

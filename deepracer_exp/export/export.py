@@ -31,7 +31,8 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
     """
     run = read_run(config.run, Path(config.runs_dir), config.tracking_uri)
     if config.format == "onnx":
-        return _onnx(run, config.checkpoint, Path(output or run.path / "export" / "policy.onnx"), out)
+        checkpoint = run.meant(config.checkpoint)
+        return _onnx(run, checkpoint, Path(output or run.path / "export" / "policy.onnx"), out)
     return _aws(run, Path(output or run.path / "export" / "aws"), out)
 
 

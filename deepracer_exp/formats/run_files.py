@@ -1,13 +1,16 @@
 """The files a training leaves in its run folder, read back."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from deepracer_exp.errors import BadInput
+
+# The one in C takes a seventh of the time, and an experiment has hundreds of runs.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -36,23 +39,63 @@ def read_run(path: Path) -> RunRecord:
     Raises:
         BadInput: a file is missing, cannot be read or does not hold what a training writes.
     """
-    config = _text(path / "config.yaml")
-    try:
-        mapping = yaml.safe_load(config)
-    except yaml.YAMLError as error:
-        raise BadInput(
-            f"{path / 'config.yaml'}: is not valid YAML: {' '.join(str(error).split())}"
-        ) from error
-    if not isinstance(mapping, dict):
-        raise BadInput(f"{path / 'config.yaml'}: holds no values; a run writes its experiment there")
-    summary, provenance = (path / name for name in ("summary.json", "provenance.json"))
+    head = read_head(path)
+    return replace(head, rows=read_metrics(path / "metrics.jsonl"))
+
+
+def read_head(path: Path) -> RunRecord:
+    """Read a run's folder without the rows of its metrics.jsonl, which is long.
+
+    Raises:
+        BadInput: as for `read_run`.
+    """
     return RunRecord(
         path,
-        {str(key): value for key, value in mapping.items()},
-        read_metrics(path / "metrics.jsonl"),
-        _object(summary, _text(summary)) if summary.exists() else {},
-        _object(provenance, _text(provenance)) if provenance.exists() else {},
+        read_config(path),
+        [],
+        read_object(path / "summary.json"),
+        read_object(path / "provenance.json"),
     )
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read the config.yaml of a run's folder.
+
+    Raises:
+        BadInput: it cannot be read or holds no values.
+    """
+    file = path / "config.yaml"
+    loader = _LOADER(_text(file))
+    try:
+        mapping = loader.get_single_data()
+    except yaml.YAMLError as error:
+        raise BadInput(f"{file}: is not valid YAML: {' '.join(str(error).split())}") from error
+    finally:
+        loader.dispose()
+    if not isinstance(mapping, dict):
+        raise BadInput(f"{file}: holds no values; a run writes its experiment there")
+    return {str(key): value for key, value in mapping.items()}
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """Read a JSON object of a run's folder; empty where there is no such file.
+
+    Raises:
+        BadInput: it cannot be read or holds something else.
+    """
+    return _object(file, _text(file)) if file.exists() else {}
+
+
+def read_run_id(path: Path) -> str | None:
+    """Return MLflow's id of the run of a folder, None for one that is not recorded.
+
+    Raises:
+        BadInput: its tracking.json cannot be read or holds something else.
+    """
+    run_id = read_object(path / "tracking.json").get("run_id")
+    if not isinstance(run_id, str | None):
+        raise BadInput(f"{path / 'tracking.json'}: run_id: {run_id!r} is no text")
+    return run_id
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -2,7 +2,8 @@
 
 Importing this module imports MLflow (1.2 s alone, 2 to 3 s beside a starting training), so only the
 recorder's thread does it. Every call may be repeated: MLflow keys a metric point by run, key, step,
-timestamp and value, and parameters, tags, files and the end status are the same when written twice.
+timestamp and value, and parameters, tags, files and the end status are the same when written twice. So a
+request of a killed process that a slow server handles late does no harm either.
 """
 
 import logging
@@ -12,8 +13,10 @@ from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
-from .names import EXPERIMENT_TAGS
+from .names import END_TAG, EXPERIMENT_TAGS
+from .points import Point
 from .store import Store
+from .tracking_file import Told
 
 # MLflow reads these at each call and offers no parameter. Its own 7 retries would hold the queue for
 # minutes after a server is back, and a request may hang for its whole 120 s: the recorder retries itself.
@@ -73,43 +76,78 @@ class MLflowRun:
         self.run_id: str | None = None
         self._store = store
         self._client: MlflowClient
+        self._params: Mapping[str, str] = {}
+        self._goes_on = False
+        self._there: dict[str, dict[int, float]] = {}
+        self._contradicted: set[tuple[str, int]] = set()
+
+    @property
+    def contradicted(self) -> int:
+        """Number of points that the store had with another value, which stays."""
+        return len(self._contradicted)
 
     def connect(self) -> None:
         """Open the store, and make it if it does not exist."""
         with _told_apart(), self._store.creation_lock():
+            if (file := self._store.sqlite_file) is not None and not file.exists():
+                _create_whole(file)
             self._client = MlflowClient(tracking_uri=self._store.uri)
 
-    def create(
-        self, experiment: str, run_name: str, tags: Mapping[str, str], start_ms: int, *, again: bool
-    ) -> None:
+    def create(self, told: Told, *, again: bool) -> None:
         """Create the run; with `again`, look first whether an earlier try created it unheard."""
+        tags = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in told.tags.items()}
         with _told_apart():
-            experiment_id = self._experiment_id(experiment)
+            experiment_id = self._experiment_id(told.experiment)
             if again:
-                self.run_id = self._find(experiment_id, run_name, start_ms)
+                self.run_id = self._find(experiment_id, told)
             if self.run_id is None:
-                short = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tags.items()}
-                run = self._client.create_run(experiment_id, start_ms, short, run_name)
+                run = self._client.create_run(experiment_id, told.start_ms, tags, told.run_name)
                 self.run_id = run.info.run_id
+
+    def reopen(self, told: Told) -> None:
+        """Go on with a run that another process recorded, whether or not MLflow has it already.
+
+        From here on parameters and points that the store has are not written again.
+        """
+        self.run_id = told.run_id
+        if self.run_id is None:
+            self.create(told, again=True)
+        with _told_apart():
+            run = self._client.get_run(self.run_id)
+            if run.info.lifecycle_stage != "active":
+                raise StoreRefusedError(f"run {self.run_id} was deleted in MLflow; restore it there")
+            self._client.update_run(self.run_id, status="RUNNING")
+            if END_TAG in run.data.tags and END_TAG not in told.tags:
+                self._client.delete_tag(self.run_id, END_TAG)
+        self._params = run.data.params
+        self._goes_on = True
+        self._there = {}
+        # Those of MLflow's own, such as the description, may have been edited in the UI.
+        self.set_tags({key: value for key, value in told.tags.items() if not key.startswith("mlflow.")})
 
     def log_params(self, params: Mapping[str, str]) -> None:
         """Write the parameters."""
-        rest = iter(params.items())
+        rest = iter((key, value) for key, value in params.items() if key not in self._params)
         with _told_apart():
             while chunk := [Param(key, value) for key, value in islice(rest, MAX_PARAMS_TAGS_PER_BATCH)]:
                 self._client.log_batch(self.run_id, params=chunk)
 
-    def log_metrics(self, points: Sequence[tuple[str, float, int, int]]) -> None:
-        """Write points of (key, value, timestamp in ms, step)."""
+    def log_metrics(self, points: Sequence[Point]) -> int:
+        """Write points, of a reopened run those that are missing; return how many."""
         with _told_apart():
-            for start in range(0, len(points), MAX_METRICS_PER_BATCH):
-                chunk = [Metric(*point) for point in points[start : start + MAX_METRICS_PER_BATCH]]
+            missing = [point for point in points if not self._has(point)] if self._goes_on else points
+            for start in range(0, len(missing), MAX_METRICS_PER_BATCH):
+                chunk = [Metric(*point) for point in missing[start : start + MAX_METRICS_PER_BATCH]]
                 self._client.log_batch(self.run_id, metrics=chunk)
+        return len(missing)
 
-    def set_tag(self, key: str, value: str) -> None:
-        """Write a tag."""
+    def set_tags(self, tags: Mapping[str, str]) -> None:
+        """Write tags."""
+        rest = iter(tags.items())
         with _told_apart():
-            self._client.log_batch(self.run_id, tags=[RunTag(key, value[:MAX_TAG_VAL_LENGTH])])
+            while some := list(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
+                chunk = [RunTag(key, value[:MAX_TAG_VAL_LENGTH]) for key, value in some]
+                self._client.log_batch(self.run_id, tags=chunk)
 
     def log_artifact(self, path: Path, folder: str | None) -> None:
         """Copy a file, or all that lies in a folder, to the run's files under `folder`."""
@@ -141,8 +179,36 @@ class MLflowRun:
             )
         return found.experiment_id
 
-    def _find(self, experiment_id: str, run_name: str, start_ms: int) -> str | None:
+    def _find(self, experiment_id: str, told: Told) -> str | None:
         runs = self._client.search_runs(
-            [experiment_id], f"attributes.start_time = {start_ms}", ViewType.ACTIVE_ONLY
+            [experiment_id], f"attributes.start_time = {told.start_ms}", ViewType.ALL
         )
-        return next((run.info.run_id for run in runs if run.info.run_name == run_name), None)
+        for run in runs:
+            if run.info.run_name == told.run_name and run.data.tags.get("run_dir") == told.tags.get(
+                "run_dir"
+            ):
+                return run.info.run_id
+        return None
+
+    def _has(self, point: Point) -> bool:
+        """Return whether the store has a point of this key and step; the first call of a key asks it."""
+        key, value, _, step = point
+        if key not in self._there:
+            history = self._client.get_metric_history(self.run_id, key)
+            self._there[key] = {found.step: found.value for found in history}
+        there = self._there[key].get(step)
+        if there is not None and there != value:
+            self._contradicted.add((key, step))
+        return there is not None
+
+
+def _create_whole(file: Path) -> None:
+    """Create an SQLite store beside its place and move it there: a process killed meanwhile leaves none.
+
+    MLflow makes its tables in dozens of steps and cannot go on with a half-made store.
+    """
+    aside = file.with_name(f".{file.name}.new")
+    for left in file.parent.glob(f"{aside.name}*"):
+        left.unlink()
+    MlflowClient(tracking_uri=f"sqlite:///{aside}").search_experiments(max_results=1)
+    aside.replace(file)

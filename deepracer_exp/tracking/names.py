@@ -4,8 +4,11 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+from deepracer_exp.formats.lineage_file import Lineage
 
 from .flatten import Scalar, flatten
 
@@ -15,6 +18,9 @@ METRICS: Mapping[str, str] = {
     "best_lap_time_s": "fastest lap so far",
     "mean_lap_time_s": "mean time of the iteration's completed laps",
     "laps": "laps completed so far",
+    "eval_completion": "per cent of the lap driven in the evaluation, mean",
+    "held_out_completion": "the same on conditions that were not trained on",
+    "eval_lap_time_s": "mean time of the evaluation's complete laps",
     "mean_return": "sum of rewards per finished episode, mean",
     "entropy": "entropy of the policy",
     "kl": "change of the policy in this iteration (KL divergence)",
@@ -34,12 +40,17 @@ TRACK_METRICS = ("completion", "lap_share", "best_lap_time_s", "mean_lap_time_s"
 """Metrics that a run on several tracks has of each: `completion/Oval_track`. The UI shows what stands before the
 slash as one section, so that the tracks stand beside one another."""
 
+END_TAG = "end"
+"""Tag of a run that has ended: how and why."""
+
 _LONGEST_LABEL = 80  # MLflow takes 250 characters, older servers fewer; the UI shows about 40
 
 VIEW = "racing"
 """Name of the view of the runs table that the UI opens with."""
 
 _COLUMNS = (
+    "metrics.`eval_lap_time_s`",
+    "metrics.`eval_completion`",
     "metrics.`best_lap_time_s`",
     "metrics.`completion`",
     "metrics.`lap_share`",
@@ -99,6 +110,12 @@ def joined(names: Sequence[str], between: str = "+") -> str:
     text = between.join(names)
     # A folder's name takes 255 characters, and a label has more than the tracks in it.
     return text if len(names) == 1 or (len(names) <= 3 and len(text) <= 120) else f"{len(names)} tracks"
+
+
+def lineage_tags(lineage: Lineage) -> dict[str, str]:
+    """Return the tags of a clone: where it comes from, and the parent it stands under in the UI."""
+    tags = {f"lineage.{key}": str(value) for key, value in asdict(lineage).items() if value is not None}
+    return tags if lineage.parent_run_id is None else {**tags, "mlflow.parentRunId": lineage.parent_run_id}
 
 
 def run_params(names: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, Scalar]:

@@ -1,4 +1,4 @@
-"""Tracker: what the training loop tells, recorded in MLflow beside the training, never in its way."""
+"""MLflowTracker: what the training loop tells, recorded in MLflow beside the training, never in its way."""
 
 import logging
 import math
@@ -9,54 +9,26 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING
 
 from deepracer_exp.config.running import TrackingConfig, TrackingOff
 
 from .flatten import Scalar, param_text
-from .names import in_order
-from .store import Store, redact, resolve_store
+from .names import END_TAG
+from .points import Point, now_ms, points_of
+from .store import Store, one_line, resolve_store
+from .tracker import NullTracker, Tracker
+from .tracking_file import Status, Told, TrackingFile
 
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
-
-Point = tuple[str, float, int, int]
-"""Key, value, time in ms, step."""
-Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 _log = logging.getLogger(__name__)
 
 _FIRST_PAUSE_S = 0.5
 _LONGEST_PAUSE_S = 10.0
 _POINTS_PER_CALL = 1000
-
-
-class Tracker(Protocol):
-    """Records one run. No method waits for the store, save `finish`."""
-
-    @property
-    def run_id(self) -> str | None:
-        """MLflow's id of the run, once it exists."""
-
-    def start(
-        self, run_name: str, experiment: str, params: Mapping[str, Scalar], tags: Mapping[str, str]
-    ) -> None:
-        """Begin the run; called once, before the others."""
-
-    def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        """Record metrics at `step` (env steps); None, NaN and infinite values are left out."""
-
-    def log_artifact(self, path: Path, folder: str | None = None) -> None:
-        """Keep a file, or all that lies in a folder, with the run.
-
-        It is read later: `path` must stay as it is until `finish` has returned.
-        """
-
-    def set_tag(self, key: str, value: str) -> None:
-        """Set a tag of the run."""
-
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
-        """Write what is left for at most `deadline_s`, end the run, return the number of points lost."""
+_END = "the end"
 
 
 def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
@@ -70,33 +42,14 @@ def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
     return MLflowTracker(resolve_store(config.uri, runs_dir))
 
 
-class NullTracker:
-    """Records nothing (`tracking=off`)."""
-
-    run_id = None
-
-    def start(
-        self, run_name: str, experiment: str, params: Mapping[str, Scalar], tags: Mapping[str, str]
-    ) -> None:
-        """Do nothing."""
-
-    def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        """Do nothing."""
-
-    def log_artifact(self, path: Path, folder: str | None = None) -> None:
-        """Do nothing."""
-
-    def set_tag(self, key: str, value: str) -> None:
-        """Do nothing."""
-
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
-        """Do nothing; nothing is lost."""
-        return 0
-
-
 @dataclass(frozen=True)
 class _Points:
     points: tuple[Point, ...]
+
+    @property
+    def step(self) -> int:
+        """The last one."""
+        return self.points[-1][-1]
 
 
 @dataclass(frozen=True)
@@ -113,18 +66,22 @@ class MLflowTracker:
     """Records one run in MLflow from a single thread fed by a queue.
 
     The store may be down, slow or come back later: what was told waits in order and is written once it
-    answers (a point carries the time at which it was told, so a repeated write is the same point). What
-    the store refuses is left out. The first failure and the sum at the end are logged.
+    answers (a repeated write is the same point). What the store refuses is left out. The first failure and
+    the sum at the end are logged.
     """
 
     def __init__(self, store: Store) -> None:
         self._store = store
+        self._file: TrackingFile
         self._queue: deque[_Points | _Call] = deque()
+        self._held: deque[_Points] = deque()
+        self._safe_step: float = -math.inf
         self._changed = threading.Condition()
         self._told = 0
         self._recorded = 0
         self._reported = False
         self._refused: set[str] = set()
+        self._rejected = False
         self._ended = False
         self._end_by = math.inf
         self._finishing = threading.Event()
@@ -145,65 +102,110 @@ class MLflowTracker:
             return self._told - self._recorded
 
     def start(
-        self, run_name: str, experiment: str, params: Mapping[str, Scalar], tags: Mapping[str, str]
+        self,
+        run_name: str,
+        experiment: str,
+        params: Mapping[str, Scalar],
+        tags: Mapping[str, str],
+        identity: Path,
     ) -> None:
-        """Begin the run; called once, before the others."""
-        start_ms = _now_ms()
-        tags = dict(tags)
+        """Begin the run, and `identity`, its `tracking.json`; called once, before the others."""
         texts = {key: param_text(value) for key, value in params.items()}
-        self._put(
-            _Call(
-                "the run",
-                lambda run, again: run.create(experiment, run_name, tags, start_ms, again=again),
-                vital=True,
-            )
-        )
-        self._put(_Call("the parameters", lambda run, _: run.log_params(texts)))
+        told = Told(None, run_name, experiment, now_ms(), self._store.shown, texts, dict(tags))
+        self._begin(TrackingFile(identity, told), lambda run, told, again: run.create(told, again=again))
+
+    def reopen(self, identity: Path) -> None:
+        """Go on with the run that `identity`, its `tracking.json`, tells of; instead of `start`.
+
+        Raises:
+            BadInput: the file is missing or not what a tracker writes.
+        """
+        file = TrackingFile.read(identity, self._store.shown)
+        tags = {key: value for key, value in file.told.tags.items() if key != END_TAG}
+        file.change(status=None, end_ms=None, files={}, tags=tags)
+        self._begin(file, lambda run, told, _: run.reopen(told))
 
     def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        """Record metrics at `step` (env steps); None, NaN and infinite values are left out."""
-        now_ms = _now_ms()
-        points = tuple(
-            (key, float(value), now_ms, step)
-            for key, value in in_order(metrics)
-            if value is not None and math.isfinite(value)
-        )
+        """Record a row of metrics.jsonl at `step` (env steps); None, NaN and infinite values are left out."""
+        points = points_of(metrics, step, self._file.told.start_ms)
         if points:
-            self._put(_Points(points))
+            with self._changed:
+                self._told += len(points)
+                self._held.append(_Points(points))
+                self._release()
+
+    def safe_until(self, step: int) -> None:
+        """Say that a checkpoint covers all steps until `step`: no resumed run will go back behind it."""
+        with self._changed:
+            self._safe_step = max(self._safe_step, step)
+            self._release()
 
     def log_artifact(self, path: Path, folder: str | None = None) -> None:
         """Keep a file, or all that lies in a folder, with the run (read later, see Tracker)."""
+        self._file.add_file(path, folder)
         self._put(_Call(f"file {path}", lambda run, _: run.log_artifact(path, folder)))
 
     def set_tag(self, key: str, value: str) -> None:
         """Set a tag of the run."""
-        self._put(_Call(f"tag {key}", lambda run, _: run.set_tag(key, value)))
+        self._file.add_tag(key, value)
+        self._put(_Call(f"tag {key}", lambda run, _: run.set_tags({key: value})))
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> int:
-        """Write what is left for at most `deadline_s`, end the run, return the number of points lost."""
-        end_ms = _now_ms()
-        self._put(_Call("the end", lambda run, _: self._end(run, status, end_ms), vital=True))
+        """Write what is left for at most `deadline_s`, end the run, return the number of points lost.
+
+        A run that failed or was killed may be resumed from its last checkpoint: points after that are not written.
+        """
+        end_ms = now_ms()
+        self._file.change(status=status, end_ms=end_ms)
+        if status == "FINISHED":
+            with self._changed:
+                self._safe_step = math.inf
+                self._release()
+        self._put(_Call(_END, lambda run, _: self._end(run, status, end_ms), vital=True))
         self._end_by = time.monotonic() + deadline_s
         self._finishing.set()
         self._thread.join(deadline_s)
-        lost = self.waiting
+        lost = self.waiting - sum(len(job.points) for job in self._held)
+        if self._rejected:
+            return lost  # and was told so
         if lost:
             _log.warning(
-                "MLflow (%s): %d of %d metric points were not recorded; metrics.jsonl has them all",
-                self._store.shown, lost, self._told,
+                "MLflow (%s): %d of %d metric points were not recorded; metrics.jsonl has them all,"
+                " `deepracer-exp resume %s` delivers them",
+                self._store.shown, lost, self._told, self._file.folder,
+            )  # fmt: skip
+        if self._run is not None and self._run.contradicted:
+            _log.warning(
+                "MLflow (%s): points of repeated iterations stay as they were first recorded there (%d);"
+                " metrics.jsonl has the repeated ones",
+                self._store.shown, self._run.contradicted,
             )  # fmt: skip
         if not self._ended:
             _log.warning("MLflow (%s): the run could not be marked %s", self._store.shown, status)
         return lost
 
+    def _begin(self, file: TrackingFile, open_run: Callable[["MLflowRun", Told, bool], None]) -> None:
+        self._file = file
+
+        def begin(run: "MLflowRun", again: bool) -> None:
+            open_run(run, file.told, again)
+            file.change(run_id=run.run_id)
+
+        self._put(_Call("the run", begin, vital=True))
+        self._put(_Call("the parameters", lambda run, _: run.log_params(file.told.params)))
+
     def _end(self, run: "MLflowRun", status: Status, end_ms: int) -> None:
         run.end(status, end_ms)
         self._ended = True
 
-    def _put(self, job: _Points | _Call) -> None:
+    def _release(self) -> None:
+        """Queue the points that wait no longer; `_changed` is held."""
+        while self._held and self._held[0].step <= self._safe_step:
+            self._queue.append(self._held.popleft())
+        self._changed.notify()
+
+    def _put(self, job: _Call) -> None:
         with self._changed:
-            if isinstance(job, _Points):
-                self._told += len(job.points)
             self._queue.append(job)
             self._changed.notify()
 
@@ -248,9 +250,15 @@ class MLflowTracker:
             try:
                 call.do(run, again)
             except StoreRefusedError as error:
-                if call.what not in self._refused:  # a run deleted in the UI refuses every iteration
+                if call.vital and call.what != _END:
+                    self._rejected = True
+                    _log.warning(
+                        "MLflow (%s) refused %s, so nothing is recorded there; the run folder has it all: %s",
+                        self._store.shown, call.what, one_line(error),
+                    )  # fmt: skip
+                elif call.what not in self._refused:  # a run deleted in the UI refuses every iteration
                     self._refused.add(call.what)
-                    _log.warning("MLflow (%s) refused %s: %s", self._store.shown, call.what, _one_line(error))
+                    _log.warning("MLflow (%s) refused %s: %s", self._store.shown, call.what, one_line(error))
                 return False
             except StoreUnavailableError as error:
                 self._report(error)
@@ -269,17 +277,9 @@ class MLflowTracker:
             self._reported = True
             _log.warning(
                 "MLflow (%s) does not answer; the training goes on and it is tried again: %s",
-                self._store.shown, _one_line(error),
+                self._store.shown, one_line(error),
             )  # fmt: skip
 
 
 def _log_points(points: tuple[Point, ...], run: "MLflowRun", again: bool) -> None:
     run.log_metrics(points)
-
-
-def _now_ms() -> int:
-    return time.time_ns() // 1_000_000
-
-
-def _one_line(error: Exception) -> str:
-    return redact(" ".join(str(error).split()))[:300]

@@ -23,6 +23,11 @@ def redact(text: str) -> str:
     return _SECRET_PARAMETER.sub(r"\1***", _USER_INFO.sub("***@", text))
 
 
+def one_line(error: Exception) -> str:
+    """Return what an error of a store says, short and without passwords."""
+    return redact(" ".join(str(error).split()))[:300]
+
+
 @dataclass(frozen=True)
 class Store:
     """An MLflow tracking store that a run can be recorded in."""

@@ -7,11 +7,11 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -19,13 +19,15 @@ from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollecto
 
 from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import BadInput, RunFailed
 
 from .faults import read_fault
 from .watchdog import Watchdog
 from .worker import EnvFactory
 
 _LOOK_EVERY_S = 0.2
+
+_T = TypeVar("_T")
 
 
 def cores() -> int:
@@ -52,6 +54,7 @@ class Collection:
         policy: torch.nn.Module,
         frames_per_batch: int,
         run_dir: Path,
+        state: Mapping[str, Any] | None = None,
     ):
         """Start the cars.
 
@@ -61,8 +64,11 @@ class Collection:
             policy: reads `observation`, writes `action` and its log-probability.
             frames_per_batch: control steps per batch over all cars; rounded up to whole steps of all cars.
             run_dir: where workers leave faults and prints.
+            state: `state_dict` of a collection of the same configuration and setup: with the same weights, the next
+                batch is what that one would have yielded next, bit for bit. None or empty: episodes begin.
 
         Raises:
+            BadInput: the state is of other cars, or of another number of processes.
             RunFailed: a worker did not start.
         """
         self._workers = worker_count(config)
@@ -70,6 +76,15 @@ class Collection:
         self._hang_timeout_s = config.hang_timeout_s
         self._run_dir = run_dir
         self._batches = 0
+        self._begun_from = state or {}
+        names = (
+            set() if config.mode == "async" else {_name(worker) for worker in range(max(1, self._workers))}
+        )
+        if self._begun_from and set(self._begun_from) != names:
+            raise BadInput(
+                f"the checkpoint does not fit: it has the cars of {len(self._begun_from)} processes that wait for one "
+                f"another; accepted by this collector: {len(names)}"
+            )
         self._watchdog: Watchdog | None = None
         parts = self._workers if config.mode == "sync" else 1
         self._steps_per_batch = -(-frames_per_batch // (parts * config.cars))
@@ -81,10 +96,12 @@ class Collection:
             "trust_policy": True,
         }
         if self._workers == 0:
-            env = factory(worker=0, threads=config.threads, heartbeat=None)
-            self._collector: Any = Collector(
-                env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
-            )
+            self._random = torch.get_rng_state()
+            with self._own_stream():
+                env = factory(worker=0, threads=config.threads, heartbeat=None)
+                self._collector: Any = Collector(
+                    env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
+                )
         else:
             heartbeat = run_dir / ".heartbeat"
             self._watchdog = Watchdog(
@@ -97,6 +114,11 @@ class Collection:
             self._collector = self._start(envs, policy, options)
             self._watchdog.workers_started(self._collector.procs)
         self._source = iter(self._collector)
+        if self._begun_from:
+            with contextlib.ExitStack() as undo:
+                undo.callback(self.close)
+                self._go_on()
+                undo.pop_all()
 
     def __enter__(self) -> "Collection":
         return self
@@ -123,20 +145,29 @@ class Collection:
         if self._watchdog is None:
             self._collector.update_policy_weights_()
             return
-        # TorchRL waits for a worker's acknowledgement without end, even if the worker is dead.
-        published: Future[None] = Future()
-        threading.Thread(target=self._publish, args=(published,), name="publish", daemon=True).start()
-        for _ in range(round(self._hang_timeout_s / _LOOK_EVERY_S)):
-            with contextlib.suppress(TimeoutError):
-                return published.result(_LOOK_EVERY_S)
-            loss = self._loss()
-            if loss is not None:
-                self._end_all()
-                raise loss
-        self._end_all()
-        raise RunFailed(
-            f"collector worker {self._receiver} took no new weights for {self._hang_timeout_s:.0f} s and was ended"
+        self._ask(self._publish, lambda: f"collector worker {self._receiver} took no new weights")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next batch depends on but the policy: arrays and plain values.
+
+        It is that of the last batch's end, to be asked for before the next batch is. Asynchronous workers are in the
+        middle of other batches by then: there is no such state of them, and what is returned is empty.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+        if self._mode == "async":
+            return {}
+        if not self._batches:
+            return dict(self._begun_from)
+        if self._watchdog is None:
+            with self._own_stream():
+                return {_name(0): self._collector.env.take_state()}
+        states = self._ask(
+            lambda: self._collector.map_fn("env.take_state"),
+            lambda: "a collector worker did not tell where its cars are",
         )
+        return {_name(worker): state for worker, state in enumerate(states)}
 
     def close(self) -> None:
         """End every worker."""
@@ -186,20 +217,73 @@ class Collection:
             process.kill()
             process.join()
 
-    def _publish(self, published: "Future[None]") -> None:
-        try:
-            for worker in range(self._workers):
-                self._receiver = worker
-                self._collector.update_policy_weights_(worker_ids=worker)
-        except BaseException as error:  # noqa: BLE001 - handed on to the thread that waits
-            published.set_exception(error)
-        else:
-            published.set_result(None)
+    def _go_on(self) -> None:
+        """Put the cars where those of the given state were.
+
+        TorchRL tries the policy once while it starts, which draws a number: the state is put back after that.
+        """
+        states = [self._begun_from[_name(worker)] for worker in range(max(1, self._workers))]
+        if self._watchdog is None:
+            with self._own_stream():
+                self._collector.env.put_state(states[0])
+                self._collector.reset()
+            return
+
+        def put() -> None:
+            self._collector.map_fn("env.put_state", [(state,) for state in states])
+            self._collector.map_fn("reset")
+
+        self._ask(put, lambda: "a collector worker did not put its cars where they were")
+
+    @contextlib.contextmanager
+    def _own_stream(self) -> Iterator[None]:
+        """Sample from the stream of the cars in this process: what else draws here must not shift it."""
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._random)
+            yield
+            self._random = torch.get_rng_state()
+
+    def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
+        """Return the workers' answer; TorchRL waits for it without end, even if the worker is dead.
+
+        Args:
+            question: asks them.
+            silence: says who did not answer.
+        """
+        answer: Future[_T] = Future()
+
+        def ask() -> None:
+            try:
+                answer.set_result(question())
+            except BaseException as error:  # noqa: BLE001 - handed on to the thread that waits
+                answer.set_exception(error)
+
+        threading.Thread(target=ask, name="ask the workers", daemon=True).start()
+        for _ in range(round(self._hang_timeout_s / _LOOK_EVERY_S)):
+            try:
+                return answer.result(_LOOK_EVERY_S)
+            except TimeoutError:
+                loss = self._loss()
+            except (RuntimeError, OSError, EOFError):  # what TorchRL and a broken pipe raise
+                loss = self._loss(patience_s=2.0)
+                if loss is None:
+                    raise
+            if loss is not None:
+                self._end_all()
+                raise loss
+        self._end_all()
+        raise RunFailed(f"{silence()} for {self._hang_timeout_s:.0f} s and was ended")
+
+    def _publish(self) -> None:
+        for worker in range(self._workers):
+            self._receiver = worker
+            self._collector.update_policy_weights_(worker_ids=worker)
 
     def _next(self) -> TensorDictBase:
         self._batches += 1
         if self._watchdog is None:
-            return next(self._source)
+            with self._own_stream():
+                return next(self._source)
         self._watchdog.expect(self._batches * self._steps_per_batch)
         try:
             batch = next(self._source)
@@ -244,3 +328,8 @@ class Collection:
             with contextlib.suppress(ValueError):  # a handle TorchRL has closed: that worker is gone
                 process.kill()
                 process.join()
+
+
+def _name(worker: int) -> str:
+    """Return what a worker's cars are called in a checkpoint."""
+    return f"worker-{worker}"

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -58,6 +59,21 @@ class Record:
             fastest = float(finished.time_s[finished.lap].min())
             self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything, JSON types."""
+        return {
+            "laps_of_last": list(self._laps_of_last),
+            "finished": self.finished,
+            "laps": self.laps,
+            "best_lap_s": self.best_lap_s,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`."""
+        self._laps_of_last.clear()
+        self._laps_of_last.extend(state["laps_of_last"])
+        self.finished, self.laps, self.best_lap_s = state["finished"], state["laps"], state["best_lap_s"]
+
 
 class EpisodeBook:
     """Numbers the episodes of a run and remembers how they ended.
@@ -102,6 +118,20 @@ class EpisodeBook:
         finished = self._close(trace)
         rows = trace.reshape(-1, trace.shape[-1])
         return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the numbers of the episodes under way and the records."""
+        return {
+            "number": self._number,
+            "next_number": self._next_number,
+            "records": [record.state_dict() for record in (self.all, *self.tracks)],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`."""
+        self._number, self._next_number = state["number"].copy(), state["next_number"]
+        for record, own in zip((self.all, *self.tracks), state["records"], strict=True):
+            record.load_state_dict(own)
 
     def _numbers(self, cars: np.ndarray, begins: np.ndarray) -> np.ndarray:
         """Return the number of each step's episode, (cars, T), from where episodes begin."""

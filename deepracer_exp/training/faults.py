@@ -10,8 +10,7 @@ import numpy as np
 
 from deepracer_exp.env.race import Race
 from deepracer_exp.errors import RunFailed
-
-from .files import write_whole
+from deepracer_exp.formats.whole_file import write_whole
 
 FAULTS_DIR = "faults"
 

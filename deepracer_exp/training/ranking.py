@@ -48,3 +48,12 @@ class Ranking:
         if not len(finished.track) or not self._episodes.all() or self._episodes.sum() < _FEWEST_EPISODES:
             return None
         return float(self._completion.mean()), float(self._speed_mps.mean())
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return what is known of each track."""
+        return {"completion": self._completion, "speed_mps": self._speed_mps, "episodes": self._episodes}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        """Take over a `state_dict`."""
+        self._completion, self._speed_mps = state["completion"].copy(), state["speed_mps"].copy()
+        self._episodes = state["episodes"].copy()

@@ -65,6 +65,15 @@ class Results:
             row |= {track_metric(metric, label): value for metric, value in figures.items()}
         return row
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything."""
+        return {"book": self.book.state_dict(), "last": self._last}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`."""
+        self.book.load_state_dict(state["book"])
+        self._last = [dict(last) for last in state["last"]]
+
     def summary(self) -> dict[str, Any]:
         """Return the figures at the end; with several tracks, `tracks` has those of each by its name."""
         book = self.book

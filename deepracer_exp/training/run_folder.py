@@ -1,32 +1,52 @@
 """The folder that tells everything about a run."""
 
+import contextlib
 import datetime
+import fcntl
 import json
 import platform
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import psutil
 
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.env.reward_source import RewardSource, source_with_constants
 from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.run_files import read_metrics
+from deepracer_exp.formats.whole_file import write_whole
 from deepracer_exp.tracking.store import redact
 
-from .files import write_whole
+from .faults import FAULTS_DIR
 
+RUNNING = ".running"
+"""Locked by the process that trains in the folder."""
 _PACKAGES = ("deepracer-exp", "torch", "torchrl", "tensordict", "mujoco", "hydra-core", "mlflow", "numpy")
 
 
 class RunFolder:
     """`runs_dir/<experiment>/<run>/` and the files that lie directly in it."""
 
-    def __init__(self, runs_dir: str, experiment: str, label: str):
+    def __init__(self, path: Path):
+        """Open a folder that is there; nobody else may write into it until this process lets go of it.
+
+        Raises:
+            BadInput: another process trains in it.
+            OSError: it cannot be written.
+        """
+        self.path = path
+        self.name = path.name
+        self._metrics = path / "metrics.jsonl"
+        self._lock = _held(path / RUNNING)
+
+    @classmethod
+    def create(cls, runs_dir: str, experiment: str, label: str) -> "RunFolder":
         """Create a folder of its own, named by the time and `label`.
 
         Raises:
@@ -37,17 +57,24 @@ class RunFolder:
         parent = Path(runs_dir) / experiment
         try:
             parent.mkdir(parents=True, exist_ok=True)
-            self.path = _make_new(parent, name)
+            return cls(_make_new(parent, name))
         except OSError as error:
             raise BadInput(
                 f"runs_dir={runs_dir}: cannot create {parent / name}: {error.strerror}; give a folder that can be "
                 "written"
             ) from error
-        self.name = self.path.name
-        self._metrics = self.path / "metrics.jsonl"
 
-    def describe(self, composition: Composition, reward: RewardSource, seed: int) -> str | None:
-        """Write the configuration and where code and reward come from; return the git commit if there is one."""
+    def describe(
+        self, composition: Composition, reward: RewardSource, seed: int, names: Mapping[str, str]
+    ) -> str | None:
+        """Write the configuration and where code and reward come from; return the git commit if there is one.
+
+        Args:
+            composition: of the experiment.
+            reward: its reward function.
+            seed: of the run.
+            names: what a racer calls its choices.
+        """
         self.write("config.yaml", redact(composition.yaml()))
         overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
         self.write("overrides.yaml", redact(overrides) or "[]\n")
@@ -57,6 +84,7 @@ class RunFolder:
             "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
             "git_commit": commit,
             "seed": seed,
+            "names": dict(names),
             "machine": {
                 "system": platform.platform(),
                 "cores": psutil.cpu_count(),
@@ -73,13 +101,37 @@ class RunFolder:
         with self._metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
+    def metrics(self) -> list[dict[str, Any]]:
+        """Return the lines of metrics.jsonl."""
+        return read_metrics(self._metrics) if self._metrics.exists() else []
+
+    def rewind(self, iteration: int) -> None:
+        """Go back to an iteration: what was written later goes."""
+        rows = [row for row in self.metrics() if row["iteration"] <= iteration]
+        self.write("metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        for name in ("summary.json", "best_lap.png", "learning.png"):
+            (self.path / name).unlink(missing_ok=True)
+        for file in (self.path / "trace").glob("*"):
+            # Files of the trace are counted from 0.
+            number = file.name.partition("-")[0]
+            if not number.isdigit() or int(number) >= iteration:
+                file.unlink()
+        shutil.rmtree(self.path / FAULTS_DIR, ignore_errors=True)
+
     def write(self, name: str, text: str) -> Path:
         """Write a file whole or not at all."""
         return write_whole(self.path / name, text)
 
     def remove(self) -> None:
         """Take back a folder in which no run has begun."""
+        self.release()
         shutil.rmtree(self.path, ignore_errors=True)
+
+    def release(self) -> None:
+        """Let others write into the folder."""
+        with contextlib.suppress(OSError):  # a disk that takes no more
+            (self.path / RUNNING).unlink(missing_ok=True)
+        self._lock.close()
 
 
 def git_commit() -> str | None:
@@ -98,6 +150,16 @@ def git_commit() -> str | None:
 def _git(root: Path, *arguments: str) -> str:
     done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)
     return done.stdout.strip()
+
+
+def _held(file: Path) -> TextIO:
+    lock = file.open("a", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise BadInput(f"{file.parent}: a process is training in it; end that one first") from None
+    return lock
 
 
 def _make_new(parent: Path, name: str) -> Path:

@@ -5,9 +5,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -69,7 +70,16 @@ class EnvFactory:
 
 
 class _StateKeepingEnv(RaceEnv):
-    """A RaceEnv whose failure carries the cars' state."""
+    """A RaceEnv whose state can be taken and put back, and whose failure carries the cars' state."""
+
+    def take_state(self) -> dict[str, Any]:
+        """Return the cars and the process's stream of random numbers, with which actions are sampled."""
+        return {"race": self.race.state_dict(), "random": torch.get_rng_state().numpy()}
+
+    def put_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `take_state` returned; the reset that follows leaves the cars there and draws nothing."""
+        self.go_on(state["race"])
+        torch.set_rng_state(torch.from_numpy(state["random"]))
 
     def _step(self, tensordict):  # type: ignore[no-untyped-def]
         try:

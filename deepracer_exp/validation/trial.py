@@ -34,7 +34,7 @@ def trial_seconds(text: str) -> float:
 def trial_overrides(seconds: float) -> list[str]:
     """Return what makes an experiment a trial of that length; runs go to `runs/validate/`."""
     return [
-        *("name=validate", "tracking=off", "stopping=none"),
+        *("name=validate", "tracking=off", "stopping=none", "checkpoints.every=null"),
         *("budget=default", "budget.env_steps=null", "budget.alerts=[]", f"budget.minutes={seconds / 60!r}"),
     ]
 

@@ -119,7 +119,7 @@ def test_all_tracks_writes_a_row_for_each_track_and_a_table(
     monkeypatch.setattr(all_tracks, "train", lambda given, folder: asked.append(given) or run)
     file = tmp_path / "tracks.json"
     all_tracks.main(["--json", str(file), "--markdown", "Oval_track", *overrides])
-    assert asked == [["track=Oval_track", *overrides]]
+    assert asked == [["track=Oval_track", "stopping=reliable", *overrides]]
     (row,) = json.loads(file.read_text())["tracks"]
     assert row["track"] == "Oval_track"
     assert (row["env_steps"], row["reliable_steps"], row["best_lap_time_s"]) == (1024, None, None)

@@ -2,11 +2,8 @@
 
 import io
 import json
-import os
-import pickle
 import re
 import shutil
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -36,11 +33,6 @@ def read(tmp_path):
         return read_checkpoint(stored.experiment, stored.checkpoints, checkpoint)
 
     return go
-
-
-def archive_of(run_dir: Path) -> Path:
-    (file,) = (run_dir / "checkpoints" / "best").resolve().rglob("state.tdz")
-    return file
 
 
 def weights(stored) -> torch.Tensor:
@@ -82,62 +74,6 @@ def test_a_missing_run_is_told_the_nearest(run_dir, read):
 
 def test_a_missing_checkpoint_is_told_those_that_are_there(run_dir, read):
     assert "best, last" in refusal(read, run_dir, "77")
-
-
-def test_a_flipped_byte_in_a_tensor_is_noticed(run_dir, read):
-    file = archive_of(run_dir)
-    with zipfile.ZipFile(file) as archive:
-        member = archive.getinfo("tensor_00000002.memmap")
-    content = bytearray(file.read_bytes())
-    content[member.header_offset + 1000] ^= 1
-    file.write_bytes(content)
-    assert "torn: checksum of tensor_00000002.memmap is wrong" in refusal(read, run_dir)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_a_truncated_checkpoint_is_refused(run_dir, read, share):
-    file = archive_of(run_dir)
-    os.truncate(file, int(file.stat().st_size * share))
-    assert "torn" in refusal(read, run_dir)
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "state.json", "state.tdz"])
-def test_a_checkpoint_without_one_of_its_files_is_refused(run_dir, read, name):
-    (file,) = (run_dir / "checkpoints" / "best").resolve().rglob(name)
-    file.unlink()
-    assert name in refusal(read, run_dir)
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"format": 1}', b"\xff\xfe"])
-def test_a_manifest_that_is_none_is_refused(run_dir, read, content):
-    (run_dir / "checkpoints" / "best" / "manifest.json").write_bytes(content)
-    refusal(read, run_dir)
-
-
-class Trap:
-    """Tells when it is unpickled."""
-
-    def __reduce__(self):
-        return os.mkdir, ("unpickled",)
-
-
-def test_a_pickle_is_never_loaded(run_dir, read, monkeypatch):
-    monkeypatch.chdir(run_dir)
-    trap = pickle.dumps(Trap())
-    file = archive_of(run_dir)
-    beside = file.with_name("state.pt")
-    beside.write_bytes(trap)
-    assert "pickle is never loaded" in refusal(read, run_dir)
-    beside.unlink()
-    with zipfile.ZipFile(file, "a") as archive:
-        archive.writestr("other.pickle", trap)
-    assert "pickle is never loaded" in refusal(read, run_dir)
-    folder = run_dir / "checkpoints"
-    shutil.rmtree(folder)
-    folder.mkdir()
-    (folder / "best").write_bytes(trap)
-    assert "pickle is never loaded" in refusal(read, run_dir)
-    assert not Path("unpickled").exists()
 
 
 def change_config(run_dir: Path, group: str, **values: object) -> None:

@@ -1,3 +1,4 @@
+import json
 import os
 import shutil
 import signal
@@ -10,8 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
+from mlflow import MlflowClient
 
-from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.formats.checkpoint_files import write_hashes
+from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import Store, resolve_store
 
 
@@ -19,7 +23,7 @@ from deepracer_exp.tracking.store import Store, resolve_store
 def empty_database(tmp_path_factory) -> Path:
     """A database with tables and no runs; creating the tables takes a second or two each time."""
     runs = tmp_path_factory.mktemp("template")
-    MLflowTracker(resolve_store(None, runs)).finish("FINISHED")
+    MLflowRun(resolve_store(None, runs)).connect()
     return runs / "mlflow.db"
 
 
@@ -27,6 +31,12 @@ def empty_database(tmp_path_factory) -> Path:
 def store(empty_database: Path, tmp_path: Path) -> Store:
     shutil.copy(empty_database, tmp_path / "mlflow.db")
     return resolve_store(None, tmp_path)
+
+
+@pytest.fixture
+def identity(tmp_path: Path) -> Path:
+    """Where a tracker writes which MLflow run it records."""
+    return tmp_path / "tracking.json"
 
 
 @pytest.fixture
@@ -96,3 +106,87 @@ def server(empty_database: Path, tmp_path: Path, free_port: int) -> Iterator[Ser
     server.start()
     yield server
     server.kill()
+
+
+class Season:
+    """Run folders as trainings leave them, without the training."""
+
+    def __init__(self, runs_dir: Path) -> None:
+        self.runs_dir = runs_dir
+
+    def run(
+        self, name: str, experiment: str = "season", /, status: str | None = "finished", **config
+    ) -> Path:
+        """Make a run with the checkpoints 10, 20 (best) and 30 (last); without a status it has no end."""
+        run = self.runs_dir / experiment / name
+        values = {
+            "track": {"name": "oval", "knots": [1, 2]},
+            "car": {"name": "deepracer"},
+            "name": experiment,
+        }
+        values |= {"evaluation": {"trials": 8, "tracks": None}, "algorithm": {"lr": 0.001}}
+        for iteration in (10, 20, 30):
+            self.checkpoint(run, iteration)
+        (run / "checkpoints" / "best").symlink_to("000020")
+        (run / "checkpoints" / "last").symlink_to("000030")
+        (run / "trace").mkdir()
+        (run / "trace" / "00000-iteration.parquet").write_bytes(bytes(1000))
+        (run / "config.yaml").write_text(yaml.safe_dump(values | config))
+        (run / "overrides.yaml").write_text("[]\n")
+        (run / "provenance.json").write_text("{}")
+        if status is not None:
+            self.result(run, status=status)
+        return run
+
+    def checkpoint(self, run: Path, iteration: int) -> Path:
+        folder = run / "checkpoints" / f"{iteration:06d}"
+        (folder / "agent").mkdir(parents=True)
+        (folder / "manifest.json").write_text("{}")
+        (folder / "agent" / "state.tdz").write_text(f"{run.name} {iteration}")
+        write_hashes(folder)
+        return folder
+
+    def result(self, run: Path, rank=None, lap_s=None, metric="lap_time", completion=90.0, **more) -> None:
+        """Write the summary of a run, with the evaluation of its best checkpoint if it has a rank."""
+        best = None
+        if rank is not None:
+            best = {"iteration": 20, "env_steps": 1, "metric": metric, "rank": list(rank)}
+            best |= {"eval_completion": completion, "eval_lap_time_s": lap_s, "held_out_completion": None}
+        summary = {"status": "finished", "best": best, "lap_share": None, "best_lap_time_s": None} | more
+        (run / "summary.json").write_text(json.dumps(summary))
+
+    def clone(
+        self, name: str, parent: Path, generation: int = 1, checkpoint: str = "000020", **config
+    ) -> Path:
+        run = self.run(name, **config)
+        lineage = {"parent": parent.name, "parent_dir": str(parent.resolve()), "parent_run_id": None}
+        lineage |= {
+            "checkpoint": checkpoint,
+            "sha256": "0" * 64,
+            "generation": generation,
+            "registered": None,
+        }
+        (run / "lineage.json").write_text(json.dumps(lineage))
+        return run
+
+    def recorded(self, run: Path, client: MlflowClient) -> str:
+        """Record a run in MLflow; return its id."""
+        found = client.get_experiment_by_name("season")
+        place = (self.runs_dir / "artifacts").as_uri()
+        experiment = found.experiment_id if found else client.create_experiment("season", place)
+        run_id = client.create_run(experiment, 0, {"run_dir": str(run.resolve())}).info.run_id
+        (run / "tracking.json").write_text(json.dumps({"run_id": run_id}))
+        return run_id
+
+
+@pytest.fixture
+def season(tmp_path: Path) -> Season:
+    return Season(tmp_path / "runs")
+
+
+@pytest.fixture
+def client(season: Season, empty_database: Path) -> MlflowClient:
+    """Of a store in the season's folder."""
+    season.runs_dir.mkdir(exist_ok=True)
+    shutil.copy(empty_database, season.runs_dir / "mlflow.db")
+    return MlflowClient(tracking_uri=resolve_store(None, season.runs_dir).uri)

@@ -1,19 +1,28 @@
 """The tracker against a real server that is stopped, killed and started again."""
 
+import contextlib
+import json
+import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
 
+from deepracer_exp.tracking.delivery import deliver
 from deepracer_exp.tracking.recorder import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 
 pytestmark = pytest.mark.slow
 
 
-def test_a_server_killed_and_restarted_mid_run_has_every_point_once(server, tmp_path, wait_until):
+def test_a_server_killed_and_restarted_mid_run_has_every_point_once(server, tmp_path, wait_until, identity):
     tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
-    tracker.start("run", "race", {"seed": 1}, {"track": "oval"})
+    tracker.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
+    tracker.safe_until(100)
     for step in range(20):
         tracker.log({"completion": float(step)}, step)
     wait_until(lambda: tracker.waiting == 0)
@@ -34,10 +43,10 @@ def test_a_server_killed_and_restarted_mid_run_has_every_point_once(server, tmp_
     ]
 
 
-def test_a_server_down_at_the_start_gets_one_whole_run_when_it_comes(server, tmp_path):
+def test_a_server_down_at_the_start_gets_one_whole_run_when_it_comes(server, tmp_path, identity):
     server.kill()
     tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
-    tracker.start("run", "race", {"seed": 1}, {})
+    tracker.start("run", "race", {"seed": 1}, {}, identity)
     tracker.log({"kl": 1.0}, 1)
     server.start()
     assert tracker.finish("FINISHED", deadline_s=60) == 0
@@ -47,9 +56,10 @@ def test_a_server_down_at_the_start_gets_one_whole_run_when_it_comes(server, tmp
     assert (run.data.params, run.data.metrics) == ({"seed": "1"}, {"kl": 1.0})
 
 
-def test_a_server_that_hangs_blocks_nobody_and_gets_every_point_later(server, tmp_path, wait_until):
+def test_a_server_that_hangs_blocks_nobody_and_gets_every_point_later(server, tmp_path, wait_until, identity):
     tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
-    tracker.start("run", "race", {}, {})
+    tracker.start("run", "race", {}, {}, identity)
+    tracker.safe_until(300)
     tracker.log({"kl": 0.0}, 0)
     wait_until(lambda: tracker.waiting == 0)
     server.signal(signal.SIGSTOP)
@@ -62,3 +72,50 @@ def test_a_server_that_hangs_blocks_nobody_and_gets_every_point_later(server, tm
     assert tracker.finish("FINISHED", deadline_s=60) == 0
     points = MlflowClient(tracking_uri=server.uri).get_metric_history(tracker.run_id, "kl")
     assert sorted(point.step for point in points) == list(range(201))
+
+
+def test_a_run_that_ends_while_the_server_is_down_is_delivered_when_it_is_back(server, tmp_path, wait_until):
+    tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
+    tracker.start("run", "race", {"seed": 1}, {}, tmp_path / "tracking.json")
+    rows = [{"env_steps": n, "wall_clock_s": n / 8, "kl": n / 3} for n in range(100)]
+    tracker.safe_until(100)
+    for row in rows:
+        if row["env_steps"] == 50:
+            wait_until(lambda: tracker.waiting == 0)
+            server.kill()
+        tracker.log(row, row["env_steps"])
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "summary.json").write_text(json.dumps({"status": "finished", "reason": "converged"}))
+    assert tracker.finish("FINISHED", deadline_s=0.5) == 100  # kl and wall_clock_s
+    server.start()
+    assert deliver(tmp_path, server.uri, tmp_path) == 100
+    assert deliver(tmp_path, server.uri, tmp_path) == 0
+    client = MlflowClient(tracking_uri=server.uri)
+    points = client.get_metric_history(tracker.run_id, "kl")
+    assert [(point.step, point.value) for point in points] == [(row["env_steps"], row["kl"]) for row in rows]
+    assert client.get_run(tracker.run_id).info.status == "FINISHED"
+
+
+@pytest.mark.timeout(600)
+def test_recordings_and_servers_that_are_killed_by_turns_leave_every_point_once(server, tmp_path):
+    script = Path(__file__).parents[1] / "faults" / "killed_recording.py"
+    recording = subprocess.Popen(
+        [sys.executable, script, str(tmp_path), server.uri, "5"], start_new_session=True
+    )
+    try:
+        for _ in range(2):
+            time.sleep(4)
+            server.kill()
+            time.sleep(1)
+            server.start()
+        assert recording.wait(400) == 0
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(recording.pid, signal.SIGKILL)
+    client = MlflowClient(tracking_uri=server.uri)
+    (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
+    assert run.info.status == "FINISHED"
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    for key in rows[0].keys() - {"env_steps"}:
+        history = client.get_metric_history(run.info.run_id, key)
+        assert [(p.step, p.value) for p in history] == [(row["env_steps"], row[key]) for row in rows], key

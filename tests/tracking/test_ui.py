@@ -30,6 +30,7 @@ def record(store, runs_dir: Path, seed: int) -> str:
         "race",
         run_params(NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}),
         run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed)),
+        runs_dir / "tracking.json",
     )
     tracker.log({key: float(seed) for key in reversed(METRICS)}, 8192)
     (runs_dir / "summary.json").write_text('{"seed": 1}')

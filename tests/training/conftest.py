@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from deepracer_exp.cli import _start_workers_early
+from deepracer_exp.commands.starting import start_workers_early
 
 # As a training does: on a busy machine threads of torch wait for one another, and saving a small network took 20 s.
 torch.set_num_threads(1)
@@ -14,6 +14,6 @@ torch.set_num_threads(1)
 def workers_start_early() -> Iterator[None]:
     """Let workers fork from a process that has imported torch, as the command does: a second instead of five each."""
     before = multiprocessing.get_start_method(allow_none=True)
-    _start_workers_early(True)
+    start_workers_early(True)
     yield
     multiprocessing.set_start_method(before, force=True)

@@ -1,0 +1,145 @@
+"""Is a clone that learns at a tenth of the rate better than one that goes on at the same rate?
+
+    python -m benchmarks.clone [--seeds 5] [--steps 1000000] [--more 500000] [--jobs 2] [--json FILE] [OVERRIDE...]
+
+For each seed `deepracer-exp train` runs the default experiment for `--steps` control steps, whatever a stopping rule
+would say, so that all parents are of the same age. Its best checkpoint is then cloned twice, each time with a fresh
+optimizer, for `--more` steps: by `deepracer-exp clone run=RUN`, which lowers the learning rate to a tenth, and with
+algorithm.lr as it was. The best checkpoint of each of the three drives 64 laps on usual and 64 on held-out conditions,
+with starts and draws that no evaluation of the training had.
+
+Figures are means over seeds with Student's 95 % interval. Both clones have the same parent, so that their differences
+within a seed tell more than those of the means: `tenth_minus_same`, and how much faster than the parent each is.
+"""
+
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from .command import at_once, read_summary, train
+from .fresh import TRIALS, drive
+from .intervals import mean_and_interval
+from .report import number, table, write_json
+
+POLICIES = ("parent", "tenth", "same")
+"""The trained run, and its clones by their rate."""
+FIGURES = ("lap_time_s", "completion", "lap_share", "held_out_lap_time_s", "held_out_completion")
+
+
+def train_family(folder: Path, seed: int, steps: int, more: int, overrides: Sequence[str]) -> dict[str, Path]:
+    """Train a parent and its two clones in `folder` and return their runs."""
+    folder.mkdir()
+    always = ("stopping=none", "tracking=off")
+    parent = train([*overrides, *always, f"budget.env_steps={steps}", f"seed={seed}"], folder)
+    cloned = [f"run={parent}", f"budget.env_steps={more}"]
+    return {
+        "parent": parent,
+        "tenth": train(cloned, folder, "clone"),
+        "same": train([*cloned, f"algorithm.lr={learning_rate(parent)}"], folder, "clone"),
+    }
+
+
+def measure(run: Path) -> dict[str, Any]:
+    """Let a run's best policy drive."""
+    summary = read_summary(run)
+    return {
+        "lr": learning_rate(run),
+        "env_steps": summary["env_steps"],
+        "best_iteration": summary["best"]["iteration"],
+        **asdict(drive(run, ["best"])[0]),
+    }
+
+
+def learning_rate(run: Path) -> float:
+    """Return the learning rate that a run was started with."""
+    config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+    return float(config["algorithm"]["lr"])
+
+
+def summarize(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return means and intervals over seeds, of each policy and of the differences within a seed."""
+
+    def difference(one: str, other: str, figure: str) -> list[float | None]:
+        pairs = [(seed[one][figure], seed[other][figure]) for seed in seeds]
+        return [None if None in pair else pair[0] - pair[1] for pair in pairs]
+
+    pairs = (("tenth", "same"), ("tenth", "parent"), ("same", "parent"))
+    return {
+        **{
+            name: {figure: mean_and_interval([seed[name][figure] for seed in seeds]) for figure in FIGURES}
+            for name in POLICIES
+        },
+        **{
+            f"{one}_minus_{other}": {
+                figure: mean_and_interval(difference(one, other, figure)) for figure in FIGURES
+            }
+            for one, other in pairs
+        },
+    }
+
+
+def markdown(seeds: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
+    """Return the table of seeds, means and differences."""
+    head = ("", "lap (s)", "done (%)", "complete laps", "held-out lap (s)", "held-out done (%)")
+    digits = (2, 1, 2, 2, 1)
+
+    def shown(figure: dict[str, Any], places: int) -> str:
+        low, high = figure["interval"] or (None, None)
+        mean = number(figure["mean"], places)
+        return mean if low is None else f"{mean} [{number(low, places)}, {number(high, places)}]"
+
+    rows = [
+        (
+            f"seed {seed['seed']}, {name}",
+            *(number(seed[name][f], d) for f, d in zip(FIGURES, digits, strict=True)),
+        )
+        for seed in seeds
+        for name in POLICIES
+    ]
+    for name, figures in summary.items():
+        cells = (shown(figures[figure], places) for figure, places in zip(FIGURES, digits, strict=True))
+        rows.append((name.replace("_", " "), *cells))
+    return table(head, rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="benchmarks.clone",
+    )
+    parser.add_argument("--seeds", type=int, default=5, help="number of parents, with the seeds 0, 1, ...")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of a parent")
+    parser.add_argument("--more", type=int, default=500_000, help="control steps of each clone")
+    parser.add_argument("--jobs", type=int, default=2, help="seeds at once")
+    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as temporary:
+        places = {seed: Path(temporary) / str(seed) for seed in range(options.seeds)}
+        how = (options.steps, options.more, options.overrides)
+        families = at_once(
+            options.jobs, [partial(train_family, folder, seed, *how) for seed, folder in places.items()]
+        )
+        seeds = [
+            {"seed": seed, **{name: measure(run) for name, run in family.items()}}
+            for seed, family in zip(places, families, strict=True)
+        ]
+    summary = summarize(seeds)
+    print(f"\n{markdown(seeds, summary)}")
+    told = {"steps": options.steps, "more": options.more, "trials": TRIALS, "overrides": options.overrides}
+    result = {**summary, **told, "seeds": seeds}
+    write_json(options.json, result)
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Stored policies put to a test that did not choose them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
+from deepracer_exp.evaluation.run import read_run
+
+TRIALS = 64
+_SEED = 20_181_128
+"""Of what held-out conditions draw; a training's evaluations have 0."""
+_SHIFT = 0.25
+"""Of the places where laps begin, as a share of their distance: evaluations of a training begin at multiples of an
+eighth and sixteenth of the lap."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Driven:
+    """What a policy did, single laps from standing starts all around the track."""
+
+    completion: float
+    """Per cent of the lap, mean; usual conditions."""
+    lap_share: float
+    """Share of complete laps."""
+    lap_time_s: float | None
+    """Mean of the complete laps, None without one."""
+    held_out_completion: float
+    """The same, with friction, noise and the like that it was not trained on."""
+    held_out_lap_time_s: float | None
+
+    def named(self, which: str) -> dict[str, float | None]:
+        """Return the figures for JSON, `which` in their names: completion_kept."""
+        return {f"{key}_{which}": None if v is None else round(v, 4) for key, v in asdict(self).items()}
+
+
+def fresh_trials(trials: int = TRIALS) -> EvaluationConfig:
+    """Return trials of one lap each whose starts and conditions no training's evaluation has."""
+    starts = ",".join(repr((place + _SHIFT) / trials) for place in range(trials))
+    overrides = [f"evaluation.trials={trials}", f"evaluation.seed={_SEED}", f"evaluation.starts=[{starts}]"]
+    return compose_evaluation(["run=any", "evaluation=three_trials", *overrides])[0].evaluation
+
+
+def drive(run: Path, checkpoints: Sequence[str], trials: int = TRIALS) -> list[Driven]:
+    """Let policies of a run drive the fresh trials.
+
+    Args:
+        run: its folder.
+        checkpoints: `best`, `last` or iterations.
+        trials: on each of usual and held-out conditions.
+    """
+    torch.set_num_threads(1)
+    stored = read_run(str(run), run.parent, None)
+    evaluator = Evaluator(stored.experiment, fresh_trials(trials))
+    policies = [read_checkpoint(stored.experiment, stored.checkpoints, name) for name in checkpoints]
+    return [driven(evaluator(policy.networks.policy)) for policy in policies]
+
+
+def driven(evaluation: Evaluation) -> Driven:
+    """Return the figures of an evaluation."""
+    usual, held_out = evaluation.on(USUAL), evaluation.on(HELD_OUT)
+    return Driven(
+        completion=usual.completion,
+        lap_share=sum(attempt.complete for attempt in usual.attempts) / len(usual.attempts),
+        lap_time_s=usual.mean_lap_time_s,
+        held_out_completion=held_out.completion,
+        held_out_lap_time_s=held_out.mean_lap_time_s,
+    )

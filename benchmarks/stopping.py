@@ -1,0 +1,247 @@
+"""What stopping in time saves, and what it costs.
+
+    python -m benchmarks.stopping [--seeds 5] [--tracks A,B,C] [--jobs 2] [--steps 3000000] [--reuse DIR] [--json FILE]
+                                  [OVERRIDE...]
+
+For each track and seed, `deepracer-exp train` runs the default experiment for the full budget, without a stopping
+rule. Since a seed gives the same run every time (synchronous collection), the run that `stopping=entropy` ends is the
+beginning of that one: the rule is applied to its metrics.jsonl. One run, seed 0 on the first track, is really run with
+the rule; it must end after the same iteration with the same metrics and the same best, or this benchmark fails.
+
+The kept checkpoint is the best evaluated one of the beginning, the other the best of the whole run, both by the
+evaluations of the training. Then both drive anew: 64 laps on usual and 64 on held-out conditions, with starts and
+draws that no evaluation of the training had, so that the figures are not those by which they were chosen.
+
+- `steps_saved`: share of all runs' control steps that need not have been driven;
+- `lap_time_loss`: how much slower the kept checkpoint's mean lap is, as a share; mean over the runs where both
+  checkpoints complete laps (`without_lap` counts the others);
+- `completion_kept`, `completion_full`: per cent of the lap, mean over runs; likewise on held-out conditions.
+
+The tracks differ in length and shape: the default one (17.7 m, 0.76 m wide), the narrowest (Oval_track, 19.6 m, 0.67 m
+wide) and a real circuit more than three times as long, driven clockwise (Spain_track, 60.0 m).
+
+`--reuse DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark goes on, and
+a changed rule costs no new training.
+"""
+
+import argparse
+import json
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.stopping import StoppingConfig
+from deepracer_exp.formats.run_files import read_run
+from deepracer_exp.training.checkpoints import checkpoint_name, read_training
+from deepracer_exp.training.stopping_replay import replay
+
+from .command import at_once, read_metrics, read_summary, train
+from .fresh import TRIALS, Driven, drive
+from .intervals import mean_and_interval
+from .report import number, table, write_json
+from .same import different_rows
+
+TRACKS = ("reinvent_base", "Oval_track", "Spain_track")
+RULE = "stopping=entropy"
+WANTED = {"steps_saved": 0.5, "lap_time_loss": 0.02}
+"""At least, and at most; the completion no lower."""
+_MEANS = ("completion", "held_out_completion", "lap_share")
+
+
+def training_overrides(track: str, seed: int, steps: int, overrides: Sequence[str], rule: str) -> list[str]:
+    """Return what is told to `deepracer-exp train`."""
+    # Every checkpoint stays: the best of the beginning is not the best of the whole run.
+    keep = ("checkpoints.keep=1000", "tracking=off", f"budget.env_steps={steps}")
+    return [f"track={track}", *overrides, rule, *keep, f"seed={seed}"]
+
+
+def trained(folder: Path, overrides: Sequence[str]) -> Path:
+    """Return a finished run of these overrides in `folder`; train if there is none."""
+    for summary in sorted(folder.glob("runs/*/*/summary.json")):
+        run = summary.parent
+        told = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
+        if told == list(overrides) and read_summary(run)["status"] in ("finished", "hopeless"):
+            return run
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    run = train(overrides, folder)
+    print(f"{folder.name}: trained in {time.monotonic() - began:.0f} s", flush=True)
+    return run
+
+
+def best_within(run: Path, iteration: int) -> str:
+    """Return the name of the checkpoint that a run ended after `iteration` would have kept as its best.
+
+    Raises:
+        SystemExit: none had been evaluated by then.
+    """
+    folders = sorted(path for path in run.glob("checkpoints/[0-9]*") if int(path.name) <= iteration)
+    # Each knows the best until then, so that a resumed training does.
+    best = read_training(folders[-1])["best"] if folders else None
+    if best is None:
+        raise SystemExit(f"{run}: no policy was evaluated within {iteration} iterations")
+    return checkpoint_name(best["iteration"])
+
+
+def prove(full: Path, stopped: Path, iteration: int, kept: str) -> dict[str, Any]:
+    """Hold a run that its rule has really ended against the beginning of the full one.
+
+    Args:
+        full: the run without a rule.
+        stopped: the one with it.
+        iteration: after which the rule ends the full run.
+        kept: its best checkpoint until then.
+
+    Raises:
+        SystemExit: they differ.
+    """
+    summary, rows = read_summary(stopped), read_metrics(stopped)
+    found = different_rows(read_metrics(full)[:iteration], rows)
+    ended = (summary["iteration"], checkpoint_name(summary["best"]["iteration"]))
+    if found is not None or ended != (iteration, kept):
+        raise SystemExit(
+            f"{stopped}: ended after {ended[0]} iterations and kept {ended[1]}; the rule ends {full} after {iteration} "
+            f"and keeps {kept}; {found or 'their metrics are the same'}"
+        )
+    return {"run": stopped.name, "iteration": iteration, "kept": int(kept), "same_metrics": True}
+
+
+def measure(run: Path, rule: StoppingConfig, trials: int = TRIALS) -> dict[str, Any]:
+    """Apply the rule to a full run and let both checkpoints drive."""
+    record = read_run(run)
+    end = replay(record, rule, RULE)
+    kept, best = best_within(run, end.iteration), best_within(run, end.iterations)
+    if (run / "checkpoints" / "best").resolve().name != best:
+        raise SystemExit(f"{run}: its best checkpoint is not {best}, which its last one names")
+    names = dict.fromkeys((kept, best))
+    driven = dict(zip(names, drive(run, list(names), trials), strict=True))
+    return {
+        "run": run.name,
+        "rule": None if end.decision is None else end.decision.rule,
+        "iteration": end.iteration,
+        "iterations": end.iterations,
+        "env_steps": end.env_steps,
+        "saved_steps": end.saved_steps,
+        "saved": round(end.saved, 4),
+        "kept": int(kept),
+        "full": int(best),
+        "lap_time_loss": lap_time_loss(driven[kept], driven[best]),
+        **driven[kept].named("kept"),
+        **driven[best].named("full"),
+    }
+
+
+def lap_time_loss(kept: Driven, full: Driven) -> float | None:
+    """Return how much slower the kept policy's mean lap is, as a share; None if one completes no lap."""
+    if kept.lap_time_s is None or full.lap_time_s is None:
+        return None
+    return round(kept.lap_time_s / full.lap_time_s - 1, 5)
+
+
+def summarize(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures over runs."""
+    losses = [run["lap_time_loss"] for run in runs]
+    loss = mean_and_interval(losses)
+    total = sum(run["env_steps"] + run["saved_steps"] for run in runs)
+    return {
+        "steps_saved": round(sum(run["saved_steps"] for run in runs) / total, 4),
+        "lap_time_loss": loss["mean"],
+        "lap_time_loss_interval": loss["interval"],
+        "without_lap": losses.count(None),
+        **{
+            f"{key}_{which}": round(statistics.fmean(run[f"{key}_{which}"] for run in runs), 4)
+            for key in _MEANS
+            for which in ("kept", "full")
+        },
+    }
+
+
+def markdown(runs: Sequence[dict[str, Any]]) -> str:
+    """Return the table of runs, with the figures of each track and of all."""
+    head = ("track, seed", "rule", "ends after", "saved", "lap (s)", "of full run", "loss")
+    completion = ("done (%)", "of full run", "held-out", "of full run")
+    rows = [
+        (
+            f"`{run['track']}`, {run['seed']}",
+            run["rule"] or "-",
+            f"{run['iteration']} of {run['iterations']}",
+            percent(run["saved"]),
+            *(number(run[f"lap_time_s_{which}"], 2) for which in ("kept", "full")),
+            percent(run["lap_time_loss"], 1),
+            *(number(run[f"{key}_{which}"], 1) for key in _MEANS[:2] for which in ("kept", "full")),
+        )
+        for run in runs
+    ]
+
+    def means(name: str, of: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+        figures = summarize(of)
+        done = (number(figures[f"{key}_{which}"], 1) for key in _MEANS[:2] for which in ("kept", "full"))
+        loss, saved = percent(figures["lap_time_loss"], 1), percent(figures["steps_saved"])
+        return (name, "", "", saved, "", "", loss, *done)
+
+    tracks = dict.fromkeys(run["track"] for run in runs)
+    rows += [means(f"`{track}`", [run for run in runs if run["track"] == track]) for track in tracks]
+    return table((*head, *completion), [*rows, means("all", runs)])
+
+
+def percent(share: float | None, digits: int = 0) -> str:
+    """Return a share for a table."""
+    return "-" if share is None else f"{share:.{digits}%}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog="benchmarks.stopping",
+    )
+    parser.add_argument("--seeds", type=int, default=5, help="runs on each track, with the seeds 0, 1, ...")
+    parser.add_argument("--tracks", default=",".join(TRACKS), help="options of the group track")
+    parser.add_argument("--jobs", type=int, default=2, help="trainings at once")
+    parser.add_argument("--steps", type=int, default=3_000_000, help="control steps of the full budget")
+    parser.add_argument("--trials", type=int, default=TRIALS, help="laps that each checkpoint drives anew")
+    parser.add_argument(
+        "--reuse", type=Path, metavar="DIR", help="keep runs here, and take the finished ones"
+    )
+    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as temporary:
+        result = benchmark(options, (options.reuse or Path(temporary)).resolve())
+    print(f"\n{markdown(result['runs'])}\n\nwanted: {WANTED}, completion no lower")
+    write_json(options.json, result)
+    print(json.dumps(result))
+
+
+def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Train in `folder` what is not there yet, and measure."""
+    places = [(track, seed) for track in options.tracks.split(",") for seed in range(options.seeds)]
+    overrides = partial(training_overrides, steps=options.steps, overrides=options.overrides)
+    rule = compose_experiment([RULE])[0].stopping
+    asked = [
+        partial(trained, folder / f"{track}-{seed}", overrides(track, seed, rule="stopping=none"))
+        for track, seed in places
+    ]
+    first, *_ = places
+    asked.append(partial(trained, folder / f"{first[0]}-{first[1]}-stopped", overrides(*first, rule=RULE)))
+    *full, stopped = at_once(options.jobs, asked)
+    runs = []
+    for (track, seed), run in zip(places, full, strict=True):
+        runs.append({"track": track, "seed": seed, **measure(run, rule, options.trials)})
+        told = {key: runs[-1][key] for key in ("rule", "iteration", "saved", "lap_time_loss")}
+        print(f"{track} seed {seed}: {told}", flush=True)
+    proof = prove(full[0], stopped, runs[0]["iteration"], checkpoint_name(runs[0]["kept"]))
+    told = {"steps": options.steps, "trials": options.trials, "overrides": options.overrides}
+    return {**summarize(runs), "wanted": WANTED, **told, "really_stopped": proof, "runs": runs}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""A run's whole family: what was cloned from what, what was changed, and what came of it."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.lineage_file import LINEAGE, Lineage, read_lineage
+from deepracer_exp.formats.run_files import RunRecord, read_head
+from deepracer_exp.formats.run_result import RunResult, read_result
+
+from .comparison import course_names, differences
+
+_OF_NO_INTEREST = ("name", "code")
+
+
+@dataclass
+class Member:
+    """A run of the family."""
+
+    name: str
+    path: Path
+    record: RunRecord | None
+    """None: its folder is gone."""
+    lineage: Lineage | None
+    """None: it is no clone, or gone."""
+    generation: int
+    result: RunResult | None
+    """None: not known."""
+    children: "list[Member]" = field(default_factory=list)
+    changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    """Values that differ from the parent's, by dotted key: the parent's and its own."""
+
+    @property
+    def course(self) -> str:
+        """Name of the track, or of several."""
+        return "" if self.record is None else course_names(self.record.config.get("track"))
+
+    def walk(self) -> "Iterator[Member]":
+        """Return the member and all below it, parents first."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+def family(run: Path, runs_dir: Path) -> Member:
+    """Return the root of a run's family.
+
+    Args:
+        run: its folder.
+        runs_dir: where its relatives are looked for, besides the runs beside it.
+
+    Raises:
+        BadInput: a file of a relative cannot be used, or a run descends from itself.
+    """
+    places = list(dict.fromkeys([runs_dir.resolve(), run.resolve().parents[1]]))
+    lineages: dict[Path, Lineage | None] = {}
+    children: dict[Path, set[Path]] = {}
+
+    def parent_of(folder: Path) -> Path | None:
+        lineage = lineages[folder] = read_lineage(folder)
+        if lineage is None:
+            return None
+        parent = _parent(lineage, places)
+        children.setdefault(parent, set()).add(folder)
+        return parent
+
+    for place in places:
+        for file in place.glob(f"*/*/{LINEAGE}"):
+            parent_of(file.parent.resolve())
+    root, seen = run.resolve(), set[Path]()
+    while (parent := parent_of(root)) is not None:
+        seen.add(root)
+        if parent in seen:
+            raise BadInput(f"{root / LINEAGE}: {root.name} descends from itself; nothing can be shown")
+        root = parent
+    return _grow(root, children, lineages)
+
+
+def best_members(root: Member) -> dict[int, str]:
+    """Return the best of the family by `id`, with a word for it: of each track and measure, where there are several.
+
+    Where a run was evaluated, those that were not are out.
+    """
+    known = [(one, one.result) for one in root.walk() if one.result is not None]
+    known = [pair for pair in known if pair[1].evaluated] or known
+    groups: dict[tuple[str, str], tuple[Member, RunResult]] = {}
+    for member, result in known:
+        key = (member.course, result.measure)
+        if key not in groups or result.rank > groups[key][1].rank:
+            groups[key] = (member, result)
+    courses, measures = ({key[at] for key in groups} for at in (0, 1))
+    words: dict[int, str] = {}
+    for (course, measure), (member, _) in groups.items():
+        word = "best" + f" on {course}" * (len(courses) > 1) + f" by {measure}" * (len(measures) > 1)
+        words[id(member)] = ", ".join(filter(None, [words.get(id(member)), word]))
+    return words
+
+
+def generations(root: Member) -> list[tuple[int, Member, RunResult]]:
+    """Return the member with the fastest lap of each generation on each track; evaluated laps before others."""
+    found: dict[tuple[int, str], tuple[Member, RunResult]] = {}
+    for member in root.walk():
+        if member.result is None or member.result.lap_time_s is None:
+            continue
+        key = (member.generation, member.course)
+        if key not in found or _lap_order(member.result) < _lap_order(found[key][1]):
+            found[key] = (member, member.result)
+    return [(key[0], *found[key]) for key in sorted(found)]
+
+
+def _lap_order(result: RunResult) -> tuple[bool, float]:
+    assert result.lap_time_s is not None
+    return not result.evaluated, result.lap_time_s
+
+
+def _parent(lineage: Lineage, places: list[Path]) -> Path:
+    """Return the parent's folder: where it was, where all runs have moved to, or where it was if it is gone."""
+    told = Path(lineage.parent_dir)
+    moved = [place / told.parent.name / lineage.parent for place in places]
+    return next((path for path in (told, *moved) if (path / "config.yaml").is_file()), told).resolve()
+
+
+def _grow(root: Path, children: Mapping[Path, set[Path]], lineages: Mapping[Path, Lineage | None]) -> Member:
+    """Return a member with all that descend from it."""
+    below = [_grow(child, children, lineages) for child in sorted(children.get(root, ()))]
+    lineage = lineages.get(root)
+    record = read_head(root) if (root / "config.yaml").is_file() else None
+    if lineage is not None:
+        generation = lineage.generation
+    elif record is not None:
+        generation = 0
+    else:  # it is gone, and may have been a clone
+        generation = min(child.generation for child in below) - 1
+    for child in below:
+        if record is not None and child.record is not None:
+            found = differences([record, child.record])
+            child.changes = {key: (a, b) for key, (a, b) in found.items() if key not in _OF_NO_INTEREST}
+    result = None if record is None else read_result(root)
+    return Member(root.name, root, record, lineage, generation, result, below)

@@ -1,0 +1,54 @@
+"""What is said when a run has ended."""
+
+import shlex
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from deepracer_exp.training.outcome import Outcome
+
+
+def tell(outcome: "Outcome", tracked_in: str | None) -> None:
+    """Print how a run ended, and where its results are.
+
+    Args:
+        outcome: of the run.
+        tracked_in: folder of the runs whose MLflow pages have it, None where it was not recorded.
+    """
+    summary = outcome.summary
+    if outcome.status == "failed":
+        print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
+        print(f"  what is known: {outcome.folder}", file=sys.stderr)
+        return
+    print(f"\n{outcome.status}: {outcome.reason}")
+    print(
+        f"  {summary['env_steps']:,} steps, {summary['episodes']:,} episodes, {summary['laps']:,} laps in "
+        f"{summary['wall_clock_s']:.0f} s, {_laps(summary)}"
+    )
+    print(f"\n  results       {outcome.folder}")
+    for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):
+        if (outcome.folder / name).exists():
+            print(f"    {name}  {what}")
+    if tracked_in is not None:
+        # `make race` calls us by a path that a newcomer's shell does not know.
+        command = "deepracer-exp" if shutil.which("deepracer-exp") else sys.argv[0]
+        where = "" if tracked_in == "runs" else f" --runs-dir {shlex.quote(tracked_in)}"
+        print(f"  compare runs  {command} ui{where}")
+
+
+def tell_all(outcomes: "Sequence[Outcome]") -> None:
+    """Print a line a run."""
+    print(f"\n{len(outcomes)} runs:")
+    for outcome in outcomes:
+        print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
+
+
+def _laps(summary: Mapping[str, Any]) -> str:
+    """Say what a run's laps came to."""
+    tracks = summary.get("tracks")
+    if tracks is not None:
+        return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
+    best = summary["best_lap_time_s"]
+    return f"best lap {best:.2f} s" if best is not None else "no lap yet"

@@ -1,0 +1,107 @@
+"""The configuration of a run that was kept: changed by overrides, compared."""
+
+import copy
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from deepracer_exp.errors import BadInput, nearest
+
+from . import custom_files
+from .compose import Composition, compose_entry
+from .options import groups
+from .overrides import OPEN_MAPPINGS, parse_single
+
+_WHOLE = ("experiment", custom_files.KEY)
+_ABSENT = "\N{EN DASH}"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A value that is not what it was."""
+
+    key: str
+    before: Any
+    after: Any
+
+    def __str__(self) -> str:
+        """Return it in words, e.g. ``algorithm.lr: 0.001 -> 0.0001``."""
+        return f"{self.key}: {_short(self.before)} -> {_short(self.after)}"
+
+
+def with_overrides(
+    config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str]
+) -> Composition:
+    """Change a stored configuration.
+
+    Args:
+        config: all values, as in config.yaml.
+        choices: the options they came from, by group.
+        overrides: of whole groups (``track=Oval_track``), whose options are composed anew, and of single values.
+
+    Raises:
+        BadInput: an override cannot be parsed, names something unknown or stands for a whole experiment.
+    """
+    parsed = [parse_single(override) for override in overrides]
+    values = copy.deepcopy(dict(config))
+    chosen = [one for one in parsed if one.key_or_group in groups() and not one.is_delete()]
+    for one in parsed:
+        if one.key_or_group in _WHOLE:
+            raise BadInput(
+                f"{one.input_line}: would replace what the run was made with; give the groups and values that are "
+                "to change, such as track=Oval_track"
+            )
+    composed = compose_entry("train", [one.input_line or "" for one in chosen])
+    for one in chosen:
+        values[one.key_or_group] = composed.mapping[one.key_or_group]
+    for one in parsed:
+        if one not in chosen:
+            if one.is_delete() or one.package is not None:
+                raise BadInput(f"{one.input_line}: accepted here: GROUP=OPTION or KEY=VALUE")
+            _set(values, one.key_or_group, one.value())
+    new = {group: composed.choices[group] for group in {one.key_or_group for one in chosen}}
+    return Composition(
+        overrides=tuple(overrides), choices={**choices, **new}, mapping=values, names={}, notes=()
+    )
+
+
+def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[Difference]:
+    """Return the values in which two configurations differ, lists as a whole."""
+    old, new = dict(_leaves(before)), dict(_leaves(after))
+    return [
+        Difference(key, old.get(key, _ABSENT), new.get(key, _ABSENT))
+        for key in {**old, **new}
+        if key not in old or key not in new or old[key] != new[key]
+    ]
+
+
+def _set(values: dict[str, Any], key: str, value: Any) -> None:
+    *path, leaf = key.split(".")
+    node: Any = values
+    for depth, part in enumerate(path):
+        if not isinstance(node, dict) or part not in node:
+            raise _unknown(key, ".".join(path[: depth + 1]), node)
+        node = node[part]
+    if not isinstance(node, dict) or (leaf not in node and ".".join(path) not in OPEN_MAPPINGS):
+        raise _unknown(key, key, node)
+    node[leaf] = value
+
+
+def _unknown(key: str, at: str, node: Any) -> BadInput:
+    known = [str(name) for name in node] if isinstance(node, dict) else []
+    leaf = at.rpartition(".")[2]
+    return BadInput(f"{key}: no such key{nearest(leaf, known)}; known there: {', '.join(known) or 'none'}")
+
+
+def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(node, Mapping) and node:
+        for name, value in node.items():
+            yield from _leaves(value, f"{prefix}.{name}" if prefix else str(name))
+    else:
+        yield prefix, node
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."

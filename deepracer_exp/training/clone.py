@@ -1,0 +1,130 @@
+"""A run that begins with another run's policy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.agents.actor_critic import ActorCritic
+from deepracer_exp.config.compose import Composition, validate
+from deepracer_exp.config.evaluation import checkpoint_name
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.stored import differences, with_overrides
+from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.run import StoredRun, read_run
+from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pin
+from deepracer_exp.formats.lineage_file import Lineage, read_lineage
+from deepracer_exp.formats.run_files import read_config, read_object, read_run_id
+
+SLOWER = 0.1
+"""A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
+_OWN = ("run", "checkpoint")
+_ALLOWED = {
+    "track": "the policy has to find its way on another road",
+    "reward": "values learned for another reward are wrong at first",
+    "car": "the policy knows another car",
+}
+
+
+@dataclass(frozen=True)
+class Clone:
+    """What a clone is trained with."""
+
+    experiment: Experiment
+    composition: Composition
+    start: tuple[ActorCritic, Lineage]
+    """The networks to begin with, and whose they were."""
+    told: tuple[str, ...]
+    """What the user is to know of it, a line each."""
+
+
+def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | None) -> Clone:
+    """Read the parent and its checkpoint, and change its configuration; the checkpoint may no longer be removed.
+
+    Args:
+        overrides: `run=` (it is there), perhaps `checkpoint=`, and what is to be different from the parent.
+        runs_dir: where the parent is.
+        tracking_uri: where ids and aliases are looked up; None: in `runs_dir`.
+
+    Raises:
+        BadInput: the parent or its checkpoint cannot be used, or what the overrides ask for does not fit its networks.
+    """
+    given = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
+    changes = [override for override in overrides if override.split("=", 1)[0] not in _OWN]
+    parent = read_run(given["run"], runs_dir, tracking_uri)
+    try:
+        name = checkpoint_name(parent.meant(given.get("checkpoint")))
+    except ValueError as error:
+        raise BadInput(f"checkpoint={given['checkpoint']}: {error}") from None
+    stored = read_checkpoint(parent.experiment, parent.path / "checkpoints", name)
+    composition = _changed(parent, changes)
+    experiment = validate(composition.mapping)
+    _refuse_other_networks(parent.experiment, experiment)
+    above = read_lineage(parent.path)
+    lineage = Lineage(
+        parent=parent.path.name,
+        parent_dir=str(parent.path.resolve()),
+        parent_run_id=read_run_id(parent.path),
+        checkpoint=stored.path.name,
+        sha256=checkpoint_sha256(stored.path),
+        generation=1 + (above.generation if above else 0),
+        registered=parent.registered,
+    )
+    pin(parent.path / "checkpoints", stored.path.name, f"cloned into {experiment.name}")
+    return Clone(
+        experiment,
+        composition,
+        (stored.networks, lineage),
+        tuple(_notes(parent, experiment, stored.path.name)),
+    )
+
+
+def _changed(parent: StoredRun, changes: Sequence[str]) -> Composition:
+    names = read_object(parent.path / "provenance.json").get("names", {})
+    composition = with_overrides(read_config(parent.path), names, changes)
+    keys = {change.lstrip("+").split("=", 1)[0] for change in changes}
+    if not keys & {"algorithm", "algorithm.lr"}:
+        composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER
+    if "runs_dir" not in keys:
+        composition.mapping["runs_dir"] = str(parent.path.parent.parent)
+    return composition
+
+
+def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
+    """Refuse what the parent's networks were not made for."""
+    why = "the parent's networks were made for it; train a new run for another"
+    if clone.network != parent.network:
+        changed = "; ".join(str(one) for one in differences(vars(parent.network), vars(clone.network)))
+        raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
+    ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
+    if clone.observation != parent.observation:
+        odd = ", ".join(sorted(set(ours) ^ set(theirs))) or "the order, or what is looked ahead"
+        raise BadInput(
+            f"observation: cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}"
+        )
+    before, after = (_words(build_action_space(one.action_space)) for one in (parent, clone))
+    if before != after:
+        raise BadInput(f"action_space: cannot be changed in a clone: {before} -> {after}; {why}")
+
+
+def _words(actions: ActionSpace) -> str:
+    if isinstance(actions, DiscreteActions):
+        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
+        return f"{actions.n} actions " + " ".join(f"{steering:g}°/{speed:g}" for steering, speed in pairs)
+    low, high = actions.low.tolist(), actions.high.tolist()
+    return f"continuous {low[0]:g} to {high[0]:g}°, {low[1]:g} to {high[1]:g} m/s"
+
+
+def _notes(parent: StoredRun, clone: Experiment, checkpoint: str) -> list[str]:
+    before: dict[str, Any] = vars(parent.experiment)
+    notes = [
+        f"clone of {parent.path.name}, checkpoint {checkpoint}; learning rate {clone.algorithm.lr:g} "
+        f"(the parent's: {parent.experiment.algorithm.lr:g})"
+    ]
+    for group, why in _ALLOWED.items():
+        if vars(clone)[group] != before[group]:
+            notes.append(f"warning: {group} is not the parent's: {why}")
+    return notes

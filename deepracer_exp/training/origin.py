@@ -1,0 +1,91 @@
+"""What a run was started with, so that it goes on with nothing else."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepracer_exp.config.stored import differences
+from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.run_files import read_config
+
+HARMLESS = (
+    "budget",
+    "checkpoints.keep",
+    "collector.hang_timeout_s",
+    "reward.time_limit_s",
+    "tracking",
+    "debug",
+)
+"""Keys, or their first parts, that change nothing of what a run learns. `runs_dir` is where the run is found."""
+
+
+def origin(run_dir: Path, setup: RaceSetup) -> dict[str, Any]:
+    """Return the configuration of a run and a hash of each of the files it was made from, JSON types."""
+    return {
+        "config": read_config(run_dir),
+        "files": _hashes(setup),
+    }
+
+
+def refuse_changes(
+    run_dir: Path, before: Mapping[str, Any], config: Mapping[str, Any], setup: RaceSetup
+) -> None:
+    """Refuse to go on with what the run was not started with.
+
+    Args:
+        run_dir: folder of the run.
+        before: its `origin`.
+        config: all values it is to go on with.
+        setup: its files as they are now.
+
+    Raises:
+        BadInput: a value or a file that matters is another one; all of them are named.
+    """
+    changed = [
+        str(difference)
+        for difference in differences(before["config"], config)
+        if not _is_harmless(difference.key)
+    ]
+    now = _hashes(setup)
+    changed += [f"{file} has other contents" for file in now if now[file] != before["files"].get(file)]
+    if changed:
+        raise BadInput(
+            f"{run_dir}: was started with other values: {'; '.join(changed)}; accepted changes: "
+            f"{', '.join(HARMLESS)}; `deepracer-exp clone` makes a new run with others"
+        )
+
+
+def _is_harmless(key: str) -> bool:
+    return key == "runs_dir" or any(key == part or key.startswith(f"{part}.") for part in HARMLESS)
+
+
+def _hashes(setup: RaceSetup) -> dict[str, str]:
+    tracks = {
+        f"track {course.name}": [
+            part for track in course.tracks for part in (track.waypoints, track.inner, track.outer)
+        ]
+        for course in setup.courses
+    }
+    return {
+        f"reward {setup.reward.name}": setup.reward.sha256,
+        "action space": _sha256(_commands(setup.actions)),
+        **{name: _sha256(parts) for name, parts in tracks.items()},
+    }
+
+
+def _commands(actions: ActionSpace) -> list[np.ndarray]:
+    if isinstance(actions, DiscreteActions):
+        return [actions.steering_deg, actions.speed_mps]
+    return [actions.low, actions.high]
+
+
+def _sha256(parts: Sequence[np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(np.ascontiguousarray(part).tobytes())
+    return digest.hexdigest()

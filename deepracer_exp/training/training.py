@@ -1,0 +1,419 @@
+"""A run in progress: its loop, its records and its end."""
+
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+from rich.console import Console
+from tensordict import TensorDictBase
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.ppo import PPO, UpdateMetrics
+from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.evaluation.result import Rank
+from deepracer_exp.formats.trace import TraceWriter, to_table
+from deepracer_exp.tracking.delivery import ENDS
+from deepracer_exp.tracking.names import joined
+from deepracer_exp.tracking.recorder import Tracker
+
+from .alerts import Alerts
+from .budget import Budget
+from .checkpoints import CheckpointStore, read_agent
+from .collection import Collection, worker_count
+from .display import ProgressDisplay, RunHeader
+from .episodes import Finished
+from .examination import NOT_EVALUATED, Examination, Mark
+from .faults import write_fault
+from .iterations import frames_per_batch, iterations
+from .log_file import log_to
+from .origin import origin
+from .outcome import Outcome
+from .ranking import Ranking
+from .report import write_report
+from .results import Results
+from .run_folder import RunFolder
+from .signals import Interruption
+from .stopping import Decision, Stopping
+
+logger = logging.getLogger("deepracer_exp")
+
+TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
+"""Columns of metrics.jsonl that differ between two runs of the same seed."""
+SPENT = "budget reached"
+"""How the reason of a run begins that has used its budget."""
+_LAST_EVERY, _LAST_EVERY_S = 10, 5.0
+"""Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
+
+
+class Training:
+    """A run in progress: what the loop reads and writes."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        setup: RaceSetup,
+        folder: RunFolder,
+        names: Mapping[str, str],
+        tracker: Tracker,
+        console: Console,
+    ):
+        """Build the networks and everything that watches over them.
+
+        Args:
+            experiment: what is trained.
+            setup: its files, read.
+            folder: where everything is written.
+            names: what a racer calls the choices.
+            tracker: has begun.
+            console: for the view of the progress.
+
+        Raises:
+            BadInput: files or values of the evaluation or the budget cannot be used.
+            OSError: the folder cannot be written.
+        """
+        self.experiment, self.setup, self.folder = experiment, setup, folder
+        self._names, self._tracker = names, tracker
+        self.checkpoints = CheckpointStore(folder.path, experiment.checkpoints.keep)
+        self._alerts = Alerts(experiment.budget)
+        self._budget = Budget(experiment.budget, folder.path)
+        self._examination = Examination(experiment)
+        self._stopping = Stopping(experiment.stopping, setup.actions.n)
+        self._decision: Decision | None = None
+        cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+        self._tracks = track_names(setup)
+        self._results = Results(self._tracks, cars, experiment.car.control_period_s, experiment.stopping)
+        self._ranking = Ranking([course.tracks[0].length_m for course in setup.courses])
+        self._trace = TraceWriter(folder.path / "trace")
+        self._display = ProgressDisplay(console, self._header())
+        # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
+        # update took 25 times as long.
+        torch.set_num_threads(1)
+        generator = torch.Generator().manual_seed(experiment.seed)
+        self.networks = build_actor_critic(
+            experiment.network, len(feature_names(experiment.observation)), setup.actions.n, generator
+        )
+        self.agent = PPO(
+            self.networks, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed
+        )
+        self._origin = origin(folder.path, setup)
+        self._cars: dict[str, Any] | None = None
+        self._env_steps = 0
+        self._iteration = 0
+        self._began = time.monotonic()
+        # The clock of a racer starts with the command, not with the loop.
+        self._process_began = psutil.Process().create_time()
+        self._saved_at = self._began
+        self._best: dict[str, Any] | None = None
+        self._best_rank: Rank | None = None
+        self._first_lap: dict[str, float] | None = None
+        self._reliable: dict[str, float] | None = None
+        self._row: dict[str, Any] = {}
+        self._log_file = log_to(folder.path / "log.txt")
+
+    def drive_and_learn(self, interruption: Interruption) -> str:
+        """Collect, learn and record until there is a reason to stop; return it."""
+        experiment = self.experiment
+        frames = frames_per_batch(experiment)
+        # The view first: workers take a second or two to start.
+        with (
+            self._display,
+            Collection(
+                experiment.collector,
+                self.setup,
+                self.networks.policy,
+                frames,
+                self.folder.path,
+                state=self._cars,
+            ) as collection,
+        ):
+            return self._loop(collection, interruption)
+
+    def go_on_from(
+        self, checkpoint: Path, state: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
+    ) -> None:
+        """Take over what a checkpoint holds of a run that ended too early.
+
+        Args:
+            checkpoint: its folder.
+            state: what `read_training` found in it.
+            rows: of metrics.jsonl, up to the checkpoint's iteration.
+
+        Raises:
+            BadInput: it does not fit the experiment.
+        """
+        read_agent(checkpoint, self.agent)
+        self._iteration, self._env_steps = state["iteration"], state["env_steps"]
+        self._results.load_state_dict(state["results"])
+        self._ranking.load_state_dict(state["ranking"])
+        self._best, self._first_lap, self._reliable = state["best"], state["first_lap"], state["reliable"]
+        self._best_rank = None if self._best is None else _rank(self._best)
+        self._cars = state["cars"]
+        self._began -= state["wall_clock_s"]
+        self._process_began -= state["wall_clock_s"]
+        for row in rows:
+            self._stopping.observe(row)
+            self._row = dict(row)
+
+    def tell_again(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Tell the tracker, which has the run open again, all rows up to the checkpoint: it may lack some."""
+        for row in rows:
+            self._tell(row)
+        self._tracker.safe_until(self._env_steps)
+
+    def close(self, status: str, reason: str, exit_code: int) -> Outcome:
+        """Write what a run has at its end: pictures, summary.
+
+        Raises:
+            OSError, RunFailed: the folder takes no more.
+        """
+        write_report(self.folder.path, self.setup.courses)
+        return self._end(status, reason, exit_code)
+
+    def fail(self, reason: str, error: BaseException) -> Outcome:
+        """Write what is known of a failure; a disk that takes no more leaves no summary, and keeps no one waiting."""
+        write_fault(self.folder.path, error)
+        return self._end("failed", reason, RunFailed.exit_code, error)
+
+    def break_off(self, exit_code: int) -> Outcome:
+        """End at once: no checkpoint, which might be of a half-made update, and no pictures."""
+        return self._end("interrupted", "ended at once by a second signal", exit_code)
+
+    @property
+    def verdict(self) -> str:
+        """What a run is that was not interrupted: `finished`, or `hopeless` by its stopping rule."""
+        return "hopeless" if self._decision is not None and self._decision.hopeless else "finished"
+
+    def _loop(self, collection: Collection, interruption: Interruption) -> str:
+        algorithm = self.experiment.algorithm
+        self._budget.alerts(*self._usage())  # what was used before this loop needs no alert
+        for batch, collect_s in iterations(collection, algorithm, self.experiment.collector.mode == "async"):
+            rows, finished = self._results.book.enter(batch["next", "trace"].numpy())
+            self._env_steps += batch.numel()
+            if not self._examination.is_held:
+                self._rank_by_driving(finished)
+            began = time.monotonic()
+            update = self._learn(batch)
+            collection.publish_policy()
+            update_s = time.monotonic() - began
+            self._iteration += 1
+            self._row = self._measured(finished, update, batch.numel(), collect_s, update_s)
+            mark = self._evaluated() if self._examination.is_due(self._iteration) else None
+            self._decision = self._stopping.observe(self._row)
+            reason = self._reason_to_stop(interruption)
+            if reason is not None and interruption.signum is None and self._best is None:
+                mark = self._evaluated()
+            self._record(rows)
+            better = self._note(mark)
+            if reason is not None or better or self._is_time_to_save():
+                self._save(collection, better)
+            self._send_alerts()
+            if reason is not None:
+                return reason
+        raise RunFailed("the collector ended without a reason")
+
+    def _save(self, collection: Collection, best: bool) -> None:
+        self.checkpoints.save(self.agent, self._counters(), self._state(collection), best=best)
+        self._tracker.safe_until(self._env_steps)
+        self._saved_at = time.monotonic()
+
+    def _state(self, collection: Collection) -> dict[str, Any]:
+        """Return what `go_on_from` needs beside the agent."""
+        return {
+            "iteration": self._iteration,
+            "env_steps": self._env_steps,
+            "wall_clock_s": time.monotonic() - self._began,
+            "results": self._results.state_dict(),
+            "ranking": self._ranking.state_dict(),
+            "best": self._best,
+            "first_lap": self._first_lap,
+            "reliable": self._reliable,
+            "cars": collection.state_dict(),
+            **self._origin,
+        }
+
+    def _rank_by_driving(self, finished: Finished) -> None:
+        """Keep the policy if no other drove better; the weights are still those that drove."""
+        rank = self._ranking.rank(finished)
+        if rank is not None and (self._best_rank is None or rank > self._best_rank):
+            self._best_rank = rank
+            self._best = {**self._counters_of_best("driving"), "rank": list(rank), **NOT_EVALUATED}
+            self.checkpoints.save(self.agent, self._counters(), best=True)
+
+    def _note(self, mark: Mark | None) -> bool:
+        """Return whether the policy is the best evaluated so far."""
+        if mark is None or (self._best_rank is not None and mark.rank <= self._best_rank):
+            return False
+        self._best_rank = mark.rank
+        metric = self.experiment.checkpoints.metric
+        self._best = {**self._counters_of_best(metric), "rank": list(mark.rank), **mark.columns()}
+        return True
+
+    def _counters_of_best(self, metric: str) -> dict[str, Any]:
+        return {"iteration": self._iteration, "env_steps": self._env_steps, "metric": metric}
+
+    def _end(self, status: str, reason: str, exit_code: int, error: BaseException | None = None) -> Outcome:
+        """Write the summary and let go of the tracker and the log."""
+        path = self.folder.path
+        summary = {
+            "status": status,
+            "reason": reason,
+            **self._counters(),
+            "seed": self.experiment.seed,
+            "wall_clock_s": round(time.monotonic() - self._began, 3),
+            "cost": self._budget.cost(time.monotonic() - self._began),
+            **self._results.summary(),
+            "best": self._best,
+            "stopping": self._decision and self._decision.as_dict(),
+            "first_lap": self._first_lap,
+            "reliable": self._reliable,
+            "last": self._row,
+        }
+        logger.log(logging.ERROR if error else logging.INFO, "%s: %s", status, reason, exc_info=error)
+        try:
+            self.folder.write("summary.json", json.dumps(summary, indent=2) + "\n")
+        except OSError:
+            if status != "failed":
+                raise
+        for name in ("config.yaml", "overrides.yaml", "provenance.json", "reward_function.py"):
+            self._tracker.log_artifact(path / name)
+        for name in ("summary.json", "metrics.jsonl", "log.txt", "best_lap.png", "learning.png", "faults"):
+            if (path / name).exists():
+                self._tracker.log_artifact(path / name, "faults" if name == "faults" else None)
+        for name in ("best", "last"):
+            if (self.checkpoints.folder / name).exists():
+                self._tracker.log_artifact((self.checkpoints.folder / name).resolve(), f"checkpoints/{name}")
+        tags = self._decision.tags() if self._decision else {}
+        for tag, value in {**tags, "end": f"{status}: {reason}"}.items():
+            self._tracker.set_tag(tag, value)
+        self._tracker.finish(ENDS.get(status, "KILLED"))
+        self._alerts.close()
+        self.folder.release()
+        logger.removeHandler(self._log_file)
+        self._log_file.close()
+        return Outcome(status, reason, exit_code, path, summary, error)
+
+    def _learn(self, batch: TensorDictBase) -> UpdateMetrics:
+        _, fraction = self._spent()
+        try:
+            return self.agent.update(batch, self._iteration, min(fraction, 1.0))
+        except RunFailed as error:
+            error.arrays = {  # type: ignore[attr-defined]
+                "observation": batch["observation"].numpy(),
+                "action": batch["action"].numpy(),
+                "reward": batch["next", "reward"].numpy(),
+            }
+            raise
+
+    def _measured(
+        self, finished: Finished, update: UpdateMetrics, frames: int, collect_s: float, update_s: float
+    ) -> dict[str, Any]:
+        """Return the iteration's row of metrics.jsonl."""
+        if self._first_lap is None and self._results.book.all.laps:
+            self._first_lap = self._moment()
+        return {
+            **self._counters(),
+            **self._results.metrics(finished),
+            **{name: float(value) for name, value in vars(update).items()},
+            **NOT_EVALUATED,
+            "wall_clock_s": round(time.monotonic() - self._began, 3),
+            "collect_s": round(collect_s, 4),
+            "update_s": round(update_s, 4),
+            "env_steps_per_s": round(frames / (collect_s + update_s), 1),
+            **self._results.metrics_of_tracks(finished),
+        }
+
+    def _evaluated(self) -> Mark | None:
+        """Evaluate the policy, unless nobody wants it, and put what came out into the row."""
+        if not self._examination.is_held:
+            return None
+        mark = self._examination(self.networks.policy)
+        self._row |= mark.columns()
+        return mark
+
+    def _record(self, rows: np.ndarray) -> None:
+        if self._decision is not None and self._decision.rule == "reliable":
+            self._reliable = self._moment()
+        self.folder.append_metrics(self._row)
+        self._trace.write(self._iteration - 1, to_table(rows, self._iteration - 1, self._tracks))
+        self._tell(self._row)
+        _, fraction = self._spent()
+        wall_clock_s = self._row["wall_clock_s"]
+        self._display.update(
+            self._row, min(fraction, 1.0), wall_clock_s * (1 / fraction - 1) if fraction else None
+        )
+
+    def _is_time_to_save(self) -> bool:
+        return self._iteration % _LAST_EVERY == 0 or time.monotonic() > self._saved_at + _LAST_EVERY_S
+
+    def _tell(self, row: Mapping[str, Any]) -> None:
+        self._tracker.log(
+            {key: value for key, value in row.items() if key != "env_steps"}, step=row["env_steps"]
+        )
+
+    def _reason_to_stop(self, interruption: Interruption) -> str | None:
+        if interruption.signum is not None:
+            return "interrupted"
+        if self._decision is not None:
+            return str(self._decision)
+        limit, fraction = self._spent()
+        return f"{SPENT}: {limit}" if fraction >= 1 else None
+
+    def _moment(self) -> dict[str, float]:
+        return {
+            "env_steps": self._env_steps,
+            "since_process_start_s": round(time.time() - self._process_began, 3),
+        }
+
+    def _spent(self) -> tuple[str, float]:
+        return self._budget.used(*self._usage())
+
+    def _usage(self) -> tuple[int, int, float]:
+        return self._env_steps, self._iteration, time.monotonic() - self._began
+
+    def _send_alerts(self) -> None:
+        for alert in self._budget.alerts(*self._usage()):
+            logger.info(alert.message)
+            self._tracker.set_tag(f"budget.{alert.limit}", f"{alert.percent} %")
+            self._alerts.send(alert.message, self.folder.path)
+
+    def _counters(self) -> dict[str, int]:
+        return {
+            "iteration": self._iteration,
+            "env_steps": self._env_steps,
+            "episodes": self._results.book.all.finished,
+            "laps": self._results.book.all.laps,
+        }
+
+    def _header(self) -> RunHeader:
+        return RunHeader(
+            name=self.folder.name,
+            track=joined([course.tracks[0].title for course in self.setup.courses], " + "),
+            track_labels=tuple(self._results.labels),
+            remembered=self._results.remembered,
+            reward=self._names["reward"],
+            network=self._names["network"],
+            actions=self._names["action_space"],
+            budget=str(self._budget),
+            folder=str(self.folder.path),
+        )
+
+
+def track_names(setup: RaceSetup) -> list[str]:
+    """Return what the courses are called: one by its own name, which may stand in a file; several by their options."""
+    courses = setup.courses
+    return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
+
+
+def _rank(best: Mapping[str, Any]) -> Rank:
+    first, second = best["rank"]
+    return first, second

@@ -1,0 +1,147 @@
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.rules import EpisodeRules
+from deepracer_exp.env.setup import RaceSetup, build_setup
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.trace import STATUS_CODE
+
+EVERYTHING = (
+    "track=[reinvent_carpet,Oval_track]",
+    "track.direction=alternate",
+    "randomization=sim2real",
+    "episode.max_steps=25",
+    "reward=follow_center_line",
+)
+SHOWN = ("observation", "reward", "terminated", "truncated", "trace")
+
+
+def make_setup(*overrides: str) -> RaceSetup:
+    return build_setup(compose_experiment(overrides)[0])
+
+
+def future(race: Race, seed: int, turns: int) -> list[np.ndarray]:
+    """Drive by dice: actions, new episodes, other courses and cars put back; return all that could be seen of it."""
+    dice, seen = np.random.default_rng(seed), []
+    for _ in range(turns):
+        n_actions = race.setup.actions.n
+        race.step(
+            dice.uniform(-1.2, 1.2, (race.n_cars, 2))
+            if n_actions is None
+            else dice.integers(n_actions, size=race.n_cars)
+        )
+        seen += [getattr(race, name).copy() for name in SHOWN]
+        ended = np.flatnonzero(race.terminated | race.truncated)
+        if len(ended):
+            course = dice.integers(len(race.setup.courses), size=len(ended)) if dice.random() < 0.5 else None
+            race.reset(ended, course)
+        if dice.random() < 0.1:
+            race.put_back(dice.permutation(race.n_cars)[:2], dice.uniform(0, 60, 2))
+        if dice.random() < 0.02:
+            race.reset()
+        seen += [race.observation.copy(), race.referee.now.front.copy()]
+    return seen
+
+
+def assert_same(arrays, expected) -> None:
+    assert len(arrays) == len(expected)
+    for array, wanted in zip(arrays, expected, strict=True):
+        np.testing.assert_array_equal(array, wanted)
+
+
+@pytest.fixture(scope="module")
+def everything():
+    return make_setup(*EVERYTHING)
+
+
+def test_the_floors_differ(everything):
+    assert len({course.tracks[0].floor.friction for course in everything.courses}) > 1
+
+
+@pytest.mark.parametrize("space", ["discrete", "continuous"])
+def test_a_race_goes_on_from_a_state_as_the_race_it_was_taken_of(everything, space):
+    setup = dataclasses.replace(everything, actions=make_setup(f"action_space={space}").actions)
+    race, used = Race(setup, 5, first_car=3), Race(setup, 5, first_car=3)
+    race.reset()
+    used.seed(77)
+    used.reset()
+    future(used, 5, 30)
+    for seed, turns in enumerate([0, 80, 30]):
+        future(race, seed, turns)
+        state = race.state_dict()
+        kept = copy.deepcopy(state)
+        expected = future(race, seed, 30)
+        for other in (Race(setup, 5, first_car=3), used):
+            other.load_state_dict(state)
+            np.testing.assert_equal(other.state_dict(), kept)
+            assert_same(future(other, seed, 30), expected)
+        # Whoever drove, the state is still what it was.
+        np.testing.assert_equal(state, kept)
+
+
+def test_the_seed_that_was_set_goes_with_the_state(everything):
+    race = Race(everything, 3)
+    race.seed(1234)
+    race.reset()
+    future(race, 0, 20)
+    state = race.state_dict()
+    expected = future(race, 1, 60)
+    other = Race(everything, 3)
+    other.load_state_dict(state)
+    assert_same(future(other, 1, 60), expected)
+
+
+@pytest.mark.parametrize("off", ["randomization=none", "randomization=aws"])
+def test_a_race_with_little_or_no_randomization_goes_on_as_well(off):
+    setup = make_setup(off, "episode.max_steps=30")
+    race, other = Race(setup, 4), Race(setup, 4)
+    race.reset()
+    future(race, 0, 40)
+    other.load_state_dict(race.state_dict())
+    assert_same(future(other, 1, 60), future(race, 1, 60))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "options", "what"),
+    [
+        ((), {"n_cars": 4}, "'physics' of its cars has shape (3, "),
+        ((), {"n_cars": 3, "first_car": 3}, "begin with number 0; accepted here: 3"),
+        (
+            ("track=reinvent_carpet",),
+            {"n_cars": 3},
+            "'driven' of its cars has shape (3, 2), these cars need (3, 1)",
+        ),
+        (("observation.lookahead_m=[0.5]",), {"n_cars": 3}, "'observation' of its cars has shape (3, "),
+    ],
+    ids=["cars", "other cars", "tracks", "features"],
+)
+def test_a_state_of_another_race_is_refused(everything, overrides, options, what):
+    race = Race(everything, 3)
+    race.reset()
+    other = Race(make_setup(*EVERYTHING, *overrides), **options)
+    with pytest.raises(BadInput) as error:
+        other.load_state_dict(race.state_dict())
+    assert "the checkpoint does not fit" in str(error.value)
+    assert what in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_car_that_was_reversed_for_ten_steps_ends_its_episode_after_five_more():
+    config = make_setup().episode
+    assert config.reversed_steps == 15
+    at = np.zeros(1)
+
+    def judge(rules: EpisodeRules, step: int) -> int:
+        return int(rules.judge(at + step, 50.0 - at - step, 51.0 - at - step, at + 1.0, at > 0)[0])
+
+    before, after = EpisodeRules(config, 1), EpisodeRules(config, 1)
+    for step in range(2, 12):
+        judge(before, step)
+    after.load_state_dict(before.state_dict())
+    verdicts = [judge(after, step) for step in range(12, 17)]
+    assert verdicts == [STATUS_CODE["in_progress"]] * 4 + [STATUS_CODE["reversed"]]

@@ -1,0 +1,137 @@
+"""`deepracer-exp checkpoints` on a run trained for a moment."""
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.formats.checkpoint_files import HASHES, pin, write_hashes
+
+QUICK = ("evaluation.trials=2", "evaluation.held_out=aws", "evaluation.time_s=20")
+
+
+@pytest.fixture
+def run_dir(trained, tmp_path) -> Path:
+    """A run with three checkpoints of one's own: 7, its best, 8 and 9, its last; 7 and 9 have the same weights."""
+    original = trained("checkpoints.every=1", "checkpoints.keep=9").folder
+    copy = Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
+    checkpoints = copy / "checkpoints"
+    own = sorted(path for path in (original / "checkpoints").iterdir() if path.name.isdigit())
+    shutil.rmtree(checkpoints)
+    for name, source in (("000007", own[-1]), ("000008", own[0]), ("000009", own[-1])):
+        shutil.copytree(source, checkpoints / name)
+        (checkpoints / name / HASHES).unlink(missing_ok=True)
+        manifest = json.loads((checkpoints / name / "manifest.json").read_text())
+        manifest["metadata"]["iteration"] = int(name)
+        (checkpoints / name / "manifest.json").write_text(json.dumps(manifest))
+        write_hashes(checkpoints / name)
+    (checkpoints / "best").symlink_to("000007")
+    (checkpoints / "last").symlink_to("000009")
+    return copy
+
+
+def tear(run_dir: Path, name: str) -> None:
+    os.truncate(next((run_dir / "checkpoints" / name).rglob("state.tdz")), 100)
+
+
+def test_every_kept_checkpoint_drives_the_same_trials(run_dir, call, tmp_path):
+    pin(run_dir / "checkpoints", "000008", "promoted as racer@champion")
+    ended = call("checkpoints", run_dir.name, *QUICK, "-o", "picture.png", "--json", "figures.json")
+    assert ended.code == 0, ended.stderr
+    assert re.search(r"000007 .*best", ended.stdout)
+    assert re.search(r"000008 .*pinned", ended.stdout)
+    assert re.search(r"000009 .*last", ended.stdout)
+    assert "000008 is pinned: promoted as racer@champion" in ended.stdout
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+    found = json.loads((tmp_path / "figures.json").read_text())
+    assert [one["name"] for one in found["checkpoints"]] == ["000007", "000008", "000009"]
+    assert [one["labels"] for one in found["checkpoints"]] == [["best"], [], ["last"]]
+    assert found["checkpoints"][1]["counters"]["iteration"] == 8
+    assert found["evaluation"]["trials"] == 2
+    # Whatever one driver leaves to the next would show.
+    first, second, third = (one["figures"] for one in found["checkpoints"])
+    assert first == third != second
+    assert "recommended: {name}: {why}".format_map(found["recommended"]) in ended.stdout
+
+
+def test_a_torn_checkpoint_is_shown_and_left_out(run_dir, call, tmp_path):
+    tear(run_dir, "000009")
+    ended = call(
+        "checkpoints", f"run={run_dir}", *QUICK, "evaluation.held_out=null", "--json", "figures.json"
+    )
+    assert ended.code == 0, ended.stderr
+    assert re.search(r"000009 .*last, torn", ended.stdout)
+    assert re.search(r"000009 is left out: torn: .*state.tdz is not as it was written", ended.stdout)
+    found = json.loads((tmp_path / "figures.json").read_text())
+    assert found["checkpoints"][2]["figures"] is None
+    assert found["recommended"]["name"] != "000009"
+
+
+def test_with_all_checkpoints_torn_there_is_a_refusal(run_dir, call):
+    for name in ("000007", "000008", "000009"):
+        tear(run_dir, name)
+    ended = call("checkpoints", run_dir.name, *QUICK)
+    assert ended.code == 2
+    assert "torn" in ended.complaint
+    assert ended.stdout == ""
+
+
+def test_twenty_trials_are_driven_unless_told_otherwise(run_dir, call, tmp_path):
+    for name in ("000007", "000008"):
+        shutil.rmtree(run_dir / "checkpoints" / name)
+    ended = call(
+        "checkpoints",
+        run_dir.name,
+        "evaluation.time_s=1",
+        "evaluation.held_out=null",
+        "--json",
+        "figures.json",
+    )
+    assert ended.code == 0, ended.stderr
+    assert "1 checkpoints, 20 trials each" not in ended.stderr
+    assert "1 checkpoint, 20 trials each" in ended.stderr
+    assert "best leads nowhere" in ended.stderr
+    assert json.loads((tmp_path / "figures.json").read_text())["evaluation"]["trials"] == 20
+
+
+def test_evaluate_says_loudly_that_another_checkpoint_drives(run_dir, call):
+    tear(run_dir, "000007")
+    ended = call("evaluate", f"run={run_dir.name}", "checkpoint=best", "evaluation.held_out=null")
+    assert ended.code == 0, ended.stderr
+    (warning,) = [line for line in ended.stderr.splitlines() if line.startswith("warning: ")]
+    assert "000007: torn: " in warning
+    assert "000009, the newest intact one, takes its place" in warning
+    assert "checkpoint 000009" in ended.stderr
+    (file,) = (run_dir / "evaluations").iterdir()
+    assert json.loads(file.read_text())["checkpoint"]["name"] == "000009"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("nowhere",), ("run=nowhere: no such run",)),
+        (("evaluation=summit",), ("run: missing",)),
+        (("one", "two"), ("2 runs given: one, two",)),
+        (("x", "checkpoint=best"), ("checkpoint=best", "evaluate")),
+        (("x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
+        (("x", "-o", "nowhere/picture.png"), ("--output nowhere/picture.png",)),
+        (("x", "--json", "nowhere/figures.json"), ("--json nowhere/figures.json",)),
+    ],
+)
+def test_bad_input_is_one_line(call, arguments, words):
+    ended = call("checkpoints", *arguments)
+    assert ended.code == 2
+    assert all(word in ended.complaint for word in words)
+    assert ended.stdout == ""
+
+
+def test_a_picture_of_an_unknown_kind_is_refused_before_anybody_drives(call):
+    assert "--output picture.txt" in call("checkpoints", "x", "-o", "picture.txt").complaint
+
+
+def test_a_run_without_checkpoints_is_refused(run_dir, call):
+    shutil.rmtree(run_dir / "checkpoints")
+    assert "holds no checkpoint" in call("checkpoints", run_dir.name).complaint

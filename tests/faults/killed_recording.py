@@ -1,0 +1,100 @@
+"""A recording that is killed with SIGKILL again and again and goes on each time: RUN_DIR URI KILLS.
+
+It stands for a training whose repeated iterations differ (`collector=async`). It forks, so that MLflow is imported
+once.
+"""
+
+import json
+import os
+import random
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+from deepracer_exp.formats.run_files import read_metrics
+from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.store import resolve_store
+
+ITERATIONS = 160
+CHECKPOINT_EVERY = 12
+KEYS = ("completion", "kl", "env_steps_per_s")
+
+
+def write_whole(path: Path, text: str) -> None:
+    aside = path.with_name(f".{path.name}")
+    aside.write_text(text)
+    aside.replace(path)
+
+
+def record(run_dir: Path, uri: str) -> None:
+    metrics, checkpoint, identity = (
+        run_dir / name for name in ("metrics.jsonl", "checkpoint.json", "tracking.json")
+    )
+    tracker = MLflowTracker(resolve_store(uri, run_dir))
+    kept = json.loads(checkpoint.read_text()) if checkpoint.exists() else 0
+    rows = read_metrics(metrics)[:kept] if metrics.exists() else []
+    write_whole(metrics, "".join(json.dumps(row) + "\n" for row in rows))
+    if identity.exists():
+        tracker.reopen(identity)
+    else:
+        tracker.start("killed", "race", {"seed": 1}, {"run_dir": str(run_dir)}, identity)
+    for row in rows:
+        tracker.log(row, row["env_steps"])
+    tracker.safe_until(100 * kept)
+    for iteration in range(kept + 1, ITERATIONS + 1):
+        row = {"iteration": iteration, "env_steps": 100 * iteration, "wall_clock_s": time.monotonic()}
+        row |= {key: random.random() for key in KEYS}
+        with metrics.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        tracker.log(row, row["env_steps"])
+        if iteration % CHECKPOINT_EVERY == 0:
+            tracker.set_tag("half", str(2 * iteration // ITERATIONS))
+            write_whole(checkpoint, str(iteration))
+            tracker.safe_until(100 * iteration)
+            while tracker.waiting:  # kills shall find the recorder at work, not far behind
+                time.sleep(0.001)
+        time.sleep(0.01)
+    tracker.log_artifact(metrics)
+    assert tracker.finish("FINISHED", 200) == 0
+
+
+def fork(do: Callable[[], None]) -> int:
+    child = os.fork()
+    if child == 0:
+        try:
+            do()
+            os._exit(0)
+        finally:
+            traceback.print_exc()
+            os._exit(1)
+    return child
+
+
+def lines(path: Path) -> int:
+    return path.read_text().count("\n") if path.exists() else 0
+
+
+def main(run_dir: Path, uri: str, kills: int) -> None:
+    metrics = run_dir / "metrics.jsonl"
+    os.waitpid(fork(lambda: MLflowRun(resolve_store(uri, run_dir)).connect()), 0)  # makes the tables
+    for number in range(kills + 1):
+        before = lines(metrics)
+        child = fork(lambda: record(run_dir, uri))
+        if number < kills:
+            # While it starts or tells again, or after some iterations.
+            wanted = min(before + random.choice((0, 10, 20)), ITERATIONS - 20)
+            while lines(metrics) < wanted:
+                time.sleep(0.001)
+            time.sleep(random.uniform(0, 0.5))
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        print("ended" if status == 0 else "killed", lines(metrics), flush=True)
+    assert status == 0
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))

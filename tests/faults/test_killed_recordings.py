@@ -1,0 +1,53 @@
+"""Recordings that are killed and go on: MLflow has what metrics.jsonl has, once."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from mlflow import MlflowClient
+
+
+def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
+    kills = 5
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    script = Path(__file__).parent / "killed_recording.py"
+    command = [sys.executable, script, str(tmp_path), uri, str(kills)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("killed") == kills
+    client = MlflowClient(tracking_uri=uri)
+    (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
+    assert run.info.run_id == json.loads((tmp_path / "tracking.json").read_text())["run_id"]
+    assert run.info.status == "FINISHED"
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == list(range(1, 161))
+    for key in rows[0].keys() - {"env_steps"}:
+        history = client.get_metric_history(run.info.run_id, key)
+        assert [(p.step, p.value) for p in history] == [(row["env_steps"], row[key]) for row in rows], key
+
+
+_CREATES = """
+import pathlib, sys
+from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.store import resolve_store
+
+print("begins", flush=True)
+MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1]))).connect()
+"""
+
+
+def test_a_store_whose_creation_was_killed_is_created_anew(tmp_path):
+    command = [sys.executable, "-c", _CREATES, str(tmp_path)]
+    killed = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert killed.stdout is not None
+    killed.stdout.readline()
+    give_up_at = time.monotonic() + 120
+    while not list(tmp_path.glob(".mlflow.db.new*")) and time.monotonic() < give_up_at:
+        time.sleep(0.005)
+    killed.kill()
+    killed.wait()
+    assert not (tmp_path / "mlflow.db").exists()
+    subprocess.run(command, check=True, capture_output=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mlflow.db", "mlflow.db.lock"]

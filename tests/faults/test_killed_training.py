@@ -1,0 +1,110 @@
+"""kill -9 of a training and all its workers, and what `deepracer-exp resume` makes of it."""
+
+import json
+import random
+import signal
+import time
+
+import pytest
+import torch
+from mlflow import MlflowClient
+from torchrl.checkpoint import Checkpoint
+
+from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.training.run import TIMES
+
+ITERATIONS = 14
+RUN = (
+    *("train", "experiment=tiny", "collector.processes=2", "stopping=none", "checkpoints.every=4"),
+    *("episode.max_steps=60", "budget.env_steps=null", f"budget.iterations={ITERATIONS}"),
+)
+
+
+def folder_of(where, runs_dir):
+    (file,) = (where / runs_dir).glob("tiny/*/config.yaml")
+    return file.parent
+
+
+def rows_of(folder) -> list[dict]:
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
+
+
+def weights_of(folder) -> dict[str, torch.Tensor]:
+    class Holder:
+        def state_dict(self) -> dict:
+            return {}
+
+        def load_state_dict(self, state: dict) -> None:
+            self.networks = state["networks"]
+
+    holder = Holder()
+    Checkpoint(agent=holder).load(folder / "checkpoints" / "last")
+    return holder.networks
+
+
+def points_of(where, runs_dir, folder) -> dict[str, list[tuple[int, float]]]:
+    run_id = json.loads((folder / "tracking.json").read_text())["run_id"]
+    client = MlflowClient(tracking_uri=f"sqlite:///{where / runs_dir / 'mlflow.db'}")
+    keys = client.get_run(run_id).data.metrics
+    assert client.get_run(run_id).info.status == "FINISHED"
+    found = {key: [(p.step, p.value) for p in client.get_metric_history(run_id, key)] for key in keys}
+    return {key: points for key, points in found.items() if key not in TIMES}
+
+
+def killed_after(start, arguments, ready) -> None:
+    training = start(*arguments)
+    training.wait_for(ready, "a moment to kill at")
+    training.signal_group(signal.SIGKILL)
+    training.popen.wait()
+    training.destroy()
+
+
+def assert_as_if_nothing_had_happened(tmp_path, start):
+    whole = start(*RUN, "runs_dir=whole").end()
+    assert whole.code == 0, whole.stderr
+    one, other = folder_of(tmp_path, "whole"), folder_of(tmp_path, "cut")
+    assert len(rows_of(one)) == ITERATIONS
+    assert rows_of(one) == rows_of(other)
+    ours, theirs = weights_of(one), weights_of(other)
+    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+    assert read_trace(one / "trace").equals(read_trace(other / "trace"))
+    points = points_of(tmp_path, "cut", other)
+    assert points == points_of(tmp_path, "whole", one)
+    assert len(points["entropy"]) == len(set(points["entropy"])) == ITERATIONS
+
+
+def recorded(tmp_path) -> int:
+    return sum(file.read_bytes().count(b"\n") for file in (tmp_path / "cut").glob("tiny/*/metrics.jsonl"))
+
+
+def test_a_killed_run_that_is_resumed_is_the_run_that_was_not_killed(start, tmp_path):
+    killed_after(start, (*RUN, "runs_dir=cut"), lambda: recorded(tmp_path) >= 6)
+    folder = folder_of(tmp_path, "cut")
+    assert not (folder / "summary.json").exists()
+    ended = start("resume", str(folder)).end()
+    assert ended.code == 0, ended.stderr
+    assert_as_if_nothing_had_happened(tmp_path, start)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_killed_at_random_moments_it_still_is(start, tmp_path):
+    moments = random.Random(7)
+    arguments = (*RUN, "runs_dir=cut")
+    for _ in range(6):
+        until = time.monotonic() + moments.uniform(1.0, 12.0)
+        training = start(*arguments)
+        while training.popen.poll() is None and time.monotonic() < until:
+            time.sleep(0.05)
+        if training.popen.poll() is not None:
+            break
+        training.signal_group(signal.SIGKILL)
+        training.popen.wait()
+        training.destroy()
+        if list((tmp_path / "cut").glob("tiny/*/config.yaml")):
+            arguments = ("resume", str(folder_of(tmp_path, "cut")))
+    else:
+        ended = start(*arguments).end()
+        assert ended.code == 0, ended.stderr
+    assert_as_if_nothing_had_happened(tmp_path, start)

@@ -1,0 +1,252 @@
+"""What clean lists, what it removes, and what it never touches."""
+
+import fcntl
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.formats.checkpoint_files import pin
+from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, remove, survey
+from deepracer_exp.tracking.overview import look_over
+from deepracer_exp.tracking.registry import promote
+
+HOUR_S = 3600
+
+
+def tree(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+def listed(season, overview=None) -> list[tuple[str, str, list[str]]]:
+    found = survey(season.runs_dir, overview)
+    return [(item.run.name, item.what, [path.name for path in item.paths]) for item in found.removable]
+
+
+def kept(season, overview=None) -> dict[str, str]:
+    return {run.name: reason for run, reason in survey(season.runs_dir, overview).kept}
+
+
+def age(run: Path, seconds: float) -> None:
+    for path in (run, *run.rglob("*")):
+        then = path.lstat().st_mtime - seconds
+        os.utime(path, (then, then), follow_symlinks=False)
+
+
+def test_checkpoints_that_are_neither_best_nor_last_can_go(season):
+    season.run("1")
+    assert listed(season) == [("1", CHECKPOINTS, ["000010"])]
+
+
+def test_pinned_and_cloned_from_checkpoints_stay(season):
+    first, second = season.run("1"), season.run("2")
+    pin(first / "checkpoints", "000010", "cloned into season")
+    shutil.rmtree(season.clone("3", second, checkpoint="000010") / "checkpoints")
+    assert listed(season) == []
+
+
+def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp_path):
+    season.clone("2", season.run("1"), checkpoint="000010")
+    season.runs_dir.rename(tmp_path / "moved")
+    season.runs_dir = tmp_path / "moved"
+    assert listed(season) == [("2", CHECKPOINTS, ["000010"])]
+
+
+def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
+    run = season.run("1")
+    season.recorded(run, client)
+    promote(run, "10", "model", "champion", None, season.runs_dir)
+    (run / "checkpoints" / "pinned.json").unlink()
+    client.delete_registered_model_alias("model", "champion")
+    assert listed(season, look_over(None, season.runs_dir)) == []
+
+
+def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(season, client):
+    season.recorded(season.run("1"), client)
+    season.run("2")
+    assert listed(season) == [("2", CHECKPOINTS, ["000010"])]
+    assert "--tracking-uri" in kept(season)["1"]
+    assert len(listed(season, look_over(None, season.runs_dir))) == 2
+    (season.runs_dir / "season" / "1" / "tracking.json").write_text(json.dumps({"run_id": "0" * 32}))
+    assert len(listed(season, look_over(None, season.runs_dir))) == 1
+
+
+def test_traces_of_failed_runs_can_go_and_of_no_others(season):
+    for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", "hopeless")):
+        shutil.rmtree(season.run(name, status=status) / "checkpoints")
+    assert listed(season) == [("2", TRACE, ["trace"])]
+
+
+def test_a_run_deleted_in_mlflow_can_go_whole_and_an_active_one_cannot(season, client):
+    ids = [season.recorded(season.run(name), client) for name in ("1", "2")]
+    client.delete_run(ids[0])
+    assert listed(season, look_over(None, season.runs_dir)) == [
+        ("1", DELETED, ["1"]),
+        ("2", CHECKPOINTS, ["000010"]),
+    ]
+
+
+def test_runs_of_a_deleted_experiment_can_go(season, client):
+    season.recorded(season.run("1"), client)
+    client.delete_experiment(client.get_experiment_by_name("season").experiment_id)
+    assert listed(season, look_over(None, season.runs_dir)) == [("1", DELETED, ["1"])]
+
+
+def test_a_deleted_run_that_is_needed_stays_and_the_reason_is_told(season, client):
+    cloned, registered = season.run("1"), season.run("2")
+    season.clone("3", cloned)
+    ids = [season.recorded(run, client) for run in (cloned, registered)]
+    promote(registered, "best", "model", "champion", None, season.runs_dir)
+    for run_id in ids:
+        client.delete_run(run_id)
+    overview = look_over(None, season.runs_dir)
+    assert [item for item in listed(season, overview) if item[1] == DELETED] == []
+    assert kept(season, overview)["1"] == "deleted in MLflow, but needed: 000020 cloned to 3"
+    assert kept(season, overview)["2"] == "deleted in MLflow, but needed: 000020 registered as model"
+
+
+def test_a_run_that_a_training_holds_stays_until_it_lets_go(season):
+    run = season.run("1", status="failed")
+    with (run / ".running").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert listed(season) == []
+        assert kept(season) == {"1": "a training goes on in it"}
+    assert [what for _, what, _ in listed(season)] == [CHECKPOINTS, TRACE]
+
+
+def test_a_run_without_an_end_stays_for_an_hour_after_its_last_sign(season):
+    run = season.run("1", status=None)
+    assert listed(season) == []
+    assert "has no end" in kept(season)["1"]
+    age(run, HOUR_S - 120)
+    assert listed(season) == []
+    age(run, 240)
+    assert listed(season) == [("1", CHECKPOINTS, ["000010"])]
+    (run / "metrics.jsonl").write_text("{}\n")
+    assert listed(season) == []
+
+
+def test_where_last_is_torn_the_others_stay(season):
+    run = season.run("1")
+    (run / "checkpoints" / "000030" / "agent" / "state.tdz").write_text("?")
+    assert listed(season) == []
+    assert "may be needed" in kept(season)["1"]
+    (run / "checkpoints" / "last").unlink()
+    assert listed(season) == []
+
+
+def test_what_is_no_run_of_ours_is_left_alone(season, tmp_path):
+    outside = tmp_path / "outside"
+    season.run("1").rename(outside)
+    place = season.runs_dir / "season"
+    (place / "linked").symlink_to(outside)
+    (season.runs_dir / "linked").symlink_to(season.run("2", "elsewhere").parent)
+    shutil.move(place.parent / "elsewhere", tmp_path / "elsewhere")
+    foreign = season.run("3", status="failed")
+    (foreign / "provenance.json").unlink()
+    inner = season.run("4", status="failed")
+    shutil.rmtree(inner / "checkpoints")
+    shutil.rmtree(inner / "trace")
+    for name in ("checkpoints", "trace"):
+        (inner / name).symlink_to(outside / name)
+    odd = season.run("5")
+    shutil.rmtree(odd / "checkpoints" / "000010")
+    (odd / "checkpoints" / "000010").symlink_to(outside / "checkpoints" / "000010")
+    (odd / "checkpoints" / "notes").mkdir()
+    (place / "notes.txt").write_text("mine")
+    assert listed(season) == []
+
+
+def test_apply_removes_what_was_listed_and_nothing_else(season, call):
+    first, failed = season.run("1"), season.run("2", status="failed")
+    before = tree(season.runs_dir)
+    shown = call("clean")
+    assert shown.code == 0, shown.stderr
+    assert "--apply removes it" in shown.stdout
+    assert tree(season.runs_dir) == before
+    ended = call("clean", "--apply")
+    assert ended.code == 0, ended.stderr
+    gone = before - tree(season.runs_dir)
+    assert gone == {
+        path
+        for path in before
+        for run, part in ((first, "checkpoints/000010"), (failed, "checkpoints/000010"), (failed, "trace"))
+        if f"{path}/".startswith(f"{(run / part).relative_to(season.runs_dir).as_posix()}/")
+    }
+    assert not tree(season.runs_dir) - before
+    assert "nothing to remove" in call("clean").stdout
+
+
+def test_the_sums_are_those_of_the_files(season, call):
+    run = season.run("1", status="failed")
+    wanted = sum(
+        path.stat().st_size for path in (run / "checkpoints" / "000010").rglob("*") if path.is_file()
+    )
+    ended = call("clean")
+    lines = [line.split() for line in ended.stdout.splitlines()]
+    assert [*str(wanted).split(), "bytes", "checkpoints", "neither", "best", "nor", "last:", "000010"] in [
+        line[:8] for line in lines
+    ]
+    assert ["1.0", "kB", "trace", "of", "a", "failed", "run", "season/1"] in lines
+    assert f"{(wanted + 1000) / 1000:.1f} kB in all" in " ".join(ended.stdout.split())
+
+
+def test_what_a_link_inside_leads_to_outlives_it(season, client, call, tmp_path):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "file").write_text("dear")
+    run = season.run("1")
+    for place in (run, run / "trace", run / "checkpoints" / "000010"):
+        (place / "link").symlink_to(precious)
+    client.delete_run(season.recorded(run, client))
+    ended = call("clean", "--apply")
+    assert ended.code == 0, ended.stderr
+    assert not run.exists()
+    assert (precious / "file").read_text() == "dear"
+
+
+def test_a_store_that_does_not_answer_is_told_and_its_part_left_out(season, client, call, free_port):
+    client.delete_run(season.recorded(season.run("1"), client))
+    season.run("2")
+    ended = call("clean", "--apply", "--tracking-uri", f"http://127.0.0.1:{free_port}")
+    assert ended.code == 0
+    assert "runs deleted there, and checkpoints of runs recorded there, are left out" in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    assert not (season.runs_dir / "season" / "2" / "checkpoints" / "000010").exists()
+    assert (season.runs_dir / "season" / "1" / "checkpoints" / "000010").exists()
+
+
+def test_a_training_or_a_pin_that_came_after_the_survey_is_heeded(season):
+    runs = [season.run(name) for name in ("1", "2")]
+    first, second = survey(season.runs_dir, None).removable
+    pin(runs[0] / "checkpoints", "000010", "cloned into season")
+    assert not remove(first)
+    with (runs[1] / ".running").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert not remove(second)
+    assert all((run / "checkpoints" / "000010").is_dir() for run in runs)
+    assert remove(second)
+    assert not (runs[1] / ".running").exists()
+
+
+@pytest.mark.parametrize("name", ["lineage.json", "checkpoints/pinned.json", "tracking.json", "summary.json"])
+def test_where_a_file_cannot_be_read_nothing_is_removed(season, call, name):
+    season.run("1")
+    (season.run("2") / name).write_text("{")
+    before = tree(season.runs_dir)
+    ended = call("clean", "--apply")
+    assert ended.code == 2
+    assert name in ended.complaint
+    assert tree(season.runs_dir) == before
+
+
+def test_a_folder_without_runs_has_nothing_to_remove(season, call):
+    season.runs_dir.mkdir()
+    assert call("clean").stdout == "nothing to remove\n"
+    assert tree(season.runs_dir) == set()
+    shutil.rmtree(season.runs_dir)
+    ended = call("clean")
+    assert ended.code == 2
+    assert "is no folder" in ended.complaint

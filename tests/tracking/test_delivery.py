@@ -1,0 +1,104 @@
+"""Runs that ended while the store was away."""
+
+import json
+
+import pytest
+from mlflow import MlflowClient
+
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.tracking.delivery import deliver
+from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.store import Store
+from deepracer_exp.tracking.tracking_file import read_told
+
+
+@pytest.fixture
+def away(free_port) -> str:
+    return f"http://me:s3cr3t@127.0.0.1:{free_port}"
+
+
+@pytest.fixture
+def run_dir(tmp_path, away):
+    """Return the folder of a run whose store never answered."""
+    folder = tmp_path / "race" / "run"
+    (folder / "checkpoints" / "000003").mkdir(parents=True)
+    (folder / "checkpoints" / "000003" / "manifest.json").write_text("{}")
+    (folder / "checkpoints" / "best").symlink_to("000003")
+    tracker = MLflowTracker(Store(away, None))
+    tracker.start("run", "race", {"seed": 1}, {"track": "oval"}, folder / "tracking.json")
+    rows = [
+        {"iteration": n, "env_steps": 100 * n, "wall_clock_s": n / 2, "completion": n / 3, "kl": None}
+        for n in range(1, 4)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    for row in rows:
+        tracker.log(row, row["env_steps"])
+        tracker.safe_until(row["env_steps"])
+    (folder / "summary.json").write_text(json.dumps({"status": "hopeless", "reason": "collapsed"}))
+    tracker.log_artifact(folder / "summary.json")
+    tracker.log_artifact((folder / "checkpoints" / "best").resolve(), "checkpoints/best")
+    tracker.set_tag("stopping.rule", "collapsed")
+    tracker.set_tag("end", "hopeless: collapsed")
+    assert tracker.finish("FINISHED", deadline_s=0) == 9
+    return folder
+
+
+def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, store, tmp_path, caplog):
+    moved = run_dir.rename(tmp_path / "moved")  # what was told is found there, too
+    assert deliver(moved, store.uri, tmp_path) == 9
+    client = MlflowClient(tracking_uri=store.uri)
+    (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
+    told = read_told(moved / "tracking.json")
+    assert (run.info.run_name, run.info.status) == ("run", "FINISHED")
+    assert (run.info.run_id, run.info.start_time, run.info.end_time) == (
+        told.run_id, told.start_ms, told.end_ms,
+    )  # fmt: skip
+    assert run.data.params == {"seed": "1"}
+    wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "hopeless: collapsed"}
+    assert run.data.tags.items() >= wanted.items()
+    assert run.data.metrics.keys() == {"completion", "iteration", "wall_clock_s"}
+    files = {file.path for file in client.list_artifacts(run.info.run_id)}
+    assert files == {"summary.json", "checkpoints"}
+    assert deliver(moved, store.uri, tmp_path) == 0
+    history = client.get_metric_history(run.info.run_id, "completion")
+    assert [(point.step, point.value) for point in history] == [(100, 1 / 3), (200, 2 / 3), (300, 1.0)]
+    assert not [record for record in caplog.records if record.name.endswith("delivery")]
+
+
+def test_a_run_killed_before_it_told_its_end_is_ended_by_its_summary(run_dir, store, tmp_path):
+    told = json.loads((run_dir / "tracking.json").read_text())
+    del told["tags"]["end"]
+    (run_dir / "tracking.json").write_text(json.dumps({**told, "status": None, "end_ms": None}))
+    deliver(run_dir, store.uri, tmp_path)
+    run_id = read_told(run_dir / "tracking.json").run_id
+    run = MlflowClient(tracking_uri=store.uri).get_run(run_id)
+    assert (run.info.status, run.data.tags["end"]) == ("FINISHED", "hopeless: collapsed")
+
+
+def test_a_file_that_is_gone_holds_up_nothing(run_dir, store, tmp_path, caplog):
+    (run_dir / "checkpoints" / "000003" / "manifest.json").unlink()
+    (run_dir / "checkpoints" / "000003").rmdir()
+    assert deliver(run_dir, store.uri, tmp_path) == 9
+    assert f"{run_dir}/checkpoints/000003: is gone" in caplog.text
+
+
+def test_a_store_that_is_still_away_is_named_and_costs_nothing(run_dir, away, tmp_path):
+    before = (run_dir / "tracking.json").read_text()
+    with pytest.raises(RunFailed, match="does not answer") as failed:
+        deliver(run_dir, away, tmp_path)
+    assert "s3cr3t" not in f"{failed.value} {before}"
+    assert (run_dir / "tracking.json").read_text() == before
+
+
+def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, tmp_path):
+    deliver(run_dir, store.uri, tmp_path)
+    run_id = read_told(run_dir / "tracking.json").run_id
+    MlflowClient(tracking_uri=store.uri).delete_run(run_id)
+    with pytest.raises(BadInput, match=f"{run_id} was deleted in MLflow"):
+        deliver(run_dir, store.uri, tmp_path)
+
+
+def test_a_run_that_has_not_ended_is_refused(run_dir, store, tmp_path):
+    (run_dir / "summary.json").unlink()
+    with pytest.raises(BadInput, match="has not ended"):
+        deliver(run_dir, store.uri, tmp_path)

@@ -1,0 +1,197 @@
+"""Family trees, by function and by command."""
+
+import json
+import shutil
+
+import pytest
+import yaml
+
+from deepracer_exp.analysis.family import best_members, family, generations
+from deepracer_exp.errors import BadInput
+
+
+def rows(stdout: str, *words: str) -> list[str]:
+    return [line for line in stdout.splitlines() if all(word in line for word in words)]
+
+
+@pytest.fixture
+def clan(season):
+    """An original, its two clones and a grandchild, and a run of another family."""
+    root = season.run("1-root")
+    season.result(root, (1, -11.0), 11.0)
+    child = season.clone("2-child", root, algorithm={"lr": 0.0001})
+    season.result(child, (1, -9.5), 9.5)
+    season.result(season.clone("3-sibling", root), (0, 80.0), None, completion=80.0)
+    grandchild = season.clone("4-grandchild", child, 2, "000030", algorithm={"lr": 1e-5})
+    season.result(grandchild, (1, -10.0), 10.0)
+    season.run("9-stranger")
+    return season
+
+
+def test_any_member_shows_the_whole_family_and_no_other(clan):
+    for run in ("1-root", "3-sibling", "4-grandchild"):
+        root = family(clan.runs_dir / "season" / run, clan.runs_dir)
+        found = {member.name: member for member in root.walk()}
+        assert list(found) == ["1-root", "2-child", "4-grandchild", "3-sibling"]
+        assert [member.generation for member in found.values()] == [0, 1, 2, 1]
+        assert found["4-grandchild"].changes == {"algorithm.lr": (0.0001, 1e-5)}
+        assert best_members(root) == {id(found["2-child"]): "best"}
+    (alone,) = family(clan.runs_dir / "season" / "9-stranger", clan.runs_dir).walk()
+    assert alone.name == "9-stranger"
+
+
+def test_the_best_lap_of_each_generation_stands_at_the_end(clan, call):
+    ended = call("lineage", "3-sib")
+    assert ended.code == 0, ended.stderr
+    last = [" ".join(line.split()) for line in ended.stdout.splitlines()[-3:]]
+    assert last == [
+        "generation 0 best lap 11.00 s 1-root",
+        "generation 1 best lap 9.50 s 2-child",
+        "generation 2 best lap 10.00 s 4-grandchild",
+    ]
+
+
+def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
+    ended = call("lineage", "4-grandchild")
+    assert rows(ended.stdout, "4-grandchild", "<- this run")
+    assert rows(ended.stdout, "2-child", "* best")
+    assert len(rows(ended.stdout, "<- this run")) == len(rows(ended.stdout, "* best")) == 1
+    assert rows(ended.stdout, "generation 2, from 000030, completion 90.0 %, lap 10.00 s")
+    assert rows(ended.stdout, "algorithm.lr 0.0001 -> 1e-05")
+    assert "\x1b" not in ended.stdout
+    assert all(line == line.rstrip() for line in ended.stdout.splitlines())
+
+
+def test_a_missing_parent_is_shown_as_missing(clan, call):
+    shutil.rmtree(clan.runs_dir / "season" / "2-child")
+    ended = call("lineage", "4-grandchild")
+    lines = ended.stdout.splitlines()
+    assert lines[0] == "2-child"
+    assert "generation 1, missing: its folder is gone" in lines[1]
+    assert not rows(ended.stdout, "1-root")
+    assert rows(call("lineage", "1-root").stdout, "3-sibling")
+
+
+def test_clones_of_one_missing_parent_are_one_family(clan, call):
+    shutil.rmtree(clan.runs_dir / "season" / "1-root")
+    ended = call("lineage", "3-sibling")
+    assert ended.stdout.splitlines()[0] == "1-root"
+    assert "generation 0, missing" in ended.stdout.splitlines()[1]
+    assert rows(ended.stdout, "4-grandchild")
+
+
+def test_a_family_that_moved_is_still_one(clan, call, tmp_path):
+    clan.runs_dir.rename(tmp_path / "moved")
+    ended = call("lineage", "--runs-dir", "moved", "4-grandchild")
+    assert ended.code == 0, ended.stderr
+    assert not rows(ended.stdout, "missing")
+    assert rows(ended.stdout, "1-root")
+
+
+def test_runs_elsewhere_bring_their_relatives_along(clan, call, tmp_path):
+    run = clan.runs_dir / "season" / "2-child"
+    ended = call("lineage", str(run), "--runs-dir", "nowhere")
+    assert rows(ended.stdout, "4-grandchild")
+
+
+def test_a_clone_on_another_track_has_a_best_of_its_own(clan, call):
+    parent = clan.runs_dir / "season" / "2-child"
+    there = clan.clone("5-away", parent, 2, track={"name": "bowtie", "knots": [1]})
+    clan.result(there, (1, -20.0), 20.0)
+    ended = call("lineage", "1-root")
+    assert rows(ended.stdout, "5-away", "* best on bowtie")
+    assert rows(ended.stdout, "2-child", "* best on oval")
+    assert rows(ended.stdout, "track oval -> bowtie")
+    assert rows(ended.stdout, "generation 2", "bowtie", "20.00 s")
+    assert rows(ended.stdout, "generation 2", "oval", "10.00 s")
+
+
+def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
+    root = season.run("1")
+    season.result(root, lap_share=0.5, best_lap_time_s=12.0, last={"completion": 61.0})
+    season.result(season.clone("2", root), lap_share=0.9, best_lap_time_s=13.0)
+    ended = call("lineage", "1")
+    assert rows(ended.stdout, "completion 61.0 %, lap 12.00 s (training)")
+    assert rows(ended.stdout, "2", "* best")
+
+
+def test_a_run_without_an_end_says_so(season, call):
+    season.clone("2", season.run("1"))
+    (season.runs_dir / "season" / "2" / "summary.json").unlink()
+    assert rows(call("lineage", "1").stdout, "generation 1, from 000020, goes on, or was killed")
+
+
+def test_many_changes_are_counted(season, call):
+    root = season.run("1", algorithm={str(n): 0 for n in range(10)})
+    season.clone("2", root, algorithm={str(n): 1 for n in range(10)})
+    assert rows(call("lineage", "1").stdout, "algorithm.5 0 -> 1, and 4 more")
+
+
+@pytest.mark.parametrize("length", [1, 2, 3])
+def test_a_run_that_descends_from_itself_is_refused(season, call, length):
+    runs = [season.run(str(n)) for n in range(length)]
+    for n, run in enumerate(runs):
+        shutil.rmtree(run)
+        season.clone(run.name, runs[n - 1])
+    ended = call("lineage", "0")
+    assert ended.code == 2
+    assert "descends from itself" in ended.complaint
+    season.run("apart")
+    assert call("lineage", "apart").code == 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "{}",
+        '{"parent": 1}',
+        '{"parent": "../x", "parent_dir": "/", "parent_run_id": null, "checkpoint": "000001", "sha256": "", '
+        '"generation": 1, "registered": null}',
+    ],
+)
+def test_a_lineage_file_that_is_none_is_refused_in_one_line(season, call, text):
+    (season.run("1") / "lineage.json").write_text(text)
+    ended = call("lineage", "1")
+    assert ended.code == 2
+    assert "1/lineage.json" in ended.complaint
+    assert len(ended.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("generation", 0), ("generation", "1"), ("checkpoint", "../000001")]
+)
+def test_a_wrong_value_in_a_lineage_file_is_named(season, key, value):
+    run = season.clone("2", season.run("1"))
+    file = run / "lineage.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {key: value}))
+    with pytest.raises(BadInput, match=f"lineage.json: {key}: "):
+        family(run, season.runs_dir)
+
+
+def test_a_relatives_configuration_that_is_none_is_refused(clan, call):
+    (clan.runs_dir / "season" / "3-sibling" / "config.yaml").write_text("- a")
+    ended = call("lineage", "1-root")
+    assert ended.code == 2
+    assert "3-sibling/config.yaml" in ended.complaint
+
+
+def test_generations_leave_out_who_has_no_lap(clan):
+    root = family(clan.runs_dir / "season" / "1-root", clan.runs_dir)
+    assert [(generation, member.name) for generation, member, _ in generations(root)] == [
+        (0, "1-root"),
+        (1, "2-child"),
+        (2, "4-grandchild"),
+    ]
+
+
+def test_a_changed_reward_is_seen_by_its_hash(season, call):
+    for name, sha256 in (("1", "a" * 64), ("2", "b" * 64)):
+        run = season.run(name) if name == "1" else season.clone(name, season.runs_dir / "season" / "1")
+        (run / "provenance.json").write_text(json.dumps({"reward": {"sha256": sha256}, "git_commit": name}))
+        assert yaml.safe_load((run / "config.yaml").read_text())
+    ended = call("lineage", "1")
+    assert rows(ended.stdout, "reward_function.py sha256 aaaaaaaa -> sha256 bbbbbbbb")
+    assert "code" not in ended.stdout

@@ -1,0 +1,187 @@
+"""What a run may be called by."""
+
+import json
+import shutil
+
+import pytest
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.references import resolve
+from deepracer_exp.tracking.registry import promote
+
+
+def refusal(run, season) -> str:
+    with pytest.raises(BadInput) as refused:
+        resolve(run, season.runs_dir, None)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def best(season):
+    return resolve("best:season", season.runs_dir, None).path.name
+
+
+def test_the_best_of_an_experiment_is_the_one_of_the_highest_rank(season):
+    for name, rank in (("1", (1, -11.0)), ("2", (1, -9.5)), ("3", (0, 99.0))):
+        season.result(season.run(name), rank)
+    season.result(season.run("other", "elsewhere"), (1, -5.0))
+    assert best(season) == "2"
+
+
+def test_an_evaluated_run_is_better_than_one_that_was_not(season):
+    season.result(season.run("1"), (0, 50.0))
+    season.result(season.run("2"), lap_share=1.0, best_lap_time_s=8.0)
+    assert best(season) == "1"
+
+
+def test_without_evaluations_the_share_of_laps_counts_before_the_fastest_lap(season):
+    for name, share, lap_s in (("1", 0.9, 12.0), ("2", 0.9, 10.0), ("3", 0.5, 8.0), ("4", None, 7.0)):
+        season.result(season.run(name), lap_share=share, best_lap_time_s=lap_s)
+    assert best(season) == "2"
+
+
+def test_of_equals_the_newest_is_taken(season):
+    for name in ("1", "3", "2"):
+        season.result(season.run(name), (1, -10.0))
+    assert best(season) == "3"
+
+
+@pytest.mark.parametrize(
+    ("config", "metric", "words"),
+    [
+        ({"track": {"name": "bowtie"}}, "lap_time", "track is oval in 1 and bowtie in 2"),
+        ({"car": {"name": "ideal"}}, "lap_time", "car is deepracer in 1 and ideal in 2"),
+        ({"evaluation": {"trials": 1, "tracks": None}}, "lap_time", "evaluation is"),
+        ({}, "progress", "what they are ranked by is lap_time in 1 and progress in 2"),
+    ],
+)
+def test_runs_whose_ranks_mean_different_things_are_refused_by_name(season, config, metric, words):
+    season.result(season.run("1"), (1, -10.0))
+    season.result(season.run("2", **config), (1, -5.0), metric=metric)
+    assert words in refusal("best:season", season)
+
+
+def test_runs_trained_on_different_tracks_compare_when_evaluated_on_the_same(season):
+    evaluation = {"trials": 8, "tracks": ["oval"]}
+    season.result(season.run("1", evaluation=evaluation), (1, -10.0))
+    season.result(season.run("2", evaluation=evaluation, track={"name": "bowtie"}), (1, -9.0))
+    assert best(season) == "2"
+
+
+def test_a_run_without_a_best_checkpoint_is_out(season):
+    season.result(season.run("1"), (1, -10.0))
+    gone = season.run("2")
+    season.result(gone, (1, -5.0))
+    shutil.rmtree(gone / "checkpoints" / "000020")
+    season.run("3", status=None)
+    assert best(season) == "1"
+
+
+@pytest.mark.parametrize("name", ["", "..", "../season", "season/1", "/tmp", "a" * 81])
+def test_an_experiment_is_a_name_and_no_path(season, name):
+    season.result(season.run("1"), (1, -10.0))
+    assert "a name has letters" in refusal(f"best:{name}", season)
+
+
+def test_what_there_is_no_best_of_is_refused(season):
+    season.run("1")
+    assert "(did you mean season?)" in refusal("best:seeson", season)
+    assert "none of its 1 runs has a result" in refusal("best:season", season)
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"best": 3}', '{"best": {"metric": "x", "rank": [1]}}'])
+def test_a_summary_that_is_none_is_named(season, text):
+    (season.run("1") / "summary.json").write_text(text)
+    assert "1/summary.json" in refusal("best:season", season)
+
+
+def test_an_alias_leads_to_run_and_checkpoint(season, client):
+    run = season.run("1")
+    season.recorded(run, client)
+    promote(run, "10", "season", "champion", None, season.runs_dir)
+    for given in ("champion", "season@champion"):
+        found = resolve(given, season.runs_dir, None)
+        assert (found.path, found.checkpoint, found.registered) == (run, "000010", "season@champion")
+    assert resolve("1", season.runs_dir, None).checkpoint is None
+
+
+def test_a_runs_name_goes_before_an_alias(season, client):
+    season.recorded(run := season.run("1"), client)
+    promote(run, "best", "season", "champion", None, season.runs_dir)
+    named = season.run("champion-of-all")
+    assert resolve("champion", season.runs_dir, None).path == named
+    assert resolve("season@champion", season.runs_dir, None).path == run
+
+
+def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, tmp_path):
+    season.recorded(run := season.run("1"), client)
+    promote(run, "best", "season", "champion", None, season.runs_dir)
+    moved = tmp_path / "moved"
+    season.runs_dir.rename(moved)
+    assert resolve("champion", moved, None).path == moved / "season" / "1"
+
+
+def test_a_checkpoint_that_is_not_the_registered_one_is_refused(season, client):
+    season.recorded(run := season.run("1"), client)
+    promote(run, "best", "season", "champion", None, season.runs_dir)
+    checkpoint = run / "checkpoints" / "000020"
+    file = checkpoint / "agent" / "state.tdz"
+    file.write_text("other weights")
+    assert "torn" in refusal("champion", season)
+    hashes = json.loads((checkpoint / "hashes.json").read_text())
+    (checkpoint / "hashes.json").unlink()
+    assert "torn" in refusal("champion", season)
+    shutil.rmtree(checkpoint)
+    assert "which is gone" in refusal("champion", season)
+    made_anew = season.checkpoint(run, 20)
+    assert json.loads((made_anew / "hashes.json").read_text()) == hashes
+    assert resolve("champion", season.runs_dir, None).checkpoint == "000020"
+    shutil.rmtree(made_anew)
+    season.checkpoint(season.runs_dir / "season" / "2", 20).rename(made_anew)
+    assert "is not the checkpoint that was registered as season@champion" in refusal("champion", season)
+
+
+UNKNOWN = {
+    "chmpion": "(did you mean season@champion?)",
+    "season@rain": "no registered model has this alias",
+    "other@champion": "no registered model has this alias",
+    "season@latest": "'latest' is no alias",
+    "season@v2": "'v2' is no alias",
+    "season@": "'' is no alias",
+    "@champion": "'' is no model",
+    "..@champion": "'..' is no model",
+    "a@b@champion": "'a@b' is no model",
+    "2026": "no such run",
+    "../champion": "no such run",
+}
+
+
+def test_what_no_model_is_called_by_is_refused(season, client):
+    season.recorded(run := season.run("1"), client)
+    promote(run, "best", "season", "champion", None, season.runs_dir)
+    for reference, words in UNKNOWN.items():
+        assert words in refusal(reference, season), reference
+
+
+def test_a_bare_alias_of_two_models_is_refused(season, client):
+    season.recorded(run := season.run("1"), client)
+    for model in ("a", "b"):
+        promote(run, "best", model, "champion", None, season.runs_dir)
+    text = refusal("champion", season)
+    assert "2 models have this alias" in text
+    assert "a@champion, b@champion" in text
+    assert resolve("b@champion", season.runs_dir, None).registered == "b@champion"
+
+
+def test_a_model_that_others_registered_is_refused(season, client):
+    client.create_registered_model("theirs")
+    client.create_model_version("theirs", "file:///somewhere", tags={"run_dir": "/", "checkpoint": "../.."})
+    client.set_registered_model_alias("theirs", "champion", "1")
+    assert "was not registered by deepracer-exp promote" in refusal("champion", season)
+
+
+def test_without_a_store_a_word_is_no_alias(season):
+    season.run("1")
+    assert "no such run" in refusal("champion", season)
+    assert "mlflow.db" in refusal("season@champion", season)
+    assert not (season.runs_dir / "mlflow.db").exists()

@@ -1,0 +1,165 @@
+"""Promotion into a real registry of models."""
+
+import json
+from pathlib import Path
+
+import pytest
+from mlflow import MlflowClient
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pinned
+from deepracer_exp.tracking.registry import is_alias, look_up, promote
+
+
+def files(client, run_id, place=""):
+    found = client.list_artifacts(run_id, place)
+    return {one.path for one in found} | {
+        name for one in found if one.is_dir for name in files(client, run_id, one.path)
+    }
+
+
+def check_promotion(season, client, uri):
+    run = season.run("1")
+    run_id = season.recorded(run, client)
+    first = promote(run, "best", "model", "champion", uri, season.runs_dir)
+    version = client.get_model_version_by_alias("model", "champion")
+    assert version.run_id == run_id
+    assert version.tags == {
+        "run_dir": str(run),
+        "checkpoint": "000020",
+        "sha256": checkpoint_sha256(run / "checkpoints" / "000020"),
+    }
+    assert "checkpoints/000020/agent/state.tdz" in files(client, run_id)
+    assert pinned(run / "checkpoints") == {"000020": ["registered as model"]}
+    assert promote(run, "20", "model", "champion", uri, season.runs_dir) == first
+    second = promote(run, "last", "model", "champion", uri, season.runs_dir)
+    assert int(second.version) > int(first.version)
+    assert look_up("model@champion", uri, season.runs_dir) == second
+    assert look_up("champion", uri, season.runs_dir) == second
+    assert len(client.search_model_versions("name = 'model'")) == 2
+
+
+def test_a_promoted_checkpoint_is_registered_kept_and_found_by_its_alias(season, client):
+    check_promotion(season, client, None)
+
+
+@pytest.mark.slow
+def test_a_server_takes_promotions_as_well(season, server):
+    season.runs_dir.mkdir()
+    client = MlflowClient(tracking_uri=server.uri)
+    client.create_experiment("season")
+    check_promotion(season, client, server.uri)
+
+
+def test_files_that_the_run_has_are_not_sent_again_and_others_are(season, client):
+    run = season.run("1")
+    season.recorded(run, client)
+    promote(run, "best", "model", "champion", None, season.runs_dir)
+    (theirs,) = season.runs_dir.glob("artifacts/*/artifacts/checkpoints/000020")
+    before = (theirs / "hashes.json").stat().st_mtime_ns
+    promote(run, "best", "model", "rain", None, season.runs_dir)
+    assert (theirs / "hashes.json").stat().st_mtime_ns == before
+    (theirs / "agent" / "state.tdz").unlink()
+    promote(run, "best", "model", "rain", None, season.runs_dir)
+    assert (theirs / "agent" / "state.tdz").exists()
+
+
+def spoil(checkpoint: Path) -> None:
+    (checkpoint / "agent" / "state.tdz").write_text("?")
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "words"),
+    [
+        (lambda run, client, run_id: spoil(run / "checkpoints/000020"), (), "torn"),
+        (lambda run, client, run_id: (run / "tracking.json").unlink(), (), "is not recorded in MLflow"),
+        (
+            lambda run, client, run_id: (run / "tracking.json").write_text('{"run_id": null}'),
+            (),
+            "is not recorded in MLflow",
+        ),
+        (lambda run, client, run_id: (run / "tracking.json").write_text("[]"), (), "tracking.json"),
+        (lambda run, client, run_id: (run / "tracking.json").write_text('{"run_id": 3}'), (), "run_id: 3"),
+        (
+            lambda run, client, run_id: (run / "tracking.json").write_text(json.dumps({"run_id": "0" * 32})),
+            (),
+            "not found",
+        ),
+        (lambda run, client, run_id: client.delete_run(run_id), (), "was deleted in MLflow"),
+        (None, ("--checkpoint", "77"), "000077 is not there"),
+        (None, ("--checkpoint", "../x"), "best, last or the number"),
+        (None, ("--tracking-uri", "ftp://x"), "tracking.uri=ftp://x"),
+    ],
+)
+def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, change, arguments, words):
+    run = season.run("1")
+    run_id = season.recorded(run, client)
+    if change is not None:
+        change(run, client, run_id)
+    ended = call("promote", "1", *arguments)
+    assert ended.code == 2, ended.stderr
+    assert words in ended.complaint
+    assert ended.stdout == ""
+    assert len(ended.stderr.splitlines()) == 1
+    assert not client.search_registered_models()
+    assert not (run / "checkpoints" / "pinned.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--alias", "latest"), "'latest' is no alias"),
+        (("--alias", "Latest"), "'Latest' is no alias"),
+        (("--alias", "v12"), "'v12' is no alias"),
+        (("--alias", ""), "'' is no alias"),
+        (("--alias", "a b"), "'a b' is no alias"),
+        (("--alias", "champion\n"), "is no alias"),
+        (("--model", "a/b"), "'a/b' is no model"),
+        (("--model", ""), "'' is no model"),
+        (("--model", "a:b"), "'a:b' is no model"),
+    ],
+)
+def test_a_name_that_cannot_be_is_refused_before_anything_is_asked(call, arguments, words):
+    ended = call("promote", "nowhere", *arguments)
+    assert ended.code == 2
+    assert words in ended.complaint
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_a_server_that_does_not_answer_is_one_line_without_its_password(season, client, call, free_port):
+    season.recorded(season.run("1"), client)
+    ended = call("promote", "1", "--tracking-uri", f"http://me:s3cr3t@127.0.0.1:{free_port}")
+    assert ended.code == 2
+    assert f"http://***@127.0.0.1:{free_port}" in ended.complaint
+    assert "s3cr3t" not in ended.stderr
+
+
+def test_the_command_names_the_experiment_s_model_and_says_what_to_do_next(season, client, call):
+    run = season.run("1")
+    season.recorded(run, client)
+    ended = call("promote", "1")
+    assert ended.code == 0, ended.stderr
+    assert ended.stdout.splitlines()[0] == "season@champion: version 1"
+    assert "deepracer-exp evaluate run=season@champion" in ended.stdout
+    assert ended.stderr == ""
+    again = call("promote", "champion", "--alias", "rain")
+    assert again.code == 0, again.stderr
+    assert client.get_model_version_by_alias("season", "rain").version == 1
+
+
+def test_mlflow_would_take_every_alias_that_we_do():
+    from mlflow.utils.validation import (
+        _validate_model_alias_name,
+        _validate_model_alias_name_reserved,
+    )
+
+    for alias in ("champion", "a", "v", "v1a", "V-2", "latest2", "a" * 80):
+        assert is_alias(alias)
+        _validate_model_alias_name(alias)
+        _validate_model_alias_name_reserved(alias)
+
+
+def test_a_look_up_without_a_registry_is_refused(season):
+    season.runs_dir.mkdir()
+    with pytest.raises(BadInput, match=r"has no mlflow\.db"):
+        look_up("champion", None, season.runs_dir)

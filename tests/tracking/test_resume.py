@@ -1,0 +1,231 @@
+"""Runs that are gone on with by another process: one MLflow run, each point once."""
+
+import json
+import shutil
+
+import pytest
+from mlflow import MlflowClient
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracking_file import read_told
+
+
+def row(iteration: int, completion: float | None = None) -> dict[str, float]:
+    return {
+        "iteration": iteration,
+        "env_steps": 100 * iteration,
+        "wall_clock_s": iteration / 8,
+        "completion": iteration / 3 if completion is None else completion,
+    }
+
+
+def tell(tracker, rows, safe: bool = True):
+    for one in rows:
+        tracker.log(one, one["env_steps"])
+        if safe:
+            tracker.safe_until(one["env_steps"])
+
+
+@pytest.fixture
+def client(store):
+    return MlflowClient(tracking_uri=store.uri)
+
+
+@pytest.fixture
+def killed(store, identity, wait_until):
+    """Return the tracker of a run of ten iterations that was never finished."""
+    tracker = MLflowTracker(store)
+    params, tags = {"seed": 1}, {"track": "oval", "mlflow.note.content": "as it began"}
+    tracker.start("run", "race", params, tags, identity)
+    tell(tracker, [row(iteration) for iteration in range(1, 11)])
+    wait_until(lambda: tracker.waiting == 0 and read_told(identity).run_id is not None)
+    return tracker
+
+
+def runs(client):
+    return client.search_runs([client.get_experiment_by_name("race").experiment_id])
+
+
+def points(client, run_id, key="completion"):
+    return [(point.step, point.value) for point in client.get_metric_history(run_id, key)]
+
+
+def test_a_resumed_run_goes_on_in_the_same_mlflow_run(store, client, identity, killed):
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    rows = [row(iteration) for iteration in range(1, 21)]
+    tell(tracker, rows)
+    assert tracker.finish("FINISHED") == 0
+    (run,) = runs(client)
+    assert run.info.run_id == tracker.run_id == killed.run_id
+    assert run.info.status == "FINISHED"
+    for key in ("completion", "iteration"):
+        assert points(client, run.info.run_id, key) == [(one["env_steps"], one[key]) for one in rows]
+    assert "env_steps" not in run.data.metrics
+
+
+def test_the_times_of_points_are_those_of_the_training(client, identity, killed):
+    history = client.get_metric_history(killed.run_id, "completion")
+    start_ms = read_told(identity).start_ms
+    assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 11)]
+
+
+def test_points_wait_for_a_checkpoint_and_hold_up_nothing_else(store, client, identity, wait_until, caplog):
+    tracker = MLflowTracker(store)
+    tracker.start("run", "race", {}, {}, identity)
+    tell(tracker, [row(iteration) for iteration in range(1, 11)], safe=False)
+    tracker.set_tag("budget", "50 %")
+    wait_until(lambda: bool(tracker.run_id) and "budget" in client.get_run(tracker.run_id).data.tags)
+    assert points(client, tracker.run_id) == []
+    tracker.safe_until(400)
+    wait_until(lambda: len(points(client, tracker.run_id)) == 4)
+    tracker.set_tag("budget", "80 %")
+    assert tracker.finish("KILLED") == 0
+    assert points(client, tracker.run_id) == [(100 * n, n / 3) for n in range(1, 5)]
+    assert not caplog.records
+
+
+def test_two_processes_that_tell_the_same_rows_record_them_once(store, client, identity, killed):
+    """A request of a killed process may be handled by a slow server after the new process has looked."""
+    both = [MLflowTracker(store) for _ in range(2)]
+    for tracker in both:
+        tracker.reopen(identity)
+    for tracker in both:
+        tell(tracker, [row(iteration) for iteration in range(1, 101)])
+    assert [tracker.finish("FINISHED") for tracker in both] == [0, 0]
+    assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 101)]
+
+
+def test_a_run_whose_id_was_never_heard_is_found_again(store, client, identity, killed):
+    identity.write_text(json.dumps({**json.loads(identity.read_text()), "run_id": None}))
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    assert tracker.finish("FINISHED") == 0
+    assert [run.info.run_id for run in runs(client)] == [killed.run_id]
+    assert read_told(identity).run_id == killed.run_id
+
+
+def test_a_run_that_was_never_created_begins_when_it_began(store, client, identity, free_port, tmp_path):
+    away = MLflowTracker(type(store)(f"http://127.0.0.1:{free_port}", None))
+    away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
+    tell(away, [row(1)])
+    away.finish("KILLED", deadline_s=0)
+    told = read_told(identity)
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    tell(tracker, [row(1), row(2)])
+    assert tracker.finish("FINISHED") == 0
+    (run,) = runs(client)
+    assert (told.run_id, run.info.start_time, run.info.run_name) == (None, told.start_ms, "run")
+    assert (run.data.params, run.data.tags["track"]) == ({"seed": "1"}, "oval")
+    assert points(client, run.info.run_id) == [(100, 1 / 3), (200, 2 / 3)]
+
+
+def test_a_run_that_goes_on_in_another_store_is_whole_there(
+    store, client, identity, killed, empty_database, tmp_path
+):
+    (tmp_path / "other").mkdir()
+    shutil.copy(empty_database, tmp_path / "other" / "mlflow.db")
+    other = resolve_store(None, tmp_path / "other")
+    tracker = MLflowTracker(other)
+    tracker.reopen(identity)
+    tell(tracker, [row(iteration) for iteration in range(1, 13)])
+    assert tracker.finish("FINISHED") == 0
+    there = MlflowClient(tracking_uri=other.uri)
+    assert [run.info.run_id for run in runs(there)] == [tracker.run_id]
+    assert points(there, tracker.run_id) == [(100 * n, n / 3) for n in range(1, 13)]
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    assert tracker.finish("FINISHED") == 0
+    assert [run.info.run_id for run in runs(client)] == [killed.run_id]
+
+
+def test_a_run_that_goes_on_looks_like_one(store, client, identity, killed, wait_until):
+    killed.set_tag("end", "interrupted: by Ctrl-C")
+    killed.finish("KILLED")
+    client.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    wait_until(lambda: client.get_run(killed.run_id).info.status == "RUNNING")
+    tracker.set_tag("went", "on")
+    wait_until(lambda: "went" in client.get_run(killed.run_id).data.tags)
+    data = client.get_run(killed.run_id).data
+    assert "end" not in data.tags
+    assert data.tags["mlflow.note.content"] == "edited in the UI"
+    assert (data.params, data.tags["track"]) == ({"seed": "1"}, "oval")
+    assert tracker.finish("FINISHED") == 0
+
+
+def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
+    store, client, identity, killed, caplog
+):
+    client.delete_run(killed.run_id)
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    tell(tracker, [row(iteration) for iteration in range(1, 21)])
+    assert tracker.finish("FINISHED") > 0
+    (record,) = caplog.records
+    assert f"run {killed.run_id} was deleted in MLflow; restore it there" in record.message
+    assert points(client, killed.run_id)[-1] == (1000, 10 / 3)
+
+
+def test_a_repeated_iteration_that_differs_is_told_and_not_doubled(store, client, identity, killed, caplog):
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    tell(tracker, [row(iteration) for iteration in range(1, 10)] + [row(10, completion=99.0)])
+    assert tracker.finish("FINISHED") == 0
+    assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 11)]
+    assert "points of repeated iterations stay as they were first recorded there (1)" in caplog.text
+
+
+def test_thousands_of_points_are_read_back(store, client, identity):
+    keys = [f"metric_{number}" for number in range(20)]
+    rows = [{**row(n), **{key: n / 7 for key in keys}} for n in range(1, 251)]
+    first = MLflowTracker(store)
+    first.start("run", "race", {}, {}, identity)
+    tell(first, rows)
+    assert first.finish("KILLED") == 0
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    tell(tracker, [*rows, {**row(251), "metric_3": 0.5}])
+    assert tracker.finish("FINISHED") == 0
+    assert points(client, tracker.run_id, "metric_3") == [(100 * n, n / 7) for n in range(1, 251)] + [
+        (25100, 0.5)
+    ]
+    assert len(points(client, tracker.run_id, "metric_19")) == 250
+
+
+def test_a_clone_is_nested_under_its_parent(store, client, identity, killed, tmp_path):
+    tracker = MLflowTracker(store)
+    lineage = {"mlflow.parentRunId": killed.run_id, "generation": "1"}
+    tracker.start("clone", "race", {}, lineage, tmp_path / "clone.json")
+    assert tracker.finish("FINISHED") == 0
+    experiment = client.get_experiment_by_name("race").experiment_id
+    (child,) = client.search_runs([experiment], f"tags.`mlflow.parentRunId` = '{killed.run_id}'")
+    assert child.info.run_id == tracker.run_id
+    # What the UI asks for the row of a child.
+    assert client.get_parent_run(tracker.run_id).info.run_id == killed.run_id
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (None, "cannot be read"),
+        ("{", "is not valid JSON"),
+        ("[]", "holds other keys"),
+        ("{}", "holds other keys"),
+        ('{"run_id": 1, "run_name": "a", "experiment": "b", "start_ms": 2, "store": "c"}', "run_id: 1"),
+        (
+            '{"run_id": null, "run_name": "a", "experiment": "b", "start_ms": "x", "store": "c"}',
+            "start_ms: 'x'",
+        ),
+    ],
+)
+def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
+    if text is not None:
+        identity.write_text(text)
+    with pytest.raises(BadInput, match=says) as refused:
+        MLflowTracker(store).reopen(identity)
+    assert str(identity) in str(refused.value)

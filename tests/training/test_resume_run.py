@@ -1,0 +1,247 @@
+"""`deepracer-exp resume`: the rest of a run is what it would have been."""
+
+import json
+import shutil
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+from torchrl.checkpoint import Checkpoint
+
+from deepracer_exp.formats.checkpoint_files import verify
+from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.training.checkpoints import read_training
+from deepracer_exp.training.run import TIMES
+from deepracer_exp.training.run_folder import RunFolder
+
+# Reached sooner than a lap: episodes end often.
+OFTEN = ("episode.max_steps=60", "checkpoints.every=2")
+
+
+def rows(folder) -> list[dict]:
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
+
+
+class Holder:
+    """Takes whatever state a checkpoint has."""
+
+    def state_dict(self) -> dict:
+        return {}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.state = state
+
+
+def leaves(node) -> list:
+    if isinstance(node, dict):
+        return [(key, leaf) for key, value in node.items() for leaf in leaves(value)]
+    return [leaf for value in node for leaf in leaves(value)] if isinstance(node, list) else [node]
+
+
+def agent(folder) -> list:
+    """Return networks, optimizer, schedule and random stream of the last checkpoint."""
+    holder = Holder()
+    Checkpoint(agent=holder).load(folder / "checkpoints" / "last")
+    return leaves(holder.state)
+
+
+def same(one, other) -> bool:
+    if isinstance(one, tuple):
+        return one[0] == other[0] and same(one[1], other[1])
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+
+
+def assert_same_run(one, other) -> None:
+    assert rows(one) == rows(other)
+    assert all(same(*pair) for pair in zip(agent(one), agent(other), strict=True))
+    pd.testing.assert_frame_equal(read_trace(one / "trace"), read_trace(other / "trace"))
+    best = [json.loads((folder / "summary.json").read_text())["best"] for folder in (one, other)]
+    assert best[0] == best[1]
+    labels = [(folder / "checkpoints" / "best").readlink() for folder in (one, other)]
+    assert labels[0] == labels[1]
+
+
+@pytest.fixture
+def cut(trained, tmp_path):
+    """Return a function that gives a copy of the run that ended after three of six iterations."""
+
+    def make(*overrides):
+        ended = trained(*OFTEN, *overrides, "budget.env_steps=null", "budget.iterations=3")
+        assert ended.code == 0, ended.stderr
+        copy = tmp_path / "runs" / "tiny" / ended.folder.name
+        shutil.copytree(ended.folder, copy, symlinks=True)
+        return copy
+
+    return make
+
+
+def whole(trained, *overrides):
+    ended = trained(*OFTEN, *overrides, "budget.env_steps=null", "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    return ended.folder
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("action_space=continuous", "randomization=sim2real", "network=mlp_small_shared"),
+        (
+            "track=[reinvent_base,Oval_track]",
+            "track.Oval_track.direction=alternate",
+            "lr_schedule=adaptive_kl",
+        ),
+        ("checkpoints.every=null", "reward=speed_on_track"),
+    ],
+    ids=lambda overrides: " ".join(overrides) or "as it is",
+)
+def test_a_run_that_goes_on_is_the_run_that_was_never_interrupted(trained, cut, call, overrides):
+    run = cut(*overrides)
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    assert_same_run(run, whole(trained, *overrides))
+    assert json.loads((run / "summary.json").read_text())["iteration"] == 6
+    assert "will not be that of an uninterrupted run" not in ended.stderr
+
+
+def test_what_was_written_after_the_checkpoint_is_written_anew(trained, cut, call):
+    run = cut()
+    with (run / "metrics.jsonl").open("a") as metrics:
+        metrics.write(json.dumps({"iteration": 4, "env_steps": 1}) + '\n{"iteration": 5, "en')
+    (run / "trace" / "00003-iteration.parquet").write_bytes(b"half")
+    (run / "checkpoints" / ".000004").mkdir()
+    (run / "summary.json").unlink()
+    assert call("resume", run.name, "budget.iterations=6").code == 0
+    assert_same_run(run, whole(trained))
+
+
+def test_a_torn_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trained, cut, call):
+    run = cut()
+    archives = (run / "checkpoints" / "000003").rglob("state.tdz")
+    (archive,) = (path for path in archives if "training" in path.parent.name)
+    archive.write_bytes(archive.read_bytes()[:-20])
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    assert "000003: torn" in ended.stderr
+    assert "000002, the newest intact one, takes its place" in ended.stderr
+    assert_same_run(run, whole(trained))
+
+
+def test_with_no_intact_checkpoint_nothing_is_begun(cut, call):
+    run = cut()
+    for hashes in (run / "checkpoints").glob("0*/hashes.json"):
+        hashes.write_text("{}")
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 2
+    assert "none in" in ended.complaint
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_anew(trained, cut, call):
+    run = cut()
+    shutil.rmtree(run / "checkpoints")
+    (run / "summary.json").unlink()
+    assert call("resume", run.name, "budget.iterations=6").code == 0
+    assert_same_run(run, whole(trained))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["algorithm.lr=1e-5"], ["algorithm.lr: 0.001 -> 1e-05", "deepracer-exp clone"]),
+        (["track=Oval_track"], ["track.name", "Oval_track"]),
+        (["algorithm.learning_rate=1"], ["algorithm.learning_rate: no such key"]),
+        (["experiment=fast_lap"], ["experiment=fast_lap", "give the groups and values"]),
+        (["budget.iterations=many"], ["budget.iterations"]),
+    ],
+)
+def test_another_configuration_is_refused_with_what_differs(cut, call, overrides, words):
+    run = cut()
+    before = (run / "metrics.jsonl").read_bytes()
+    ended = call("resume", run.name, "budget.iterations=6", *overrides)
+    assert ended.code == 2, ended.stderr
+    for word in words:
+        assert word in ended.complaint
+    assert (run / "metrics.jsonl").read_bytes() == before
+    assert (run / "summary.json").exists()
+
+
+def test_a_config_file_changed_by_hand_is_refused(cut, call):
+    run = cut()
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["algorithm"]["entropy_coeff"] = 0.5
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 2
+    assert "algorithm.entropy_coeff: 0.01 -> 0.5" in ended.complaint
+
+
+def test_a_reward_function_changed_since_is_refused(trained, call, tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("def reward_function(params):\n    return params['speed']\n")
+    ended = trained(*OFTEN, f"reward.file={file}", "budget.iterations=2")
+    copy = tmp_path / "runs" / "tiny" / ended.folder.name
+    shutil.copytree(ended.folder, copy, symlinks=True)
+    file.write_text("def reward_function(params):\n    return 2 * params['speed']\n")
+    ended = call("resume", copy.name, "budget.iterations=4")
+    assert ended.code == 2
+    assert "reward mine has other contents" in ended.complaint
+
+
+def test_a_reward_function_with_a_memory_is_told_of(trained, call, tmp_path):
+    file = tmp_path / "memory.py"
+    file.write_text(
+        "seen = 0\ndef reward_function(params):\n    global seen\n    seen += 1\n    return 1.0\n"
+    )
+    ended = trained(*OFTEN, f"reward.file={file}", "budget.iterations=2")
+    copy = tmp_path / "runs" / "tiny" / ended.folder.name
+    shutil.copytree(ended.folder, copy, symlinks=True)
+    ended = call("resume", copy.name, "budget.iterations=3")
+    assert ended.code == 0
+    assert "will not be that of an uninterrupted run: the reward function memory keeps" in ended.stderr
+
+
+def test_a_run_at_its_end_is_refused_with_what_can_be_done(cut, trained, call, tmp_path):
+    run = cut()
+    ended = call("resume", run.name)
+    assert ended.code == 2
+    assert "budget reached: iterations" in ended.complaint
+    assert "budget.iterations=" in ended.complaint
+    stopped = trained("stopping=reliable", "stopping.episodes=20", "stopping.lap_share=0")
+    copy = tmp_path / "runs" / "tiny" / stopped.folder.name
+    shutil.copytree(stopped.folder, copy, symlinks=True)
+    ended = call("resume", copy.name, "budget.env_steps=99999")
+    assert ended.code == 2
+    assert "deepracer-exp clone run=" in ended.complaint
+
+
+def test_a_run_that_is_being_trained_is_left_alone(cut, call):
+    run = cut()
+    folder = RunFolder(run)
+    ended = call("resume", run.name, "budget.iterations=6")
+    folder.release()
+    assert ended.code == 2
+    assert "a process is training in it" in ended.complaint
+
+
+def test_lost_lines_of_metrics_are_refused(cut, call):
+    run = cut()
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:2]))
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 2
+    assert "has 2 of the 3 rows" in ended.complaint
+
+
+def test_every_checkpoint_that_is_kept_is_whole_and_knows_the_best(cut):
+    run = cut()
+    kept = sorted((run / "checkpoints").glob("0*"))
+    assert [path.name for path in kept] == ["000002", "000003"]
+    for path in kept:
+        verify(path)
+        state = read_training(path)
+        assert state["iteration"] == int(path.name)
+        assert state["best"]["iteration"] == 2
