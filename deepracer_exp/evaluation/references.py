@@ -60,12 +60,14 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> Reference:
     if meant:
         names = ", ".join(str(folder.relative_to(runs_dir)) for folder in meant[:3])
         raise BadInput(f"run={run}: {len(meant)} runs are meant: {names}{', ...' * (len(meant) > 3)}")
-    if is_alias(run) and has_store(tracking_uri, runs_dir):
-        return _of_registered(run, look_up(run, tracking_uri, runs_dir), runs_dir)
-    close = nearest(run, [folder.name for folder in folders])
-    raise BadInput(
-        f"run={run}: no such run in {runs_dir} ({len(folders)} there){close}; accepted: {ACCEPTED}"
-    )
+    unknown = f"run={run}: no such run in {runs_dir} ({len(folders)} there){nearest(run, [f.name for f in folders])}"
+    if not is_alias(run) or not has_store(tracking_uri, runs_dir):
+        raise BadInput(f"{unknown}; accepted: {ACCEPTED}")
+    try:
+        registered = look_up(run, tracking_uri, runs_dir)
+    except BadInput as error:
+        raise BadInput(f"{unknown}; {str(error).removeprefix(f'run={run}: ')}") from None
+    return _of_registered(run, registered, runs_dir)
 
 
 def best_of(experiment: str, runs_dir: Path) -> Path:

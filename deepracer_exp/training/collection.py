@@ -174,7 +174,10 @@ class Collection:
         if self._watchdog is not None:
             self._watchdog.close()
         if not self._collector.closed:
+            threads = torch.get_num_threads()
             self._collector.shutdown()
+            # TorchRL gives this process the workers' threads, and with other threads sums have other last digits.
+            torch.set_num_threads(threads)
         if self._workers:
             self._close_weight_queues()
 

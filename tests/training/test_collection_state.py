@@ -159,6 +159,12 @@ def test_the_cars_of_one_worker_go_on_in_the_training_process(driver_of):
     assert_same(here.collect(here.open(state), range(1, 2)), expected)
 
 
+def test_closing_leaves_the_threads_of_this_process_as_they_were(driver_of):
+    before = torch.get_num_threads()
+    driver_of("collector=sync", "collector.processes=1", "collector.cars=6").open().close()
+    assert torch.get_num_threads() == before
+
+
 def test_asynchronous_workers_have_no_state_and_begin_again(driver_of):
     driver = driver_of("collector=async", "collector.processes=1", "collector.cars=6")
     collection = driver.open()
