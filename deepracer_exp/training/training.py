@@ -122,6 +122,9 @@ class Training:
 
     def drive_and_learn(self, interruption: Interruption) -> str:
         """Collect, learn and record until there is a reason to stop; return it."""
+        over = self._reason_to_stop(interruption) if self._iteration else None
+        if over is not None:  # killed while it was ending
+            return over
         experiment = self.experiment
         frames = frames_per_batch(experiment)
         # The view first: workers take a second or two to start.
@@ -161,7 +164,7 @@ class Training:
         self._began -= state["wall_clock_s"]
         self._process_began -= state["wall_clock_s"]
         for row in rows:
-            self._stopping.observe(row)
+            self._decision = self._stopping.observe(row)
             self._row = dict(row)
 
     def tell_again(self, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -148,6 +148,30 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(trained, cut, call
     assert_same_run(run, whole(trained))
 
 
+def test_a_run_killed_while_it_was_ending_is_ended_and_not_driven_on(cut, call):
+    run = cut()
+    before, summary = rows(run), json.loads((run / "summary.json").read_text())
+    (run / "summary.json").unlink()
+    assert call("resume", run.name).code == 0
+    assert rows(run) == before
+    again = json.loads((run / "summary.json").read_text())
+    for key in ("status", "reason", "iteration", "env_steps", "best", "last"):
+        assert again[key] == summary[key]
+
+
+def test_a_run_killed_after_its_stopping_rule_had_decided_is_ended(trained, call, tmp_path):
+    stopped = trained("stopping=reliable", "stopping.episodes=20", "stopping.lap_share=0")
+    copy = tmp_path / "runs" / "tiny" / stopped.folder.name
+    shutil.copytree(stopped.folder, copy, symlinks=True)
+    (copy / "summary.json").unlink()
+    assert call("resume", copy.name).code == 0
+    again = json.loads((copy / "summary.json").read_text())
+    assert {key: again[key] for key in ("reason", "stopping", "reliable")} == {
+        key: stopped.summary[key] for key in ("reason", "stopping", "reliable")
+    }
+    assert rows(copy) == rows(stopped.folder)
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
