@@ -4,9 +4,10 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from deepracer_exp.config import stored
 from deepracer_exp.formats.run_files import RunRecord
 
-NOTHING = "\N{EN DASH}"
+NOTHING = stored.ABSENT
 _NO_MATTER = ("runs_dir", "debug", "tracking")  # whatever they are, the car drives the same
 LAST = 10
 """Iterations at the end of a run over which its figures are averaged: single ones wobble."""
@@ -28,24 +29,13 @@ def differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
         sha256 = record.provenance.get("reward", {}).get("sha256")
         config["reward_function.py"] = NOTHING if sha256 is None else f"sha256 {sha256[:8]}"
         config["code"] = str(record.provenance.get("git_commit") or NOTHING)[:16]
-    return _differences(configs)
+    return stored.differences(configs)
 
 
 def course_names(track: Any) -> str:
     """Return the name of the track of a configuration, or those of several."""
     known = isinstance(track, Mapping)
     return str(track["name"]) if known and "name" in track else ", ".join(track) if known else NOTHING
-
-
-def _differences(nodes: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = {}
-    for key in dict.fromkeys(key for node in nodes for key in node):
-        values = [node.get(key, NOTHING) for node in nodes]
-        if all(isinstance(value, Mapping) for value in values):
-            found |= _differences(values, f"{prefix}{key}.")
-        elif any(value != values[0] for value in values):
-            found[f"{prefix}{key}"] = values
-    return found
 
 
 def value_text(value: Any, most: int = 48) -> str:

@@ -2,8 +2,7 @@
 
 import copy
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from deepracer_exp.errors import BadInput, nearest
@@ -14,20 +13,8 @@ from .options import groups
 from .overrides import OPEN_MAPPINGS, parse_single
 
 _WHOLE = ("experiment", custom_files.KEY)
-_ABSENT = "\N{EN DASH}"
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A value that is not what it was."""
-
-    key: str
-    before: Any
-    after: Any
-
-    def __str__(self) -> str:
-        """Return it in words, e.g. ``algorithm.lr: 0.001 -> 0.0001``."""
-        return f"{self.key}: {_short(self.before)} -> {_short(self.after)}"
+ABSENT = "\N{EN DASH}"
+"""Stands for a value that is not there."""
 
 
 def with_overrides(
@@ -66,14 +53,26 @@ def with_overrides(
     )
 
 
-def differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[Difference]:
-    """Return the values in which two configurations differ, lists as a whole."""
-    old, new = dict(_leaves(before)), dict(_leaves(after))
-    return [
-        Difference(key, old.get(key, _ABSENT), new.get(key, _ABSENT))
-        for key in {**old, **new}
-        if key not in old or key not in new or old[key] != new[key]
-    ]
+def differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:
+    """Return the values in which configurations differ, by dotted key; ABSENT where one has no such key.
+
+    Args:
+        configs: all values of each.
+        prefix: of the keys.
+    """
+    found: dict[str, list[Any]] = {}
+    for key in dict.fromkeys(key for config in configs for key in config):
+        values = [config.get(key, ABSENT) for config in configs]
+        if all(isinstance(value, Mapping) for value in values):
+            found |= differences(values, f"{prefix}{key}.")
+        elif any(value != values[0] for value in values):
+            found[f"{prefix}{key}"] = values
+    return found
+
+
+def in_words(different: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Return differences in words, e.g. ``algorithm.lr: 0.001 -> 0.0001``."""
+    return [f"{key}: {' -> '.join(map(_short, values))}" for key, values in different.items()]
 
 
 def _set(values: dict[str, Any], key: str, value: Any) -> None:
@@ -92,14 +91,6 @@ def _unknown(key: str, at: str, node: Any) -> BadInput:
     known = [str(name) for name in node] if isinstance(node, dict) else []
     leaf = at.rpartition(".")[2]
     return BadInput(f"{key}: no such key{nearest(leaf, known)}; known there: {', '.join(known) or 'none'}")
-
-
-def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(node, Mapping) and node:
-        for name, value in node.items():
-            yield from _leaves(value, f"{prefix}.{name}" if prefix else str(name))
-    else:
-        yield prefix, node
 
 
 def _short(value: Any) -> str:

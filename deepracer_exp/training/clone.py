@@ -9,7 +9,7 @@ from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config.compose import Composition, validate
 from deepracer_exp.config.evaluation import checkpoint_name
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.stored import differences, with_overrides
+from deepracer_exp.config.stored import differences, in_words, with_overrides
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
@@ -97,7 +97,7 @@ def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
     """Refuse what the parent's networks were not made for."""
     why = "the parent's networks were made for it; train a new run for another"
     if clone.network != parent.network:
-        changed = "; ".join(str(one) for one in differences(vars(parent.network), vars(clone.network)))
+        changed = "; ".join(in_words(differences([vars(parent.network), vars(clone.network)])))
         raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
     ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
     if clone.observation != parent.observation:

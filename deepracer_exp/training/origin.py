@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.config.stored import differences
+from deepracer_exp.config.stored import differences, in_words
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput
@@ -46,11 +46,8 @@ def refuse_changes(
     Raises:
         BadInput: a value or a file that matters is another one; all of them are named.
     """
-    changed = [
-        str(difference)
-        for difference in differences(before["config"], config)
-        if not _is_harmless(difference.key)
-    ]
+    different = differences([before["config"], config])
+    changed = in_words({key: values for key, values in different.items() if not _is_harmless(key)})
     now = _hashes(setup)
     changed += [f"{file} has other contents" for file in now if now[file] != before["files"].get(file)]
     if changed:

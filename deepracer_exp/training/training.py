@@ -20,13 +20,13 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.evaluation.result import Rank
 from deepracer_exp.formats.trace import TraceWriter, to_table
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.names import joined
 from deepracer_exp.tracking.recorder import Tracker
 
 from .alerts import Alerts
+from .best import Best
 from .budget import Budget
 from .checkpoints import CheckpointStore, read_agent
 from .collection import Collection, worker_count
@@ -113,8 +113,7 @@ class Training:
         # The clock of a racer starts with the command, not with the loop.
         self._process_began = psutil.Process().create_time()
         self._saved_at = self._began
-        self._best: dict[str, Any] | None = None
-        self._best_rank: Rank | None = None
+        self._best = Best(experiment.checkpoints.metric)
         self._first_lap: dict[str, float] | None = None
         self._reliable: dict[str, float] | None = None
         self._row: dict[str, Any] = {}
@@ -158,8 +157,8 @@ class Training:
         self._iteration, self._env_steps = state["iteration"], state["env_steps"]
         self._results.load_state_dict(state["results"])
         self._ranking.load_state_dict(state["ranking"])
-        self._best, self._first_lap, self._reliable = state["best"], state["first_lap"], state["reliable"]
-        self._best_rank = None if self._best is None else _rank(self._best)
+        self._best.policy = state["best"]
+        self._first_lap, self._reliable = state["first_lap"], state["reliable"]
         self._cars = state["cars"]
         self._began -= state["wall_clock_s"]
         self._process_began -= state["wall_clock_s"]
@@ -203,7 +202,10 @@ class Training:
             rows, finished = self._results.book.enter(batch["next", "trace"].numpy())
             self._env_steps += batch.numel()
             if not self._examination.is_held:
-                self._rank_by_driving(finished)
+                rank = self._ranking.rank(finished)
+                if self._best.beaten_by_driving(rank, self._counters()):
+                    # The weights are still those that drove; the update makes others.
+                    self.checkpoints.save(self.agent, self._counters(), best=True)
             began = time.monotonic()
             update = self._learn(batch)
             collection.publish_policy()
@@ -213,10 +215,10 @@ class Training:
             mark = self._evaluated() if self._examination.is_due(self._iteration) else None
             self._decision = self._stopping.observe(self._row)
             reason = self._reason_to_stop(interruption)
-            if reason is not None and interruption.signum is None and self._best is None:
+            if reason is not None and interruption.signum is None and self._best.policy is None:
                 mark = self._evaluated()
             self._record(rows)
-            better = self._note(mark)
+            better = self._best.beaten_by(mark, self._counters())
             if reason is not None or better or self._is_time_to_save():
                 self._save(collection, better)
             self._send_alerts()
@@ -237,32 +239,12 @@ class Training:
             "wall_clock_s": time.monotonic() - self._began,
             "results": self._results.state_dict(),
             "ranking": self._ranking.state_dict(),
-            "best": self._best,
+            "best": self._best.policy,
             "first_lap": self._first_lap,
             "reliable": self._reliable,
             "cars": collection.state_dict(),
             **self._origin,
         }
-
-    def _rank_by_driving(self, finished: Finished) -> None:
-        """Keep the policy if no other drove better; the weights are still those that drove."""
-        rank = self._ranking.rank(finished)
-        if rank is not None and (self._best_rank is None or rank > self._best_rank):
-            self._best_rank = rank
-            self._best = {**self._counters_of_best("driving"), "rank": list(rank), **NOT_EVALUATED}
-            self.checkpoints.save(self.agent, self._counters(), best=True)
-
-    def _note(self, mark: Mark | None) -> bool:
-        """Return whether the policy is the best evaluated so far."""
-        if mark is None or (self._best_rank is not None and mark.rank <= self._best_rank):
-            return False
-        self._best_rank = mark.rank
-        metric = self.experiment.checkpoints.metric
-        self._best = {**self._counters_of_best(metric), "rank": list(mark.rank), **mark.columns()}
-        return True
-
-    def _counters_of_best(self, metric: str) -> dict[str, Any]:
-        return {"iteration": self._iteration, "env_steps": self._env_steps, "metric": metric}
 
     def _end(self, status: str, reason: str, exit_code: int, error: BaseException | None = None) -> Outcome:
         """Write the summary and let go of the tracker and the log."""
@@ -275,7 +257,7 @@ class Training:
             "wall_clock_s": round(time.monotonic() - self._began, 3),
             "cost": self._budget.cost(time.monotonic() - self._began),
             **self._results.summary(),
-            "best": self._best,
+            "best": self._best.policy,
             "stopping": self._decision and self._decision.as_dict(),
             "first_lap": self._first_lap,
             "reliable": self._reliable,
@@ -415,8 +397,3 @@ def track_names(setup: RaceSetup) -> list[str]:
     """Return what the courses are called: one by its own name, which may stand in a file; several by their options."""
     courses = setup.courses
     return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
-
-
-def _rank(best: Mapping[str, Any]) -> Rank:
-    first, second = best["rank"]
-    return first, second

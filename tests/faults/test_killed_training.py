@@ -6,11 +6,10 @@ import signal
 import time
 
 import pytest
-import torch
 from mlflow import MlflowClient
-from torchrl.checkpoint import Checkpoint
 
-from deepracer_exp.formats.trace import read_trace
+from benchmarks.same import different_rows, different_tensors, different_traces
+from deepracer_exp.formats.run_files import read_metrics
 from deepracer_exp.training.run import TIMES
 
 ITERATIONS = 14
@@ -23,24 +22,6 @@ RUN = (
 def folder_of(where, runs_dir):
     (file,) = (where / runs_dir).glob("tiny/*/config.yaml")
     return file.parent
-
-
-def rows_of(folder) -> list[dict]:
-    lines = (folder / "metrics.jsonl").read_text().splitlines()
-    return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
-
-
-def weights_of(folder) -> dict[str, torch.Tensor]:
-    class Holder:
-        def state_dict(self) -> dict:
-            return {}
-
-        def load_state_dict(self, state: dict) -> None:
-            self.networks = state["networks"]
-
-    holder = Holder()
-    Checkpoint(agent=holder).load(folder / "checkpoints" / "last")
-    return holder.networks
 
 
 def points_of(where, runs_dir, folder) -> dict[str, list[tuple[int, float]]]:
@@ -64,11 +45,11 @@ def assert_as_if_nothing_had_happened(tmp_path, start):
     whole = start(*RUN, "runs_dir=whole").end()
     assert whole.code == 0, whole.stderr
     one, other = folder_of(tmp_path, "whole"), folder_of(tmp_path, "cut")
-    assert len(rows_of(one)) == ITERATIONS
-    assert rows_of(one) == rows_of(other)
-    ours, theirs = weights_of(one), weights_of(other)
-    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
-    assert read_trace(one / "trace").equals(read_trace(other / "trace"))
+    rows = [read_metrics(folder / "metrics.jsonl") for folder in (one, other)]
+    assert len(rows[0]) == ITERATIONS
+    assert different_rows(*rows) is None
+    assert different_tensors(*(folder / "checkpoints" / "last" for folder in (one, other))) is None
+    assert different_traces(one, other) is None
     points = points_of(tmp_path, "cut", other)
     assert points == points_of(tmp_path, "whole", one)
     assert len(points["entropy"]) == len(set(points["entropy"])) == ITERATIONS

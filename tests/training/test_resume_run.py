@@ -3,14 +3,12 @@
 import json
 import shutil
 
-import pandas as pd
 import pytest
-import torch
 import yaml
-from torchrl.checkpoint import Checkpoint
 
+from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.formats.checkpoint_files import verify
-from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.formats.run_files import read_metrics
 from deepracer_exp.training.checkpoints import read_training
 from deepracer_exp.training.run import TIMES
 from deepracer_exp.training.run_folder import RunFolder
@@ -24,39 +22,10 @@ def rows(folder) -> list[dict]:
     return [{key: value for key, value in json.loads(line).items() if key not in TIMES} for line in lines]
 
 
-class Holder:
-    """Takes whatever state a checkpoint has."""
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.state = state
-
-
-def leaves(node) -> list:
-    if isinstance(node, dict):
-        return [(key, leaf) for key, value in node.items() for leaf in leaves(value)]
-    return [leaf for value in node for leaf in leaves(value)] if isinstance(node, list) else [node]
-
-
-def agent(folder) -> list:
-    """Return networks, optimizer, schedule and random stream of the last checkpoint."""
-    holder = Holder()
-    Checkpoint(agent=holder).load(folder / "checkpoints" / "last")
-    return leaves(holder.state)
-
-
-def same(one, other) -> bool:
-    if isinstance(one, tuple):
-        return one[0] == other[0] and same(one[1], other[1])
-    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
-
-
 def assert_same_run(one, other) -> None:
-    assert rows(one) == rows(other)
-    assert all(same(*pair) for pair in zip(agent(one), agent(other), strict=True))
-    pd.testing.assert_frame_equal(read_trace(one / "trace"), read_trace(other / "trace"))
+    assert different_rows(read_metrics(one / "metrics.jsonl"), read_metrics(other / "metrics.jsonl")) is None
+    assert different_tensors(*(folder / "checkpoints" / "last" for folder in (one, other))) is None
+    assert different_traces(one, other) is None
     best = [json.loads((folder / "summary.json").read_text())["best"] for folder in (one, other)]
     assert best[0] == best[1]
     labels = [(folder / "checkpoints" / "best").readlink() for folder in (one, other)]
