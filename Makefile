@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help env race test test-long check bench clean
+.PHONY: help env race test test-long test-faults check bench clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -27,6 +27,9 @@ test: $(STAMP)  ## the tests
 
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each
 	@$(BIN)/python -m pytest -q -m slow
+
+test-faults: $(STAMP)  ## sweeps whose processes are killed and stopped, twenty times each
+	@FAULT_TIMES=20 $(BIN)/python -m pytest -q tests/faults/test_killed_sweeps.py
 
 check: $(STAMP)  ## style, types and import rules
 	@$(BIN)/ruff check .

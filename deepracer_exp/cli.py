@@ -18,6 +18,7 @@ from deepracer_exp.commands import (
     promote,
     resume,
     stopping,
+    sweep,
 )
 from deepracer_exp.commands.ending import tell, tell_all
 from deepracer_exp.commands.starting import start_workers_early
@@ -182,6 +183,7 @@ def _parser() -> argparse.ArgumentParser:
     ui.add_argument("--uri", help="another MLflow store, as given to tracking.uri")
     ui.set_defaults(command=_ui)
 
+    sweep.register(commands)
     resume.register(commands)
     clone.register(commands)
     checkpoints.register(commands)

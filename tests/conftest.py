@@ -231,6 +231,26 @@ def call_in(cwd: Path, *arguments: str) -> Ended:
     return Ended(exit_.value.code or 0, out.getvalue(), err.getvalue(), cwd)
 
 
+@pytest.fixture(scope="session")
+def call_at() -> Callable[..., Ended]:
+    """Call `deepracer-exp ARGUMENTS` in this process: `call_at(FOLDER, ARGUMENTS...)`."""
+    return call_in
+
+
+@pytest.fixture(scope="session")
+def run_at() -> Callable[..., Ended]:
+    """Run `deepracer-exp ARGUMENTS` as a process of its own to its end: `run_at(FOLDER, ARGUMENTS...)`."""
+
+    def run(cwd: Path, *arguments: str) -> Ended:
+        started = Started(arguments, cwd)
+        try:
+            return started.end()
+        finally:
+            started.destroy()
+
+    return run
+
+
 @pytest.fixture
 def call(tmp_path: Path) -> Callable[..., Ended]:
     """Call `deepracer-exp ARGUMENTS` in this process, with `tmp_path` as the working folder."""

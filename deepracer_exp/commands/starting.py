@@ -8,15 +8,20 @@ from pathlib import Path
 from deepracer_exp.formats.run_files import read_config
 
 
-def start_workers_early(wanted: bool) -> None:
-    """Let a server process import torch while this one does, so that workers fork from it at once."""
+def start_workers_early(wanted: bool, module: str = "deepracer_exp.training.fork_server") -> None:
+    """Let a server process import torch while this one does, so that workers fork from it at once.
+
+    Args:
+        wanted: whether there will be workers.
+        module: that the server imports.
+    """
     if not wanted or not sys.platform.startswith("linux"):
         return
     import multiprocessing
     from multiprocessing import forkserver
 
     multiprocessing.set_start_method("forkserver", force=True)
-    multiprocessing.set_forkserver_preload(["deepracer_exp.training.fork_server"])
+    multiprocessing.set_forkserver_preload([module])
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -30,6 +30,8 @@ from .several_tracks import in_own_words, several_tracks
 
 Config = TypeVar("Config")
 
+_adapters: dict[type, TypeAdapter[Any]] = {}
+
 # Option files name the files beside them by it, whatever the working folder: ${conf:'reward/mine.py'}.
 OmegaConf.register_new_resolver("conf", find, replace=True)
 
@@ -78,7 +80,7 @@ def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Compos
     """
     composition = compose_entry("evaluate", overrides)
     _require_run(composition)
-    return _typed(composition.mapping, EvaluateConfig), composition
+    return typed(composition.mapping, EvaluateConfig), composition
 
 
 def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]:
@@ -91,7 +93,7 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     _require_run(composition)
     if composition.mapping["format"] is None:
         raise BadInput("format: missing; write format=onnx or format=aws")
-    return _typed(composition.mapping, ExportConfig), composition
+    return typed(composition.mapping, ExportConfig), composition
 
 
 def _require_run(composition: Composition) -> None:
@@ -157,17 +159,29 @@ def validate(mapping: dict[str, Any]) -> Experiment:
     Raises:
         BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
     """
-    experiment = _typed(mapping, Experiment)
+    experiment = typed(mapping, Experiment)
     _check_together(experiment)
     return experiment
 
 
-def _typed(mapping: dict[str, Any], kind: type[Config]) -> Config:
+def typed(mapping: dict[str, Any], kind: type[Config]) -> Config:
+    """Turn plain values into a frozen dataclass; types are strict.
+
+    Raises:
+        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
+    """
     try:
         # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
-        return TypeAdapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
+        return _adapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
     except ValidationError as error:
         raise BadInput(_first_finding(mapping, error)) from error
+
+
+def _adapter(kind: type[Config]) -> TypeAdapter[Config]:
+    # Building one takes longer than ten validations.
+    if kind not in _adapters:
+        _adapters[kind] = TypeAdapter(kind)
+    return _adapters[kind]
 
 
 def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
@@ -221,9 +235,11 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
 def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
     """Return one line for what Hydra tells in several."""
     text = in_own_words(str(error))
-    missing = re.search(r"Could not find '([\w-]+)/([^']*)'", text)
-    if missing:
-        group, option = missing.groups()
+    missing = re.search(r"Could not find '([^']*)'", text)
+    groups_within = [group for group in groups(entry) if missing and missing[1].startswith(f"{group}/")]
+    if missing and groups_within:
+        group = max(groups_within, key=len)  # sweep/executor rather than sweep
+        option = missing[1].removeprefix(f"{group}/")
         known = options(group)
         return f"{group}={option}: no such {group}{nearest(option, known)}; options: {', '.join(known)}"
     unknown = re.search(r"Could not override '([^']+)'", text)

@@ -24,7 +24,7 @@ def conf_dirs() -> list[Path]:
     try:
         if not own.is_dir() or own.samefile(project):
             return [project]
-        for group in sorted(folder.name for folder in project.iterdir() if folder.is_dir()):
+        for group in sorted(str(path.relative_to(project)) for path in project.rglob("*/") if path.is_dir()):
             for path in sorted((own / group).glob("*.yaml")):
                 namesake = project / group / path.name
                 if namesake.is_file() and namesake.read_bytes() != path.read_bytes():

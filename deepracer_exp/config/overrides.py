@@ -18,6 +18,8 @@ PLAIN_TEXT = (
     *("track.file", "reward.file", "action_space.file", "custom_files", "runs_dir", "tracking.uri"),
     # Of the commands that read runs back; an id may look like a number.
     *("run", "checkpoint", "tracking_uri"),
+    # Of sweeps.
+    *("study", "parent", "sweep.storage"),
 )
 _KEYS = "|".join((*map(re.escape, PLAIN_TEXT), r"(?:track|several_tracks)\.[\w-]+\.file"))
 _PLAIN = re.compile(rf"(\+{{0,2}}(?:{_KEYS})=)(.+)", re.DOTALL)

@@ -39,15 +39,17 @@ def with_overrides(
                 f"{one.input_line}: would replace what the run was made with; give the groups and values that are "
                 "to change, such as track=Oval_track"
             )
-    composed = compose_entry("train", [one.input_line or "" for one in chosen])
-    for one in chosen:
-        values[one.key_or_group] = composed.mapping[one.key_or_group]
+    new: dict[str, str] = {}
+    if chosen:
+        composed = compose_entry("train", [one.input_line or "" for one in chosen])
+        for one in chosen:
+            values[one.key_or_group] = composed.mapping[one.key_or_group]
+            new[one.key_or_group] = composed.choices[one.key_or_group]
     for one in parsed:
         if one not in chosen:
             if one.is_delete() or one.package is not None:
                 raise BadInput(f"{one.input_line}: accepted here: GROUP=OPTION or KEY=VALUE")
             _set(values, one.key_or_group, one.value())
-    new = {group: composed.choices[group] for group in {one.key_or_group for one in chosen}}
     return Composition(
         overrides=tuple(overrides), choices={**choices, **new}, mapping=values, names={}, notes=()
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.formats.best_of_sweep import run_of_sweep
 from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, verify
 from deepracer_exp.formats.run_files import read_config
 from deepracer_exp.formats.run_result import RunResult, read_result
@@ -73,18 +74,21 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> Reference:
 def best_of(experiment: str, runs_dir: Path) -> Path:
     """Return the folder of an experiment's best run.
 
-    Runs whose best checkpoint was evaluated are ranked by that; where none was, by the share of complete laps and the
-    fastest lap of their training. The newest of equals is taken.
+    Of a sweep it is the run of its best trial, whatever else was trained under the same name. Otherwise runs whose
+    best checkpoint was evaluated are ranked by that; where none was, by the share of complete laps and the fastest lap
+    of their training. The newest of equals is taken.
 
     Raises:
-        BadInput: there is no such experiment, no run of it tells how good it is, or they do not compare: another
-            car, course, evaluation or measure.
+        BadInput: there is no such experiment, no run of it tells how good it is, they do not compare (another car,
+            course, evaluation or measure), or the best of a sweep is gone.
     """
     what = f"run={BEST}{experiment}"
     try:
         folder = runs_dir / safe_name(experiment)
     except ValueError as error:
         raise BadInput(f"{what}: {error}") from None
+    if (of_sweep := run_of_sweep(folder)) is not None:
+        return of_sweep
     runs = sorted(file.parent for file in folder.glob("*/config.yaml"))
     if not runs:
         known = sorted({file.parents[1].name for file in runs_dir.glob("*/*/config.yaml")})

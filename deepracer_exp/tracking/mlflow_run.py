@@ -10,6 +10,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -104,6 +105,27 @@ class MLflowRun:
                 run = self._client.create_run(experiment_id, told.start_ms, tags, told.run_name)
                 self.run_id = run.info.run_id
 
+    def create_once(self, told: Told, mark: Sequence[str]) -> None:
+        """Create a run, or go on with the oldest one in its experiment that has the same values of some tags.
+
+        Of two processes that create it at once both go on with one run, and the other run is deleted.
+
+        Args:
+            told: of the run.
+            mark: the tags by which it is known.
+        """
+        sought = {key: told.tags[key] for key in mark}
+        with _told_apart():
+            oldest = self._oldest(self._experiment_id(told.experiment), sought)
+        if oldest is None:
+            self.create(told, again=False)
+            with _told_apart():
+                oldest = self._oldest(self._experiment_id(told.experiment), sought)
+                if oldest in (None, self.run_id):
+                    return
+                self._client.delete_run(self.run_id)
+        self.reopen(replace(told, run_id=oldest))
+
     def reopen(self, told: Told) -> None:
         """Go on with a run that another process recorded, whether or not MLflow has it already.
 
@@ -189,6 +211,11 @@ class MLflowRun:
             ):
                 return run.info.run_id
         return None
+
+    def _oldest(self, experiment_id: str, tags: Mapping[str, str]) -> str | None:
+        sought = " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
+        runs = self._client.search_runs([experiment_id], sought, ViewType.ACTIVE_ONLY)
+        return min(((run.info.start_time, run.info.run_id) for run in runs), default=(0, None))[1]
 
     def _has(self, point: Point) -> bool:
         """Return whether the store has a point of this key and step; the first call of a key asks it."""

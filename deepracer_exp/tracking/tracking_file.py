@@ -117,3 +117,18 @@ def read_told(path: Path) -> Told:
         if not isinstance(getattr(told, key), kind):
             raise BadInput(f"{path}: {key}: {getattr(told, key)!r} is not what a tracker writes")
     return told
+
+
+def begin_again(path: Path, run_dir: Path) -> None:
+    """Make a copied `tracking.json` that of a run which MLflow does not have yet.
+
+    Args:
+        path: the copy.
+        run_dir: where the run will lie.
+
+    Raises:
+        BadInput: as for `read_told`.
+    """
+    told = read_told(path)
+    tags = {**told.tags, "run_dir": str(run_dir.resolve())}
+    write_whole(path, json.dumps(asdict(replace(told, run_id=None, tags=tags)), indent=1) + "\n")

@@ -33,6 +33,7 @@ from .outcome import Outcome
 from .run_folder import RunFolder
 from .signals import Interruption
 from .training import SPENT, TIMES, Training, track_names
+from .watching import TakenOver, Watch
 
 __all__ = ["TIMES", "Outcome", "RunEnded", "read_files", "resume", "train"]
 
@@ -52,6 +53,7 @@ def train(
     composition: Composition,
     console: Console,
     start: tuple[ActorCritic, Lineage] | None = None,
+    watch: Watch | None = None,
 ) -> Outcome:
     """Train the experiment.
 
@@ -60,32 +62,36 @@ def train(
         composition: where it came from.
         console: for the view of the progress.
         start: networks to begin with, and whose they were; None: new ones.
+        watch: looks on.
 
     Returns:
         How it ended; a failed run's line is its `reason`.
 
     Raises:
         BadInput: before anything was started; no folder is left.
+        TakenOver: `watch` said so.
     """
     # From here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption() as interruption:
-        training = _begin(experiment, composition, console, start)
+        training = _begin(experiment, composition, console, start, watch)
         return _run(training, interruption)
 
 
-def resume(run_dir: Path, overrides: Sequence[str], console: Console) -> Outcome:
+def resume(run_dir: Path, overrides: Sequence[str], console: Console, watch: Watch | None = None) -> Outcome:
     """Go on with a run that ended before its time, from its last checkpoint.
 
     Args:
         run_dir: its folder.
         overrides: of values that change nothing of what it learns.
         console: for the view of the progress.
+        watch: looks on.
 
     Raises:
         BadInput: the run has come to its end, or is being trained, or cannot go on as it was.
+        TakenOver: `watch` said so.
     """
     with Interruption() as interruption:
-        return _run(_go_on(run_dir, overrides, console), interruption)
+        return _run(_go_on(run_dir, overrides, console, watch), interruption)
 
 
 def read_files(experiment: Experiment) -> RaceSetup:
@@ -104,6 +110,7 @@ def _begin(
     composition: Composition,
     console: Console,
     start: tuple[ActorCritic, Lineage] | None,
+    watch: Watch | None,
 ) -> Training:
     setup = read_files(experiment)
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
@@ -119,8 +126,10 @@ def _begin(
         commit = folder.describe(composition, setup.reward, experiment.seed, names)
         if lineage is not None:
             folder.write(LINEAGE, json.dumps(asdict(lineage), indent=2) + "\n")
-        training = Training(experiment, setup, folder, names, tracker, console)
-    except BadInput:
+        training = Training(experiment, setup, folder, names, tracker, console, watch)
+        if watch is not None:
+            watch.begins(folder.path)
+    except (BadInput, TakenOver):
         folder.remove()
         raise
     except OSError as error:
@@ -134,19 +143,24 @@ def _begin(
     for note in composition.notes:
         logger.info(note)
     tags = run_tags(names, commit, setup.reward.sha256, folder.path.resolve())
+    if lineage is not None:
+        tags |= lineage_tags(lineage)
+    if watch is not None:
+        tags |= watch.tags
     # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
     what = names["reward"] if lineage is None else f"clone {lineage.generation}"
+    title = f"{what} s{experiment.seed}" if watch is None else watch.title
     tracker.start(
-        f"{what} s{experiment.seed} {time.strftime('%H:%M:%S')}",
+        f"{title} {time.strftime('%H:%M:%S')}",
         experiment.name,
         run_params(names, composition.mapping),
-        tags if lineage is None else {**tags, **lineage_tags(lineage)},
+        tags,
         identity=folder.path / tracking_file.NAME,
     )
     return training
 
 
-def _go_on(run_dir: Path, overrides: Sequence[str], console: Console) -> Training:
+def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Watch | None) -> Training:
     stored = read_config(run_dir)
     names = read_object(run_dir / "provenance.json").get("names", {})
     composition = with_overrides(stored, names, overrides)
@@ -165,7 +179,7 @@ def _go_on(run_dir: Path, overrides: Sequence[str], console: Console) -> Trainin
     folder = RunFolder(run_dir)
     iteration = 0 if state is None else state["iteration"]
     try:
-        training = Training(experiment, setup, folder, names, tracker, console)
+        training = Training(experiment, setup, folder, names, tracker, console, watch)
         rows = [row for row in folder.metrics() if row["iteration"] <= iteration]
         if len(rows) != iteration:
             raise BadInput(
@@ -197,6 +211,9 @@ def _run(training: Training, interruption: Interruption) -> Outcome:
         return training.fail(str(error), error)
     except OSError as error:
         return training.fail(f"{error.filename or training.folder.path}: {error.strerror or error}", error)
+    except TakenOver:
+        training.let_go()
+        raise
     except KeyboardInterrupt:
         return training.break_off(interruption.exit_code or 130)
     except Exception as error:

@@ -134,6 +134,17 @@ class RunFolder:
         self._lock.close()
 
 
+def is_held(run_dir: Path) -> bool:
+    """Return whether a process trains in a run's folder."""
+    if not (run_dir / RUNNING).exists():
+        return False
+    try:
+        _held(run_dir / RUNNING).close()
+    except BadInput:
+        return True
+    return False
+
+
 def git_commit() -> str | None:
     """Return the commit of the checkout this code runs from, `-dirty` if changed, None outside a checkout."""
     root = Path(__file__).parents[2]

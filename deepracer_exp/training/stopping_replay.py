@@ -65,7 +65,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
         raise BadInput(f"{record.path / 'metrics.jsonl'}: has no iteration; nothing to apply a rule to")
     if isinstance(config, ReliableStopping):
         _check_memory(record, config)
-    stopping = Stopping(config, _action_count(record))
+    stopping = Stopping(config, action_count(record))
     decision, count = None, len(rows)
     for number, row in enumerate(rows, 1):
         decision = _observed(stopping, row, record, number)
@@ -142,7 +142,12 @@ def _check_memory(record: RunRecord, config: ReliableStopping) -> None:
         )
 
 
-def _action_count(record: RunRecord) -> int | None:
+def action_count(record: RunRecord) -> int | None:
+    """Return how many actions a run's policy chooses between, None for a continuous one.
+
+    Raises:
+        BadInput: its configuration does not tell.
+    """
     try:
         adapter: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
         space = adapter.validate_python(record.config.get("action_space"))

@@ -22,7 +22,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.formats.trace import TraceWriter, to_table
 from deepracer_exp.tracking.delivery import ENDS
-from deepracer_exp.tracking.names import joined
+from deepracer_exp.tracking.names import END_TAG, joined
 from deepracer_exp.tracking.recorder import Tracker
 
 from .alerts import Alerts
@@ -44,6 +44,7 @@ from .results import Results
 from .run_folder import RunFolder
 from .signals import Interruption
 from .stopping import Decision, Stopping
+from .watching import Watch
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -66,6 +67,7 @@ class Training:
         names: Mapping[str, str],
         tracker: Tracker,
         console: Console,
+        watch: Watch | None,
     ):
         """Build the networks and everything that watches over them.
 
@@ -76,13 +78,15 @@ class Training:
             names: what a racer calls the choices.
             tracker: has begun.
             console: for the view of the progress.
+            watch: looks on.
 
         Raises:
             BadInput: files or values of the evaluation or the budget cannot be used.
             OSError: the folder cannot be written.
         """
         self.experiment, self.setup, self.folder = experiment, setup, folder
-        self._names, self._tracker = names, tracker
+        self._names, self._tracker, self._watch = names, tracker, watch
+        self._beaten: str | None = None
         self.checkpoints = CheckpointStore(folder.path, experiment.checkpoints.keep)
         self._alerts = Alerts(experiment.budget)
         self._budget = Budget(experiment.budget, folder.path)
@@ -186,14 +190,21 @@ class Training:
         write_fault(self.folder.path, error)
         return self._end("failed", reason, RunFailed.exit_code, error)
 
+    def let_go(self) -> None:
+        """Leave the run to whoever goes on with it: nothing more is written into its folder."""
+        self._tracker.set_tag(END_TAG, "taken over")
+        self._tracker.finish("KILLED")
+        self._let_go()
+
     def break_off(self, exit_code: int) -> Outcome:
         """End at once: no checkpoint, which might be of a half-made update, and no pictures."""
         return self._end("interrupted", "ended at once by a second signal", exit_code)
 
     @property
     def verdict(self) -> str:
-        """What a run is that was not interrupted: `finished`, or `hopeless` by its stopping rule."""
-        return "hopeless" if self._decision is not None and self._decision.hopeless else "finished"
+        """What a run is that was not interrupted: `finished`, or `hopeless` by its stopping rule or its watch."""
+        hopeless = self._beaten if self._decision is None else self._decision.hopeless
+        return "hopeless" if hopeless else "finished"
 
     def _loop(self, collection: Collection, interruption: Interruption) -> str:
         algorithm = self.experiment.algorithm
@@ -213,6 +224,8 @@ class Training:
             self._iteration += 1
             self._row = self._measured(finished, update, batch.numel(), collect_s, update_s)
             mark = self._evaluated() if self._examination.is_due(self._iteration) else None
+            if self._watch is not None:
+                self._beaten = self._watch.sees(self._row)
             self._decision = self._stopping.observe(self._row)
             reason = self._reason_to_stop(interruption)
             if reason is not None and interruption.signum is None and self._best.policy is None:
@@ -278,14 +291,17 @@ class Training:
             if (self.checkpoints.folder / name).exists():
                 self._tracker.log_artifact((self.checkpoints.folder / name).resolve(), f"checkpoints/{name}")
         tags = self._decision.tags() if self._decision else {}
-        for tag, value in {**tags, "end": f"{status}: {reason}"}.items():
+        for tag, value in {**tags, END_TAG: f"{status}: {reason}"}.items():
             self._tracker.set_tag(tag, value)
         self._tracker.finish(ENDS.get(status, "KILLED"))
+        self._let_go()
+        return Outcome(status, reason, exit_code, path, summary, error)
+
+    def _let_go(self) -> None:
         self._alerts.close()
         self.folder.release()
         logger.removeHandler(self._log_file)
         self._log_file.close()
-        return Outcome(status, reason, exit_code, path, summary, error)
 
     def _learn(self, batch: TensorDictBase) -> UpdateMetrics:
         _, fraction = self._spent()
@@ -350,6 +366,8 @@ class Training:
             return "interrupted"
         if self._decision is not None:
             return str(self._decision)
+        if self._beaten is not None:
+            return self._beaten
         limit, fraction = self._spent()
         return f"{SPENT}: {limit}" if fraction >= 1 else None
 

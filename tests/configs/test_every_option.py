@@ -35,7 +35,8 @@ def test_the_groups_are_the_fields_of_an_experiment():
 
 def test_every_folder_of_options_belongs_to_an_entry_point():
     named = {group for entry in conf_dir().glob("*.yaml") for group in groups(entry.stem)}
-    assert named == {path.name for path in conf_dir().iterdir() if path.is_dir()}
+    folders = {path.parent.relative_to(conf_dir()).as_posix() for path in conf_dir().rglob("*.yaml")}
+    assert named == folders - {"."}
 
 
 @pytest.mark.parametrize(("group", "name"), EVERY_OPTION)

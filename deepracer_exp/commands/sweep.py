@@ -1,0 +1,123 @@
+"""`deepracer-exp sweep`: search for the values that race best."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from deepracer_exp.errors import BadInput
+
+_EPILOG = """\
+what is searched, in Hydra's grammar
+  deepracer-exp sweep algorithm.lr='tag(log,interval(1e-5,1e-3))' network=mlp_small,mlp
+  deepracer-exp sweep sweep=lr_entropy track=Oval_track     a ready-made sweep: lr_entropy, reward_weights,
+                                                            action_space, network, everything
+  KEY='interval(LOW,HIGH)'  'tag(log,interval(LOW,HIGH))'  'int(interval(LOW,HIGH))'  A,B  'range(FROM,BELOW,STEP)'
+  GROUP='glob(*)'                                           all options of a group
+
+how
+  sweep.trials=60 sweep.workers=2 sweep.seeds=3             trials in total, processes, seeds a trial
+  sweep.sampler=tpe                                         gp, cmaes, qmc, random, grid, nsga2
+  sweep.pruners=[entropy,median]                            also percentile, hyperband, wilcoxon; [] prunes nothing
+  sweep.objectives=[lap_time,completion]                    a Pareto front instead of one best trial
+  sweep.storage=postgresql+psycopg://USER@HOST/NAME         instead of runs/sweeps.db
+  parent=RUN                                                trials are clones of RUN
+
+  deepracer-exp sweep study=NAME                            goes on with a study that was interrupted or killed
+  deepracer-exp sweep study=NAME sweep.trials=120           makes more trials
+  deepracer-exp sweep report NAME                           writes the study's page and prints where it is
+  deepracer-exp sweep best NAME                             prints the winning command
+  deepracer-exp clone run=best:NAME                         trains on from the winner
+  deepracer-exp sweep sweep=NAME --cfg                      print the sweep and stop
+
+exit code: 0 all trials are made; 2 bad input; 3 all trials fail, or the database stays away; 130, 143 interrupted
+"""
+_WORDS = ("report", "best")
+
+
+def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    sweep = commands.add_parser(
+        "sweep",
+        help="search for the values that race best",
+        description="Train many cars, each with other values, and find the best.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    sweep.add_argument(
+        "overrides", nargs="*", metavar="KEY=EXPRESSION | GROUP=OPTION | KEY=VALUE | report NAME | best NAME"
+    )
+    sweep.add_argument("--cfg", action="store_true", help="print the composed sweep as YAML and stop")
+    sweep.add_argument(
+        "--runs-dir", default="runs", help="for report and best: where runs are (default: runs)"
+    )
+    sweep.add_argument("--storage", help="for report and best: the study's database, as in sweep.storage")
+    sweep.set_defaults(command=_sweep)
+
+
+def _sweep(args: argparse.Namespace) -> int:
+    if args.overrides and args.overrides[0] in _WORDS:
+        return _told(args)
+    from deepracer_exp.config.sweep import compose_sweep
+    from deepracer_exp.tracking.store import redact
+    from sweeps.process import PRELOADED
+
+    from .starting import start_workers_early
+
+    request = compose_sweep(args.overrides)
+    args.debug = request.entry.debug
+    if args.cfg:
+        # What the command line says of the training stands where a ready-made sweep has it.
+        request.composition.mapping["sweep"] |= {"train": list(request.base), "space": dict(request.space)}
+        print(redact(request.composition.yaml()), end="")
+        return 0
+    print("starting", file=sys.stderr, flush=True)
+    start_workers_early(True, PRELOADED)
+
+    from rich.console import Console
+
+    from sweeps.best import complete_trials
+    from sweeps.sweep import REPORT, sweep
+
+    from .stderr_warnings import warnings_on_stderr
+
+    with warnings_on_stderr():
+        study, folder, code = sweep(args.overrides, Console(stderr=True))
+    if code:
+        print(f"\ninterrupted; `deepracer-exp sweep study={study.study_name}` goes on", file=sys.stderr)
+        return code
+    if complete_trials(study):
+        _tell_best(study)
+    else:
+        print("no trial was worth finishing: all were pruned or failed")
+    print(f"\n  page  {folder / REPORT}")
+    return 0
+
+
+def _told(args: argparse.Namespace) -> int:
+    word, *names = args.overrides
+    if len(names) != 1:
+        raise BadInput(f"sweep {word}: one study is accepted, as in `deepracer-exp sweep {word} lr_entropy`")
+
+    from sweeps.report import write_report
+    from sweeps.storage import open_storage
+    from sweeps.study import load_study
+    from sweeps.sweep import REPORT
+
+    runs_dir = Path(args.runs_dir)
+    if args.storage is None and not (runs_dir / "sweeps.db").is_file():
+        raise BadInput(f"--runs-dir {runs_dir}: has no sweeps.db; give the folder, or --storage URL")
+    study = load_study(names[0], open_storage(args.storage, runs_dir))
+    if word == "best":
+        _tell_best(study)
+        return 0
+    print(write_report(study, runs_dir / study.study_name / REPORT))
+    return 0
+
+
+def _tell_best(study: object) -> None:
+    from sweeps.best import best_line, best_trial, best_values
+    from sweeps.labels import objectives_of, shown_values
+
+    trial = best_trial(study)  # type: ignore[arg-type]
+    values = shown_values(objectives_of(study), best_values(study))  # type: ignore[arg-type]
+    print(f"\nbest: trial {trial.number}, {values}\n\n  {best_line(study)}")  # type: ignore[arg-type]

@@ -1,0 +1,196 @@
+"""What a sweep expression searches: a list of choices, or a range of numbers."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+from hydra.core.override_parser.types import (
+    ChoiceSweep,
+    Glob,
+    IntervalSweep,
+    Override,
+    QuotedString,
+    RangeSweep,
+    Sweep,
+)
+
+from deepracer_exp.errors import BadInput, nearest
+
+from .options import groups, options
+from .overrides import override_line, parse_single, parse_sweep
+
+Number = int | float
+Choice = str | int | float | bool | None
+"""A number, a truth value or null as it is; anything else in the words of an override, quotes included."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """One of several values."""
+
+    values: tuple[Choice, ...]
+
+
+@dataclass(frozen=True)
+class Range:
+    """A number from `low` to `high`, both included; whole numbers are `int`."""
+
+    low: Number
+    high: Number
+    step: Number | None
+    """Distance of neighbours, counted from `low`; None: any number in between."""
+    log: bool
+    """Search it by orders of magnitude."""
+
+    def values(self) -> list[Number] | None:
+        """Return all values in ascending order; None where there is no end of them."""
+        if self.step is None:
+            return None
+        last = round((_exact(self.high) - _exact(self.low)) / _exact(self.step))
+        return [_at(self.low, self.step, at) for at in range(last + 1)]
+
+
+def dimension(key: str, expression: str) -> Choices | Range:
+    """Return what `KEY=EXPRESSION` searches, in Hydra's grammar.
+
+    Args:
+        key: of a value, or a group.
+        expression: ``a,b``, ``choice()``, ``range()``, ``interval()``, ``tag(log, interval())`` or ``glob()``.
+
+    Raises:
+        BadInput: it cannot be parsed, gives one value only, or nothing that could be searched.
+    """
+    override = parse_sweep(f"{key}={expression}")
+    if not override.is_sweep_override():
+        raise BadInput(
+            f"{key}={expression}: one value, nothing to search; accepted: A,B, choice(A,B), range(FROM,BELOW,STEP), "
+            "interval(LOW,HIGH), tag(log,interval(LOW,HIGH)) and glob(PATTERN)"
+        )
+    return _dimension(override)
+
+
+def plain_expression(override: Override, expression: str) -> str:
+    """Return a sweep's expression with the options in the place of a `glob`: later ones are of another search.
+
+    Raises:
+        BadInput: there is no such group, or no option fits.
+    """
+    glob = override.value()
+    if not isinstance(glob, Glob):
+        return expression
+    return f"choice({','.join(_options(override, glob))})"
+
+
+def as_override(key: str, value: Choice) -> str:
+    """Return the override that gives `key` a value of its dimension; floats are written with all their digits."""
+    if isinstance(value, bool):
+        return f"{key}={str(value).lower()}"
+    return f"{key}={value}" if isinstance(value, str) else override_line(key, value)
+
+
+def value_of(line: str) -> Any:
+    """Return the plain value that an override gives."""
+    return parse_single(line).value()
+
+
+def _dimension(override: Override) -> Choices | Range:
+    value = override.value()
+    line = override.input_line or ""
+    if isinstance(value, Glob):
+        return Choices(tuple(_options(override, value)))
+    assert isinstance(value, Sweep)
+    tags = value.tags - {"log"}
+    if tags or (value.tags and isinstance(value, ChoiceSweep)):
+        raise BadInput(
+            f"{line}: tag {', '.join(sorted(value.tags))}; accepted: log, of a range or an interval"
+        )
+    if isinstance(value, ChoiceSweep):
+        return _choices(line, value.list)
+    if isinstance(value, IntervalSweep):
+        assert value.start is not None
+        assert value.end is not None
+        return _interval(line, value.start, value.end, "log" in value.tags)
+    assert isinstance(value, RangeSweep)
+    assert value.start is not None
+    assert value.stop is not None
+    return _range(line, value.start, value.stop, value.step, "log" in value.tags)
+
+
+def _options(override: Override, glob: Glob) -> list[str]:
+    key, line = override.key_or_group, override.input_line
+    if key not in groups():
+        raise BadInput(
+            f"{line}: glob() is of a group's options, and {key} is no group{nearest(key, groups())}; "
+            f"groups: {', '.join(groups())}"
+        )
+    known = options(key)
+    fitting = glob.filter(known)
+    if not fitting:
+        raise BadInput(f"{line}: fits no {key}; options: {', '.join(known)}")
+    return [name if re.fullmatch(r"[\w-]+", name) else override_line("", name)[1:] for name in fitting]
+
+
+def _choices(line: str, elements: Sequence[Any]) -> Choices:
+    values: list[Choice] = []
+    for element in elements:
+        value: Choice = element
+        if isinstance(element, str | QuotedString | list | dict):
+            value = _in_words(element)
+        if value in values:
+            raise BadInput(f"{line}: {as_override('', value)[1:]} stands there twice")
+        values.append(value)
+    return Choices(tuple(values))
+
+
+def _in_words(element: str | QuotedString | list[Any] | dict[Any, Any]) -> str:
+    """Return what an override may have after its equals sign; choice() takes the quotes off its texts."""
+    words, plain = Override._get_value_element_as_str(element), Override._convert_value(element)
+    return words if value_of(f"key={words}") == plain else override_line("", plain)[1:]
+
+
+def _interval(line: str, low: Number, high: Number, log: bool) -> Range:
+    _check_finite(line, low, high)
+    if low >= high:
+        raise BadInput(f"{line}: the first number is the lower end; accepted: interval(LOW,HIGH), LOW < HIGH")
+    _check_log(line, low, log)
+    return Range(low, high, 1 if isinstance(low, int) and isinstance(high, int) else None, log)
+
+
+def _range(line: str, start: Number, stop: Number, step: Number, log: bool) -> Range:
+    _check_finite(line, start, stop, step)
+    count = 0 if step == 0 else math.ceil((_exact(stop) - _exact(start)) / _exact(step))
+    if count < 1:
+        raise BadInput(f"{line}: holds no value; accepted: range(FROM,BELOW,STEP)")
+    first, last = _at(start, step, 0), _at(start, step, count - 1)
+    low, high = min(first, last), max(first, last)
+    _check_log(line, low, log)
+    if log and (isinstance(low, float) or abs(step) != 1):
+        raise BadInput(
+            f"{line}: by orders of magnitude there are no steps; accepted: tag(log,interval(LOW,HIGH))"
+        )
+    return Range(low, high, abs(step), log)
+
+
+def _at(start: Number, step: Number, steps: int) -> Number:
+    """Return the number so many steps on, in decimals: three steps of 0.1 on from 0 is 0.3."""
+    if isinstance(start, int) and isinstance(step, int):
+        return start + steps * step
+    return float(_exact(start) + steps * _exact(step))
+
+
+def _exact(number: Number) -> Decimal:
+    return Decimal(repr(number))
+
+
+def _check_finite(line: str, *numbers: Number) -> None:
+    for number in numbers:
+        if not math.isfinite(number):
+            raise BadInput(f"{line}: {number} is no end of a range; accepted: finite numbers")
+
+
+def _check_log(line: str, low: Number, log: bool) -> None:
+    if log and low <= 0:
+        raise BadInput(f"{line}: {low} has no order of magnitude; accepted with tag(log, ...): ends above 0")

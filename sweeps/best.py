@@ -1,0 +1,120 @@
+"""The best trial of a study: its values, its line to paste, its run."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.best_of_sweep import BestOfSweep, write_best_of_sweep
+
+from .labels import MEASURES, objectives_of
+
+_LEAST_SHARE = 0.01  # of the lap; a trial that never moved must not divide by zero
+
+
+def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
+    """Return what trials are put in order by, lower is better.
+
+    One objective is its value. Of several the race score decides if it is one of them; else lap time over the share of
+    the lap driven, which comes near to seconds per complete lap: a fast car that seldom arrives is not the best.
+    """
+    by_name = dict(zip(objectives, values, strict=True))
+    if len(objectives) == 1:
+        (name,) = objectives
+        return by_name[name] if MEASURES[name].minimize else -by_name[name]
+    if "race_score" in by_name:
+        return by_name["race_score"]
+    return by_name["lap_time"] / max(by_name["completion"] / 100, _LEAST_SHARE)
+
+
+def reranked(study: optuna.Study) -> list[Mapping[str, Any]]:
+    """Return what the best trials came to on fresh laps, the best first; empty before that."""
+    objectives = objectives_of(study)
+    return sorted(study.user_attrs.get("reranked") or (), key=lambda one: cost(objectives, one["values"]))
+
+
+def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
+    """Return the complete trials, the best first; of equals the earlier one."""
+    objectives = objectives_of(study)
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    return sorted(trials, key=lambda trial: (cost(objectives, trial.values), trial.number))
+
+
+def best_trial(study: optuna.Study) -> FrozenTrial:
+    """Return the winner: the one the sweep has told, the first of those re-ranked, or the best complete trial.
+
+    Raises:
+        BadInput: no trial is complete.
+    """
+    complete = complete_trials(study)
+    if not complete:
+        raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
+    told = study.user_attrs.get("best") or next(iter(reranked(study)), {})
+    return next((trial for trial in complete if trial.number == told.get("trial")), complete[0])
+
+
+def best_values(study: optuna.Study) -> list[float]:
+    """Return the values of the best trial, those on fresh laps if it was re-ranked.
+
+    Raises:
+        BadInput: no trial is complete.
+    """
+    trial = best_trial(study)
+    again = next((one for one in reranked(study) if one["trial"] == trial.number), None)
+    return list(trial.values if again is None else again["values"])
+
+
+def best_line(study: optuna.Study) -> str:
+    """Return the command that trains with the winning values, quoted for a shell.
+
+    Raises:
+        BadInput: no trial is complete.
+    """
+    overrides = [str(override) for override in best_trial(study).user_attrs.get("overrides", ())]
+    if parent := study.user_attrs.get("parent"):
+        return shlex.join(["deepracer-exp", "clone", f"run={parent}", *overrides])
+    return shlex.join(["deepracer-exp", "train", *overrides])
+
+
+def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
+    """Return the folder of the best run of the best trial, of all its seeds.
+
+    Args:
+        study: with the runs of its trials.
+        runs_dir: where runs are; None: where the study says.
+
+    Raises:
+        BadInput: no trial is complete, or the folder is neither where it was nor in `runs_dir`.
+    """
+    trial, objectives = best_trial(study), objectives_of(study)
+    runs = [run for run in trial.user_attrs.get("runs", ()) if run.get("value") is not None]
+    best = min(runs, key=lambda run: cost(objectives, run["value"]), default=trial.user_attrs)
+    told = Path(best.get("run_dir") or "")
+    base = runs_dir or Path(study.user_attrs.get("runs_dir", "runs"))
+    places = [base / study.study_name / told.name, told]
+    found = next((place for place in places if (place / "config.yaml").is_file()), None)
+    if not told.name or found is None:
+        raise BadInput(
+            f"study {study.study_name}: {told} of trial {trial.number} is gone; give runs_dir= if the runs have moved"
+        )
+    return found
+
+
+def write_best(study: optuna.Study, runs_dir: Path) -> Path:
+    """Write best_of_sweep.json beside the study's runs, which `best:STUDY` finds its run by.
+
+    Raises:
+        BadInput: there is no best run, or it does not lie in the folder of the study's runs.
+    """
+    run, folder = best_run(study, runs_dir), runs_dir / study.study_name
+    if run.resolve().parent != folder.resolve():
+        raise BadInput(f"study {study.study_name}: its best run {run} does not lie in {folder}")
+    values = dict(zip(objectives_of(study), best_values(study), strict=True))
+    trial = best_trial(study).number
+    return write_best_of_sweep(
+        folder, BestOfSweep(study=study.study_name, trial=trial, run_dir=run.name, values=values)
+    )

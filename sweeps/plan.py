@@ -1,0 +1,36 @@
+"""What a worker is told when it begins."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.sweep import SweepConfig
+from deepracer_exp.tracking.store import Store
+
+from .space import SearchSpace
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """A sweep, as each of its workers knows it."""
+
+    study: str
+    runs_dir: Path
+    config: SweepConfig
+    protocol: EvaluationConfig
+    space: SearchSpace
+    parent: str | None
+    """The run that trials are clones of, as it was given."""
+    store: Store | None
+    """Where runs are recorded; None with `tracking=off`."""
+    study_run_id: str | None
+    """MLflow's id of the run of the whole study, None where it has none."""
+    evaluations: int | None
+    """How many a trial has on its way, None where that depends on the trial."""
+    cores: int
+    """For each worker."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the runs of the sweep are."""
+        return self.runs_dir / self.study

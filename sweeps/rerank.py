@@ -1,0 +1,127 @@
+"""The best trials of a sweep put to a test that did not choose them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.trial import FrozenTrial
+
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.result import USUAL, Evaluation, Group
+from deepracer_exp.evaluation.run import read_run
+
+from .best import complete_trials, cost
+from .plan import Plan
+from .score import values_of, without_lap
+
+_SEED = 30_011
+"""Of what conditions draw: no protocol of the project has it."""
+_SHIFT = 0.25
+"""Of the places where laps begin, as a share of their distance."""
+_RESAMPLES = 2000
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reranked:
+    """A trial driven anew."""
+
+    trial: int
+    """Its number in the study."""
+    values: list[float]
+    """Of the objectives, means over the trial's runs."""
+    interval: tuple[float, float]
+    """95 per cent interval of the first value, by bootstrap over laps; of one policy, not over training anew."""
+    lap_time_s: float | None
+    completion: float
+    held_out_completion: float | None
+
+
+def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
+    """Return a protocol's trials with starts and draws that no evaluation of the sweep had."""
+    starts = tuple((place + _SHIFT) / trials for place in range(trials))
+    return replace(protocol, trials=trials, seed=_SEED, starts=starts)
+
+
+def rerank(plan: Plan, study: optuna.Study, on_next: Callable[[FrozenTrial], None]) -> list[Reranked]:
+    """Let the best trials' best checkpoints drive fresh laps; return them in the order that comes out.
+
+    Args:
+        plan: of the sweep.
+        study: has its trials.
+        on_next: called with each trial before it drives.
+
+    Raises:
+        RunFailed: a car's state became NaN.
+    """
+    config = plan.config
+    protocol = fresh(plan.protocol, config.rerank_laps)
+    found = []
+    for trial in complete_trials(study)[: config.rerank]:
+        on_next(trial)
+        driven = [_driven(Path(run["run_dir"]), protocol) for run in trial.user_attrs["runs"]]
+        found.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
+    return sorted(found, key=lambda one: cost(config.objectives, one.values))
+
+
+def interval_of(
+    evaluations: Sequence[Evaluation], objective: str, trial_time_s: float
+) -> tuple[float, float]:
+    """Return the bootstrap interval of an objective, trials drawn anew within each track and each evaluation.
+
+    Args:
+        evaluations: of the policies whose mean is meant.
+        objective: its name.
+        trial_time_s: the longest that a trial may take.
+    """
+    groups = [group for one in evaluations for group in one.groups if group.condition == USUAL]
+    rng = np.random.default_rng(0)
+    draws = np.mean([_draws(group, objective, trial_time_s, rng) for group in groups], axis=0)
+    tail = 100 * (1 - _CONFIDENCE) / 2
+    low, high = np.percentile(draws, [tail, 100 - tail])
+    return float(low), float(high)
+
+
+def _draws(
+    group: Group, objective: str, trial_time_s: float, rng: np.random.Generator
+) -> "np.ndarray[Any, np.dtype[np.float64]]":
+    """Return the objective's value in each of the resamples, (n,)."""
+    place = {trial: at for at, trial in enumerate(group.trials)}
+    sums = np.zeros((4, len(place)))  # laps tried, complete ones, what counts of their time, progress
+    for attempt in group.decided:
+        time_s = attempt.time_s if objective == "race_score" or attempt.complete else 0.0
+        sums[:, place[attempt.trial]] += (1, attempt.complete, time_s, attempt.progress)
+    drawn = sums[:, rng.integers(len(place), size=(_RESAMPLES, len(place)))].sum(axis=2)
+    tried, laps, time_s, progress = drawn
+    completion = progress / tried
+    if objective == "completion":
+        return completion
+    nothing = np.array([without_lap(one, trial_time_s) for one in completion])
+    return np.where(laps > 0, time_s / np.maximum(laps, 1), nothing)
+
+
+def _driven(run_dir: Path, protocol: EvaluationConfig) -> Evaluation:
+    run = read_run(str(run_dir), run_dir.parent, None)
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.meant(None))
+    return Evaluator(run.experiment, protocol)(stored.networks.policy)
+
+
+def _reranked(
+    number: int, driven: Sequence[Evaluation], objectives: Sequence[str], trial_time_s: float
+) -> Reranked:
+    values = np.mean([values_of(one, objectives, trial_time_s) for one in driven], axis=0)
+    times = [time for one in driven if (time := one.on(USUAL).mean_lap_time_s) is not None]
+    held_out = [one.on("held_out").completion for one in driven if "held_out" in one.conditions]
+    return Reranked(
+        trial=number,
+        values=[float(value) for value in values],
+        interval=interval_of(driven, objectives[0], trial_time_s),
+        lap_time_s=float(np.mean(times)) if times else None,
+        completion=float(np.mean([one.on(USUAL).completion for one in driven])),
+        held_out_completion=float(np.mean(held_out)) if held_out else None,
+    )

@@ -1,0 +1,287 @@
+"""What a sweep searches: keys, their values, and with which options of a group a key counts."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
+from optuna.trial import BaseTrial, FixedTrial
+
+from deepracer_exp.config.compose import compose_experiment, validate
+from deepracer_exp.config.dimension import Choice, Choices, Range, as_override, dimension, value_of
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.options import groups
+from deepracer_exp.config.overrides import OPEN_MAPPINGS
+from deepracer_exp.config.sweep import SweepRequest
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.reward_source import load_reward_source
+from deepracer_exp.errors import BadInput
+
+Check = Callable[[list[str]], Mapping[str, Any]]
+"""Refuses overrides that no run accepts (BadInput) and returns all values of the run they make."""
+
+_CONSTANTS = "reward.constants"
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """One key that is searched."""
+
+    key: str
+    expression: str
+    distribution: BaseDistribution
+    group: str | None
+    """The group that the key is of, if that is searched, too."""
+    options: tuple[Choice, ...] | None
+    """Options of that group with which the key counts; None: always."""
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """All that is searched, and what all trials have in common."""
+
+    base: tuple[str, ...]
+    """Overrides of every trial."""
+    dimensions: tuple[Dimension, ...]
+    """Groups first, as other keys may depend on them."""
+
+    @classmethod
+    def from_request(cls, request: SweepRequest, check: Check | None = None) -> "SearchSpace":
+        """Find out what can be searched; every choice and both ends of every range are tried, each alone.
+
+        Args:
+            request: a sweep as it was asked for.
+            check: how overrides are tried; None: as a training from scratch does.
+
+        Raises:
+            BadInput: there is nothing to search, a key does not exist, or no run accepts one of its values.
+        """
+        if not request.space:
+            raise BadInput(
+                "sweep: nothing to search; write KEY='interval(LOW,HIGH)', KEY=A,B or sweep=NAME, such as "
+                "sweep=lr_entropy"
+            )
+        found = {key: dimension(key, text) for key, text in request.space.items()}
+        trials = _Trials(request.base, check, found)
+        dimensions = [
+            Dimension(key, request.space[key], _distribution(what), *trials.condition(key))
+            for key, what in sorted(found.items(), key=lambda item: item[0] not in groups())
+            if key not in request.optional or trials.is_known(key)
+        ]
+        for one in dimensions:
+            trials.check(one)
+        return cls(request.base, tuple(dimensions))
+
+    def suggest(self, trial: BaseTrial) -> list[str]:
+        """Return the overrides of a trial; the same values give the same overrides, to the last digit."""
+        chosen: dict[str, Choice] = {}
+        for one in self.dimensions:
+            if one.options is None or (one.group and chosen[one.group] in one.options):
+                chosen[one.key] = _suggested(trial, one)
+        return [*self.base, *(as_override(key, value) for key, value in chosen.items())]
+
+    def example(self) -> list[str]:
+        """Return the overrides of a trial with the first choices and the lower ends."""
+        values = {one.key: _first(one.distribution) for one in self.dimensions}
+        return self.suggest(FixedTrial(values))
+
+    def as_text(self) -> dict[str, str]:
+        """Return the expressions by key."""
+        return {one.key: one.expression for one in self.dimensions}
+
+    def difference(self, other: Mapping[str, str]) -> list[str]:
+        """Return a line for each key that another space searches otherwise.
+
+        Args:
+            other: its expressions by key, as of `as_text`.
+        """
+        own, lines = self.as_text(), []
+        for key in dict.fromkeys([*other, *own]):
+            before, now = other.get(key), own.get(key)
+            if before is None or now is None:
+                lines.append(f"{key}: {before or 'not searched'} -> {now or 'not searched'}")
+            elif before != now and dimension(key, before) != dimension(key, now):
+                lines.append(f"{key}: {before} -> {now}")
+        return lines
+
+    def grid(self) -> dict[str, list[Choice]]:
+        """Return all values by key.
+
+        Raises:
+            BadInput: there is no end of the values of a key, or a key counts with some options only.
+        """
+        grid: dict[str, list[Choice]] = {}
+        for one in self.dimensions:
+            if one.options is not None:
+                raise BadInput(
+                    f"sweep.sampler=grid: {one.key} counts only with {one.group}={','.join(map(str, one.options))}, "
+                    "and a grid knows no conditions; accepted: another sampler, or one option"
+                )
+            what = dimension(one.key, one.expression)
+            values = list(what.values) if isinstance(what, Choices) else what.values()
+            if values is None:
+                raise BadInput(
+                    f"sweep.sampler=grid: {one.key}={one.expression} has values without end; accepted: A,B, "
+                    "range(FROM,BELOW,STEP), int(interval(LOW,HIGH)), or another sampler"
+                )
+            grid[one.key] = list(values)
+        return grid
+
+
+class _Trials:
+    """Experiments composed for trying values."""
+
+    def __init__(self, base: Sequence[str], check: Check | None, found: Mapping[str, Choices | Range]):
+        self._base, self._found = list(base), found
+        self._is_composed = check is None
+        self._check = check or _compose
+        self._made: dict[tuple[str, ...], Mapping[str, Any]] = {}
+        self._context: dict[str, str] = {}
+        try:
+            self._values({})
+        except BadInput as error:
+            # Perhaps only with what is searched the base is complete, as with one of two keys set to null.
+            self._context = {key: _lines(key, what)[0] for key, what in found.items() if not self._group(key)}
+            try:
+                self._values({})
+            except BadInput as with_context:
+                of_base = not any(key in str(with_context) for key in self._context)
+                raise error if of_base else with_context from None
+
+    def condition(self, key: str) -> tuple[str | None, tuple[Choice, ...] | None]:
+        """Return the searched group that the key is of, and those of its options that have the key; None: all."""
+        group = self._group(key)
+        if group is None:
+            return None, None
+        every = self._options(group)
+        having = tuple(option for option in every if self._has(self._with(group, option), key))
+        return group, having if having and len(having) < len(every) else None
+
+    def is_known(self, key: str) -> bool:
+        """Return whether any of the options that are searched or chosen has the key."""
+        group = self._group(key)
+        if group is None:
+            return self._has(self._values({}), key)
+        return any(self._has(self._with(group, option), key) for option in self._options(group))
+
+    def check(self, one: Dimension) -> None:
+        """Refuse a key that does not exist and values that no run accepts."""
+        what = self._found[one.key]
+        options: Sequence[Choice | None] = [None]
+        if one.group is not None:
+            options = one.options or self._options(one.group)
+        for option in options:
+            context = {} if one.group is None else {one.group: as_override(one.group, option)}
+            for line in _lines(one.key, what):
+                self._try(context, one, line)
+
+    def _try(self, context: Mapping[str, str], one: Dimension, line: str) -> None:
+        try:
+            values = self._values(context)
+            if self._is_composed and one.key not in groups() and _place(values, one.key) is not None:
+                # Composing takes a hundred times as long as setting a value.
+                changed = copy.deepcopy(dict(values))
+                _set(changed, one.key, value_of(line))
+                _read(validate(changed))
+            else:
+                self._values({**context, one.key: line})
+        except BadInput as error:
+            message = str(error)
+            if "no such" not in message:
+                message = f"{one.key}={one.expression}: {message}"
+            if "valid integer" in message and isinstance(self._found[one.key], Range):
+                message += f"; of whole numbers: {one.key}='int({one.expression})'"
+            raise BadInput(message) from None
+
+    def _values(self, lines: Mapping[str, str]) -> Mapping[str, Any]:
+        """Return all values of the base with these overrides by key.
+
+        Raises:
+            BadInput: no run accepts them.
+        """
+        overrides = (*self._base, *{**self._context, **lines}.values())
+        if overrides not in self._made:
+            self._made[overrides] = self._check(list(overrides))
+        return self._made[overrides]
+
+    def _with(self, group: str, option: Choice) -> Mapping[str, Any]:
+        return self._values({group: as_override(group, option)})
+
+    def _options(self, group: str) -> tuple[Choice, ...]:
+        what = self._found[group]
+        return what.values if isinstance(what, Choices) else tuple(what.values() or ())
+
+    def _group(self, key: str) -> str | None:
+        group, dot, _ = key.partition(".")
+        return group if dot and group in self._found and group in groups() else None
+
+    def _has(self, values: Mapping[str, Any], key: str) -> bool:
+        if key.startswith(f"{_CONSTANTS}."):
+            reward = validate(dict(values)).reward
+            return key.removeprefix(f"{_CONSTANTS}.") in load_reward_source(reward).constants
+        return _place(values, key) is not None
+
+
+def _compose(overrides: list[str]) -> Mapping[str, Any]:
+    experiment, composition = compose_experiment(overrides)
+    _read(experiment)
+    return composition.mapping
+
+
+def _read(experiment: Experiment) -> None:
+    """Refuse what a run would refuse as soon as it begins."""
+    load_reward_source(experiment.reward)
+    build_action_space(experiment.action_space)
+
+
+def _place(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:
+    """Return the mapping that a key is in; None if there is no such key."""
+    parent, _, leaf = key.rpartition(".")
+    node: Any = values
+    for part in parent.split(".") if parent else ():
+        node = node.get(part) if isinstance(node, dict) else None
+    return node if isinstance(node, dict) and (leaf in node or parent in OPEN_MAPPINGS) else None
+
+
+def _set(values: dict[str, Any], key: str, value: Any) -> None:
+    place = _place(values, key)
+    assert place is not None
+    place[key.rpartition(".")[2]] = value
+
+
+def _lines(key: str, what: Choices | Range) -> list[str]:
+    """Return overrides for all choices, or for both ends."""
+    values = what.values if isinstance(what, Choices) else (what.low, what.high)
+    return [as_override(key, value) for value in values]
+
+
+def _distribution(what: Choices | Range) -> BaseDistribution:
+    if isinstance(what, Choices):
+        return CategoricalDistribution(what.values)
+    if isinstance(what.low, int) and isinstance(what.high, int):
+        return IntDistribution(what.low, what.high, log=what.log, step=int(what.step or 1))
+    return FloatDistribution(what.low, what.high, log=what.log, step=what.step)
+
+
+def _first(what: BaseDistribution) -> Choice:
+    if isinstance(what, CategoricalDistribution):
+        return what.choices[0]
+    assert isinstance(what, FloatDistribution | IntDistribution)
+    return what.low
+
+
+def _suggested(trial: BaseTrial, one: Dimension) -> Choice:
+    what = one.distribution
+    if isinstance(what, IntDistribution):
+        return trial.suggest_int(one.key, what.low, what.high, step=what.step, log=what.log)
+    if isinstance(what, FloatDistribution):
+        return trial.suggest_float(one.key, what.low, what.high, step=what.step, log=what.log)
+    assert isinstance(what, CategoricalDistribution)
+    value: Choice = trial.suggest_categorical(one.key, what.choices)
+    return value

@@ -1,0 +1,242 @@
+"""A sweep from its overrides to its winner."""
+
+import collections
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.study import Study
+from optuna.trial import FrozenTrial
+from rich.console import Console
+
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.running import TrackingOff
+from deepracer_exp.config.sweep import SweepRequest, compose_sweep
+from deepracer_exp.env.reward import RewardFunction
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.tracking.store import Store, resolve_store
+from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
+from deepracer_exp.tracking.tracking_file import Status
+from deepracer_exp.training.signals import Interruption
+
+from .best import best_line, best_trial, best_values, complete_trials, write_best
+from .driver import Driver
+from .ledger import Ledger, Slot
+from .plan import Plan
+from .pruners import build_pruner
+from .samplers import build_sampler
+from .space import SearchSpace
+from .storage import Storage, open_storage, patiently
+from .study import completed, find_study, open_study
+from .table import SweepView
+from .telling import tell_settled, tell_strays
+
+REPORT = "sweep.html"
+"""A study's page, in the folder of its runs."""
+
+
+def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]:
+    """Make the trials of a study that are still missing.
+
+    Args:
+        overrides: as given on the command line.
+        console: stderr's, for the view.
+
+    Returns:
+        The study, the folder of its runs, and the exit code.
+
+    Raises:
+        BadInput: before anything is begun; nothing is left.
+        RunFailed: all trials fail, or the database stays away.
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    request = compose_sweep(overrides)
+    runs_dir = _runs_dir(request)
+    # Before anything is searched for: a study of that name knows itself what it searches.
+    known = _known(request, runs_dir)
+    if known is not None:
+        overrides = completed(overrides, known)
+        request = compose_sweep(overrides)
+    config = request.entry.sweep
+    protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
+    request = _without_rules(request)
+    space = SearchSpace.from_request(request, _check(request, runs_dir))
+    build_sampler(config, space)
+    build_pruner(config)
+    experiment = _experiment(request, space, runs_dir)
+    storage = open_storage(config.storage, runs_dir)
+    study = open_study(request, overrides, space, storage, runs_dir)
+    workers = config.workers or _cores()
+    study_run = open_study_run(experiment.tracking, runs_dir, request.study, space.as_text(), request.base)
+    plan = Plan(
+        study=request.study,
+        runs_dir=runs_dir,
+        config=config,
+        protocol=protocol,
+        space=space,
+        parent=request.entry.parent,
+        store=_store(experiment, runs_dir),
+        study_run_id=None if study_run is None else study_run.wait_for_id(),
+        evaluations=_evaluations(experiment),
+        cores=max(1, _cores() // workers),
+    )
+    if plan.study_run_id is not None:
+        study.set_user_attr("mlflow_run_id", plan.study_run_id)
+    status: Status = "FAILED"
+    try:
+        code = _driven(plan, storage, study, workers, console, study_run)
+        status = "KILLED" if code else "FINISHED"
+    finally:
+        if study_run is not None:
+            study_run.finish(status)
+    return study, plan.folder, code
+
+
+def _driven(
+    plan: Plan, storage: Storage, study: Study, workers: int, console: Console, study_run: StudyRun | None
+) -> int:
+    ledger, patience_s = Ledger(storage.engine, plan.study), plan.config.patience_s
+
+    def record(slots: Sequence[Slot]) -> None:
+        if study_run is not None:
+            study_run.update(_progress(slots, plan, study))
+
+    with Interruption() as interruption, SweepView(plan, workers, console) as view:
+        slots = patiently(ledger.slots, patience_s)
+        view.show(slots)
+        if not ledger.is_done(plan.config.trials):
+            code = Driver(plan, storage, workers, view, record).run(interruption)
+            if code is not None:
+                return code
+        for call in (tell_settled, tell_strays):
+            patiently(partial(call, plan.study, ledger, storage.optuna), patience_s)
+        _conclude(plan, study, view, ledger)
+        record(patiently(ledger.slots, patience_s))
+    if study_run is not None:
+        study_run.pictures([plan.folder / REPORT])
+    return 0
+
+
+def _progress(slots: Sequence[Slot], plan: Plan, study: Study) -> Progress:
+    """Return how far the study is, for MLflow."""
+    counts = collections.Counter(slot.outcome for slot in slots)
+    steps = sum(slot.attrs.get("env_steps", 0) for slot in slots)
+    told: dict[str, Any] = {
+        "total": plan.config.trials,
+        "complete": counts["COMPLETE"],
+        "pruned": counts["PRUNED"],
+        "failed": counts["FAIL"],
+        "env_steps": steps,
+    }
+    if not complete_trials(study):
+        return Progress(**told)
+    best = best_trial(study)
+    return Progress(
+        **told,
+        best_trial=best.number,
+        best_values=dict(zip(plan.config.objectives, best_values(study), strict=True)),
+        best_line=best_line(study),
+        lap_time_s=best.user_attrs.get("lap_time_s"),
+        completion=best.user_attrs.get("completion"),
+    )
+
+
+def _conclude(plan: Plan, study: Study, view: SweepView, ledger: Ledger) -> None:
+    """Find the winner, and write what is told of the study."""
+    # Both take seconds to import, and workers shall begin before.
+    from .report import write_report
+
+    if complete_trials(study) and plan.config.rerank:
+        import torch
+
+        from .rerank import rerank
+
+        torch.set_num_threads(1)
+
+        def tell(trial: FrozenTrial) -> None:
+            view.stage = f"trial {trial.number} drives {plan.config.rerank_laps} fresh laps"
+            view.show(ledger.slots())
+
+        again = [{**asdict(one), "interval": list(one.interval)} for one in rerank(plan, study, tell)]
+        study.set_user_attr("reranked", again)
+        view.stage = ""
+        view.show(ledger.slots())
+    if complete_trials(study):
+        write_best(study, plan.runs_dir)
+    write_report(study, plan.folder / REPORT)
+
+
+def _runs_dir(request: SweepRequest) -> Path:
+    given = [line.partition("=")[2] for line in request.base if line.partition("=")[0] == "runs_dir"]
+    return Path(compose_experiment([f"runs_dir={given[-1]}"] if given else [])[0].runs_dir)
+
+
+def _known(request: SweepRequest, runs_dir: Path) -> Study | None:
+    """Return the study that is asked for by its name, if it is there; no file is made for looking."""
+    if request.entry.study is None:
+        return None
+    if request.entry.sweep.storage is None and not (runs_dir / "sweeps.db").exists():
+        return None
+    return find_study(request.study, open_storage(request.entry.sweep.storage, runs_dir))
+
+
+def _without_rules(request: SweepRequest) -> SweepRequest:
+    """Let trials end by their stopping rule only where the pruner `entropy` is asked for."""
+    told = {line.partition("=")[0].lstrip("+~").partition(".")[0] for line in (*request.base, *request.space)}
+    if "entropy" in request.entry.sweep.pruners or "stopping" in told:
+        return request
+    return replace(request, base=(*request.base, "stopping=none"))
+
+
+def _check(request: SweepRequest, runs_dir: Path) -> Any:
+    """Return what tries overrides: None as a training does, else as clones of the parent do."""
+    parent = request.entry.parent
+    if parent is None:
+        return None
+
+    from deepracer_exp.training.clone import prepare_clone
+
+    def check(overrides: list[str]) -> Mapping[str, Any]:
+        clone = prepare_clone([f"run={parent}", *overrides, f"name={request.study}"], runs_dir, None)
+        return clone.composition.mapping
+
+    return check
+
+
+def _experiment(request: SweepRequest, space: SearchSpace, runs_dir: Path) -> Experiment:
+    """Return the experiment of one trial, and read its files."""
+    if request.entry.parent is not None:
+        from deepracer_exp.training.clone import prepare_clone
+
+        line = [f"run={request.entry.parent}", *space.example(), f"name={request.study}"]
+        return prepare_clone(line, runs_dir, None).experiment
+    experiment, _ = compose_experiment(space.example())
+    setup = build_setup(experiment)
+    RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
+    return experiment
+
+
+def _store(experiment: Experiment, runs_dir: Path) -> Store | None:
+    tracking = experiment.tracking
+    return None if isinstance(tracking, TrackingOff) else resolve_store(tracking.uri, runs_dir)
+
+
+def _evaluations(experiment: Experiment) -> int | None:
+    """Return how often a trial is evaluated on its way, None where the number of its iterations is not known."""
+    every, algorithm, budget = experiment.checkpoints.every, experiment.algorithm, experiment.budget
+    if every is None or algorithm.frames_per_iteration is None:
+        return None
+    limits = [budget.iterations] if budget.iterations is not None else []
+    if budget.env_steps is not None:
+        limits.append(-(-budget.env_steps // algorithm.frames_per_iteration))
+    return min(limits) // every if limits else None
+
+
+def _cores() -> int:
+    """Return the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,263 @@
+import dataclasses
+import re
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.dimension import Choices, Range, as_override, dimension, value_of
+from deepracer_exp.config.options import conf_dir, options
+from deepracer_exp.config.overrides import parse_single
+from deepracer_exp.config.sweep import SweepConfig, SweepEntry, compose_sweep
+from deepracer_exp.errors import BadInput
+
+READY = [name for name in options("sweep") if name != "own"]
+FILES = ["sweep", *(f"sweep/{name}" for name in options("sweep")), "sweep/executor/local"]
+
+
+def refusal(*overrides: str) -> str:
+    with pytest.raises(BadInput) as caught:
+        compose_sweep(overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def refused_dimension(key: str, expression: str) -> str:
+    with pytest.raises(BadInput) as caught:
+        dimension(key, expression)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# --- The files
+
+
+@pytest.mark.parametrize("name", options("sweep"))
+def test_every_ready_made_sweep_has_the_keys_of_its_dataclass(name):
+    request = compose_sweep([f"sweep={name}"])
+    mapping = request.composition.mapping
+    assert set(mapping) == {field.name for field in dataclasses.fields(SweepEntry)}
+    assert set(mapping["sweep"]) == {field.name for field in dataclasses.fields(SweepConfig)}
+    assert request.composition.choices == {"sweep": name, "sweep/executor": "local"}
+    assert request.space.keys() == mapping["sweep"]["space"].keys()
+    assert bool(request.space) == (name != "own")
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_key_is_explained(file):
+    lines = (conf_dir() / f"{file}.yaml").read_text().splitlines()
+    for above, line in zip(["", *lines], lines, strict=False):
+        if re.match(r"(?!defaults)\w+:", line):
+            assert above.startswith("#"), f"{file}: {line} has no comment above it"
+
+
+def test_trials_are_judged_by_twenty_laps_on_both_conditions():
+    protocol = compose_experiment([f"evaluation={compose_sweep([]).entry.sweep.protocol}"])[0].evaluation
+    assert (protocol.trials, protocol.usual, protocol.held_out) == (20, "none", "sim2real")
+
+
+# --- What is whose
+
+
+def test_overrides_are_of_the_sweep_of_every_trial_or_searched():
+    request = compose_sweep(
+        [
+            *("study=mine", "sweep.trials=7", "sweep/executor=local", "parent=best:a b", "debug=true"),
+            *("track=Oval_track", "algorithm.lr=tag(log, interval(1e-5, 1e-3))", "network=mlp,mlp_deep"),
+        ]
+    )
+    entry = request.entry
+    assert (entry.study, entry.parent, entry.debug, entry.sweep.trials) == ("mine", "best:a b", True, 7)
+    assert request.base == ("collector=in_process", "track=Oval_track")
+    assert request.space == {
+        "algorithm.lr": "tag(log, interval(1e-5, 1e-3))",
+        "network": "mlp,mlp_deep",
+    }
+
+
+def test_a_study_is_named_after_the_ready_made_sweep_unless_it_has_a_name():
+    assert compose_sweep(["sweep=network"]).study == "network"
+    assert compose_sweep(["seed=3"]).study == "sweep"
+    assert compose_sweep(["sweep=network", "study=2024"]).study == "2024"
+
+
+def test_the_address_of_a_database_needs_no_quotes():
+    address = "postgresql+psycopg://racer:p,w=(1)@host:5432/db?sslmode=require&x=1"
+    assert compose_sweep([f"sweep.storage={address}"]).entry.sweep.storage == address
+
+
+def test_the_command_line_takes_the_place_of_what_a_ready_made_sweep_searches():
+    ready = yaml.safe_load((conf_dir() / "sweep/lr_entropy.yaml").read_text())["space"]
+    request = compose_sweep(
+        ["sweep=lr_entropy", "algorithm.lr=0.001", "algorithm.entropy_coeff=0.01,0.02", "budget=short"]
+    )
+    assert "algorithm.lr" in ready
+    assert request.space == {"algorithm.entropy_coeff": "0.01,0.02"}
+    assert request.base[-2:] == ("algorithm.lr=0.001", "budget=short")
+
+
+def test_the_command_line_takes_the_place_of_what_a_ready_made_sweep_fixes():
+    request = compose_sweep(["sweep=lr_entropy", "budget.env_steps=10000,20000", "collector=sync"])
+    assert request.base == ("collector=sync",)
+    assert request.space["budget.env_steps"] == "10000,20000"
+
+
+def test_the_last_of_two_overrides_counts_whether_it_fixes_or_searches():
+    assert compose_sweep(["algorithm.lr=0.1,0.2", "algorithm.lr=0.3"]).space == {}
+    request = compose_sweep(["algorithm.lr=0.3", "+algorithm.lr=0.1,0.2"])
+    assert request.space == {"algorithm.lr": "0.1,0.2"}
+    assert request.base == ("collector=in_process",)
+
+
+def test_a_key_is_left_out_of_the_search_by_a_tilde():
+    request = compose_sweep(["sweep=lr_entropy", "~algorithm.lr"])
+    assert list(request.space) == ["algorithm.entropy_coeff"]
+    assert not any("algorithm.lr" in line for line in request.base)
+
+
+def test_ready_made_keys_of_a_group_chosen_on_the_command_line_are_optional():
+    request = compose_sweep(
+        ["sweep=everything", "action_space=grid", "action_space.speed_levels=2,3", "network=mlp,mlp_deep"]
+    )
+    of_both = {key for key in request.space if key.startswith(("action_space.", "network."))}
+    assert request.optional == of_both - {"action_space.speed_levels"}
+    assert compose_sweep(["sweep=everything"]).optional == frozenset()
+
+
+def test_an_options_pattern_stands_for_the_options_of_today():
+    request = compose_sweep(["network=glob([mlp_*], exclude=*_shared)"])
+    assert request.space == {"network": "choice(mlp_deep,mlp_small)"}
+    assert dimension("track", "glob(2022*)") == Choices(("2022_summit_speedway",))
+
+
+# --- What is refused
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("sweep.workers=0", ["sweep.workers=0", "greater than or equal to 1"]),
+        ("sweep.trials=0", ["sweep.trials=0", "greater than or equal to 1"]),
+        ("sweep.trails=3", ["sweep.trails: no such key", "did you mean trials?"]),
+        ("sweep=lr_entropi", ["no such sweep (did you mean lr_entropy?)"]),
+        ("sweep/executor=loca", ["no such sweep/executor (did you mean local?)"]),
+        ("sweep.protocol=three_trial", ["no such evaluation (did you mean three_trials?)"]),
+        ("sweep.sampler=tpe2", ["sweep.sampler", "'tpe'"]),
+        ("sweep.sampler=tpe,gp", ["one value is accepted"]),
+        ("sweep.pruners=entropy,median", ["sweep.pruners=[entropy,median]"]),
+        ("sweep.pruners=[entropy,entropy]", ["stands there twice"]),
+        ("sweep.objectives=[]", ["sweep.objectives"]),
+        ("sweep.space.seed=1", ["write the key itself"]),
+        ("study=a/b", ["letters, digits"]),
+        ("name=x", ["study=NAME"]),
+        ("name=x,y", ["study=NAME"]),
+        ("seed=1,2", ["sweep.seeds"]),
+        ("tracking.uri=a,b", ["cannot be searched"]),
+        ("sweep.train=['seed=1,2']", ["sweep.train: seed=1,2", "sweep.space"]),
+        ("network=glob(x*)", ["fits no network", "mlp_small"]),
+        ("netwrk=glob(*)", ["did you mean network?"]),
+        ("algorithm.lr=interval(1,", ["GROUP=OPTION or KEY=VALUE"]),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_what_would_do(override, parts):
+    message = refusal(override)
+    for part in parts:
+        assert part in message
+
+
+def test_a_value_of_a_ready_made_space_must_be_searched(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf/sweep").mkdir(parents=True)
+    file = tmp_path / "conf/sweep/mine.yaml"
+    file.write_text("defaults: [own, _self_]\nspace: {algorithm.lr: '0.1'}\n")
+    assert "nothing to search" in refusal("sweep=mine")
+    file.write_text("defaults: [own, _self_]\nspace: {algorithm.lr: '0.1,0.2'}\n")
+    assert compose_sweep(["sweep=mine"]).space == {"algorithm.lr": "0.1,0.2"}
+
+
+# --- Dimensions
+
+
+@pytest.mark.parametrize(
+    ("expression", "found"),
+    [
+        ("interval(0, 0.05)", Range(0.0, 0.05, None, False)),
+        ("interval(1, 10)", Range(1.0, 10.0, None, False)),
+        ("int(interval(1, 10))", Range(1, 10, 1, False)),
+        ("tag(log, interval(1e-5, 1e-3))", Range(1e-5, 1e-3, None, True)),
+        ("tag(log, int(interval(1, 1000)))", Range(1, 1000, 1, True)),
+        ("range(5)", Range(0, 4, 1, False)),
+        ("range(5, 12, 2)", Range(5, 11, 2, False)),
+        ("range(10, 0, -3)", Range(1, 10, 3, False)),
+        ("range(0.1, 0.5, 0.1)", Range(0.1, 0.4, 0.1, False)),
+        ("range(0, 1, 0.3)", Range(0.0, 0.9, 0.3, False)),
+        ("7,2.5,true,null,mlp", Choices((7, 2.5, True, None, "mlp"))),
+        ("choice('1', [1,2], {a:1})", Choices(("'1'", "[1,2]", "{a:1}"))),
+        ("shuffle(3,1,2)", Choices((3, 1, 2))),
+    ],
+)
+def test_an_expression_is_choices_or_a_range(expression, found):
+    assert dimension("seed", expression) == found
+    assert repr(dimension("seed", expression)) == repr(found)  # 1 and 1.0 are not the same
+
+
+def test_a_range_is_all_its_values():
+    assert Range(0.1, 0.4, 0.1, False).values() == [0.1, 0.2, 0.3, 0.4]
+    assert Range(1, 10, 3, False).values() == [1, 4, 7, 10]
+    assert Range(0.1, 0.4, None, False).values() is None
+
+
+@pytest.mark.parametrize(
+    ("expression", "part"),
+    [
+        ("interval(5, 1)", "LOW < HIGH"),
+        ("interval(1, 1)", "LOW < HIGH"),
+        ("interval(0, inf)", "finite"),
+        ("range(0, inf, 0.1)", "finite"),
+        ("range(3, 1)", "holds no value"),
+        ("range(3, 2.5)", "holds no value"),
+        ("range(1, 5, 0)", "holds no value"),
+        ("tag(log, interval(0, 1))", "above 0"),
+        ("tag(log, range(1, 100, 2))", "no steps"),
+        ("tag(lin, interval(0, 1))", "accepted: log"),
+        ("tag(log, choice(1, 2))", "accepted: log"),
+        ("1,2,1", "twice"),
+        ("0.1", "nothing to search"),
+        ("[1,2]", "nothing to search"),
+    ],
+)
+def test_a_search_of_nothing_is_refused(expression, part):
+    message = refused_dimension("algorithm.lr", expression)
+    assert message.startswith("algorithm.lr=")
+    assert part in message
+
+
+def test_a_range_of_any_length_is_read_at_once():
+    assert dimension("seed", "range(0, 1e15, 0.1)") == Range(0.0, 999999999999999.9, 0.1, False)
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False) | st.integers() | st.booleans() | st.none())
+def test_a_value_is_written_to_its_last_digit(value):
+    read = value_of(as_override("algorithm.lr", value))
+    assert (type(read), read) == (type(value), value)
+
+
+@pytest.mark.parametrize(
+    "expression",
+    ["'a b',\"c,d\",plain", "[1,'x y'],[2]", "null,'null',1,'1'", "choice('null','1','x y',[1,'2'])"],
+)
+def test_a_choice_is_written_as_it_is_read(expression):
+    what = dimension("track.title", expression)
+    assert isinstance(what, Choices)
+    lines = [as_override("track.title", value) for value in what.values]
+    assert len({repr(parse_single(line).value()) for line in lines}) == len(what.values)
+
+
+def test_paths_are_searched_as_they_are_typed():
+    what = dimension("reward.file", "mein Lohn.py,größer (2).py")
+    assert isinstance(what, Choices)
+    lines = [as_override("reward.file", value) for value in what.values]
+    assert [value_of(line) for line in lines] == ["mein Lohn.py", "größer (2).py"]

@@ -1,0 +1,227 @@
+"""kill -9 and SIGSTOP of a sweep's processes: every trial is accounted for once, whatever happens.
+
+`FAULT_TIMES=20` lets each of them happen twenty times (`make test-faults`).
+"""
+
+import os
+import random
+import time
+from pathlib import Path
+
+import optuna
+import psutil
+import pytest
+
+from deepracer_exp.formats.run_files import read_metrics, read_object
+from sweeps.ledger import Ledger
+from sweeps.storage import open_storage
+
+TIMES = range(int(os.environ.get("FAULT_TIMES", "1")))
+TRIALS, ITERATIONS = 3, 6
+SWEEP = (
+    *("sweep", "study=s", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=2"),
+    *("episode.max_steps=60", "budget.env_steps=null", f"budget.iterations={ITERATIONS}"),
+    *("algorithm.lr=tag(log,interval(1e-5,1e-3))", "sweep.protocol=three_trials", "sweep.rerank=0"),
+    *(f"sweep.trials={TRIALS}", "sweep.lease_s=6"),
+)
+PATIENCE_S = 240.0
+
+pytestmark = pytest.mark.timeout(600)
+
+
+class Sweep:
+    """A sweep started as a racer does, with its workers in sight."""
+
+    def __init__(self, start, cwd, *overrides):
+        self.cwd = cwd
+        self.command = start(*SWEEP, *overrides)
+        self.driver = psutil.Process(self.command.popen.pid)
+        self.seen = {}
+
+    def workers(self):
+        """Return the worker processes that live."""
+        try:
+            below = self.driver.children(recursive=True)
+        except psutil.NoSuchProcess:
+            below = []
+        for process in below:
+            try:
+                # Forked from a server, and leaders of their own sessions.
+                forked = "multiprocessing.forkserver" in " ".join(process.cmdline())
+                if forked and os.getsid(process.pid) == process.pid:
+                    self.seen[process.pid] = process
+            except (psutil.NoSuchProcess, ProcessLookupError):
+                continue
+        return [one for one in self.seen.values() if is_alive(one)]
+
+    def rows(self):
+        """Return how many iterations are recorded, of all trials."""
+        return sum(file.read_bytes().count(b"\n") for file in self.cwd.glob("runs/s/*/metrics.jsonl"))
+
+    def wait_for(self, condition, what):
+        return wait_for(condition, what, self)
+
+    def end(self):
+        ended = self.command.end(PATIENCE_S)
+        assert ended.code == 0, f"{ended.stderr}\n{self.log()}"
+        return ended
+
+    def log(self):
+        file = self.cwd / "runs" / "s" / "workers.log"
+        return file.read_text() if file.exists() else ""
+
+    def destroy(self):
+        for worker in self.workers():
+            worker.kill()
+
+
+def is_alive(process):
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def wait_for(condition, what, *sweeps):
+    until = time.monotonic() + PATIENCE_S
+    while not (value := condition()):
+        assert time.monotonic() < until, f"no {what}: {[one.log() for one in sweeps]}"
+        assert any(one.command.popen.poll() is None for one in sweeps), f"ended before {what}"
+        time.sleep(0.02)
+    return value
+
+
+@pytest.fixture
+def sweep(start, tmp_path):
+    begun = []
+
+    def go(*overrides, at_random=None):
+        begun.append(Sweep(start, tmp_path, *overrides))
+        if at_random is not None:
+            wait_at_random(at_random, begun[-1])
+        return begun[-1]
+
+    yield go
+    for one in begun:
+        one.destroy()
+
+
+def wait_at_random(moment, sweep):
+    """Wait for a moment of the sweep, whatever the speed of the machine: so many rows, and a little."""
+    rows, more_s = moment.randrange(TRIALS * ITERATIONS - 3), moment.uniform(0.0, 1.5)
+    sweep.wait_for(lambda: sweep.workers() and sweep.rows() >= rows, f"{rows} rows")
+    time.sleep(more_s)
+
+
+def slots(cwd, storage=None):
+    return Ledger(open_storage(storage, cwd / "runs").engine, "s").slots()
+
+
+def assert_every_trial_is_accounted_for_once(cwd, storage=None):
+    """The study has each trial once, with the value of a run that has each of its iterations once."""
+    opened = open_storage(storage, cwd / "runs")
+    ledger = Ledger(opened.engine, "s").slots()
+    assert [slot.slot for slot in ledger] == list(range(TRIALS))
+    assert {slot.state for slot in ledger} == {"told"}
+    trials = {one._trial_id: one for one in optuna.load_study(study_name="s", storage=opened.optuna).trials}
+    assert {slot.trial_id for slot in ledger} == {
+        key for key, one in trials.items() if one.state == optuna.trial.TrialState.COMPLETE
+    }
+    # A worker may be killed just when it had made a trial; it is told as such.
+    rest = [one.state for key, one in trials.items() if key not in {slot.trial_id for slot in ledger}]
+    assert set(rest) <= {optuna.trial.TrialState.FAIL}
+    for slot in ledger:
+        trial = trials[slot.trial_id]
+        assert trial.user_attrs["slot"] == slot.slot
+        assert trial.values == slot.values
+        (run,) = trial.user_attrs["runs"]
+        assert trial.values == run["value"]
+        folder = cwd / "runs" / "s" / Path(run["run_dir"]).name
+        assert read_object(folder / "summary.json")["status"] == "finished"
+        rows = [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")]
+        assert rows == list(range(1, ITERATIONS + 1))
+    assert len({trial.params["algorithm.lr"] for trial in trials.values() if trial.params}) == TRIALS
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_after_kill_9_of_a_worker_another_one_goes_on(sweep, tmp_path, seed):
+    moment = random.Random(seed)
+    running = sweep("sweep.workers=2", at_random=moment)
+    moment.choice(running.workers()).kill()
+    running.end()
+    assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_after_kill_9_of_the_only_worker_another_one_goes_on(sweep, tmp_path, seed):
+    running = sweep("sweep.workers=1", at_random=random.Random(seed))
+    (worker,) = running.workers()
+    worker.kill()
+    running.end()
+    assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_after_kill_9_of_the_driver_its_workers_end_and_the_name_is_enough_to_go_on(sweep, tmp_path, seed):
+    running = sweep("sweep.workers=2", at_random=random.Random(seed))
+    workers = running.workers()
+    running.driver.kill()
+    running.command.popen.wait()
+    until = time.monotonic() + PATIENCE_S
+    while any(map(is_alive, workers)):
+        assert time.monotonic() < until, f"workers outlive their driver: {workers}"
+        time.sleep(0.05)
+    rest = sweep("sweep.workers=2")
+    rest.end()
+    assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_after_kill_9_of_everything_the_study_goes_on(sweep, tmp_path, seed):
+    running = sweep("sweep.workers=2", at_random=random.Random(seed))
+    for process in (running.driver, *running.workers()):
+        process.kill()
+    running.command.popen.wait()
+    sweep("sweep.workers=2").end()
+    assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_nor_into_the_run(
+    sweep, tmp_path, seed
+):
+    running = sweep("sweep.workers=2")
+    running.wait_for(lambda: running.rows() >= 1 + random.Random(seed).randrange(4), "rows")
+    (held, *_) = [slot for slot in slots(tmp_path) if slot.state == "claimed" and slot.runs]
+    (late,) = [one for one in running.workers() if one.pid == pid_of(held)]
+    late.suspend()
+    try:
+        taken = running.wait_for(
+            lambda: next((s for s in slots(tmp_path) if s.slot == held.slot and s.attempt > 1), None),
+            "other worker that takes over",
+        )
+        assert taken.owner != held.owner
+        running.wait_for(
+            lambda: next(s for s in slots(tmp_path) if s.slot == held.slot).state == "told", "result"
+        )
+    finally:
+        late.resume()
+    running.end()
+    assert_every_trial_is_accounted_for_once(tmp_path)
+    slot = next(slot for slot in slots(tmp_path) if slot.slot == held.slot)
+    assert slot.attempt == taken.attempt
+    # The sleeper held its folder, so that the other one went on in a copy.
+    assert slot.runs[0]["run_dir"] != held.runs[0]["run_dir"]
+    assert not (Path(held.runs[0]["run_dir"]) / "summary.json").exists()
+
+
+def pid_of(slot):
+    return int(slot.owner.rsplit(":", 2)[1])
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_two_drivers_share_one_study(sweep, tmp_path, seed):
+    both = [sweep("sweep.workers=1"), sweep("sweep.workers=1")]
+    for one in both:
+        one.end()
+    assert_every_trial_is_accounted_for_once(tmp_path)

@@ -1,0 +1,61 @@
+"""A process of the tests of `sweeps`: `python racer.py WHAT URL OWNER ...`; begins when it is told so, on its stdin."""
+
+import sys
+from pathlib import Path
+
+import sqlalchemy as sa
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from sweeps.database import resolve_database
+from sweeps.ledger import Ledger
+
+
+def _ready() -> None:
+    print("ready", flush=True)
+    sys.stdin.readline()
+
+
+def _engine(url: str) -> sa.Engine:
+    return sa.create_engine(url, **resolve_database(url, Path()).engine_options())
+
+
+def table(url: str, owner: str) -> None:
+    """Make the table."""
+    engine = _engine(url)
+    _ready()
+    Ledger(engine, "study")
+    print("made", flush=True)
+
+
+def claim(url: str, owner: str, total: str, lease_s: str) -> None:
+    """Claim slots, each in another name, until there are none."""
+    ledger = Ledger(_engine(url), "study")
+    _ready()
+    count = 0
+    while (claim := ledger.claim(f"{owner}.{count}", int(total), float(lease_s))) is not None:
+        print(claim.slot, claim.attempt, claim.previous_owner, claim.trial_id, flush=True)
+        count += 1
+
+
+def storage(url: str, owner: str, trials: str) -> None:
+    """Open the storage, make the study if nobody has, make trials and end them."""
+    import optuna
+
+    from sweeps.storage import open_storage
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    _ready()
+    storage = open_storage(url, Path())
+    Ledger(storage.engine, "study")
+    study = optuna.create_study(study_name="study", storage=storage.optuna, load_if_exists=True)
+    for _ in range(int(trials)):
+        trial = study.ask()
+        trial.suggest_float("lr", 1e-5, 1e-3, log=True)
+        trial.report(1.0, 1)
+        study.tell(trial, 1.0)
+        print(trial.number, flush=True)
+
+
+if __name__ == "__main__":
+    {"table": table, "claim": claim, "storage": storage}[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,140 @@
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.references import resolve
+from deepracer_exp.formats.best_of_sweep import BEST_OF_SWEEP, read_best_of_sweep, run_of_sweep
+from sweeps.best import best_line, best_run, best_trial, best_values, complete_trials, write_best
+
+from .studies import add, new_study, write_metrics
+
+
+def test_the_fastest_complete_trial_is_the_best_and_a_pruned_one_never(tmp_path):
+    study = new_study(tmp_path)
+    for score in (11.0, 9.0, 10.0):
+        add(study, [score])
+    add(study, None, "median", seen=1.0)
+    assert [trial.number for trial in complete_trials(study)] == [1, 2, 0]
+    assert (best_trial(study).number, best_values(study)) == (1, [9.0])
+
+
+def test_more_completion_is_better(tmp_path):
+    study = new_study(tmp_path, objectives=["completion"])
+    for completion in (80.0, 95.0, 90.0):
+        add(study, [completion])
+    assert best_trial(study).number == 1
+
+
+def test_of_lap_time_and_completion_the_fast_car_that_never_arrives_is_not_the_best(tmp_path):
+    study = new_study(tmp_path, objectives=["lap_time", "completion"])
+    for values in ((8.0, 40.0), (9.0, 98.0), (11.0, 100.0), (60.0, 0.0)):
+        add(study, values)
+    assert best_trial(study).number == 1
+
+
+def test_on_fresh_laps_another_trial_may_win(tmp_path):
+    study = new_study(tmp_path)
+    for score in (9.0, 9.1, 12.0):
+        add(study, [score])
+    again = [
+        {"trial": 0, "values": [9.8], "interval": None},
+        {"trial": 1, "values": [9.3], "interval": [9, 10]},
+    ]
+    study.set_user_attr("reranked", again)
+    assert (best_trial(study).number, best_values(study)) == (1, [9.3])
+    study.set_user_attr("best", {"trial": 2})
+    assert (best_trial(study).number, best_values(study)) == (2, [12.0])
+
+
+def test_without_a_complete_trial_there_is_no_best(tmp_path):
+    study = new_study(tmp_path)
+    add(study, None, "collapsed")
+    with pytest.raises(BadInput, match="none of its 1 trials is complete"):
+        best_line(study)
+
+
+def test_the_line_gives_back_every_override_when_a_shell_reads_it(tmp_path):
+    study = new_study(tmp_path)
+    overrides = ["algorithm.lr=0.0003", "network.hidden=[64, 64]", "reward.constants.NAME=it's <a> $HOME"]
+    add(study, [9.0], overrides=overrides)
+    assert shlex.split(best_line(study)) == ["deepracer-exp", "train", *overrides]
+    study.set_user_attr("parent", "my run")
+    assert shlex.split(best_line(study)) == ["deepracer-exp", "clone", "run=my run", *overrides]
+
+
+def with_runs(study, values):
+    """Add a trial with a run a seed."""
+    base = Path(study.user_attrs["runs_dir"]) / study.study_name
+    runs = []
+    for seed, value in enumerate(values):
+        write_metrics(base / f"seed-{seed}", 2)
+        runs.append(
+            {"seed": seed, "run_dir": str(base / f"seed-{seed}"), "status": "finished", "value": value}
+        )
+    add(study, [sum(value[0] for value in values) / len(values)], runs=runs)
+
+
+def test_the_best_run_is_that_of_the_best_seed_wherever_all_runs_have_moved(tmp_path):
+    study = new_study(tmp_path / "runs")
+    with_runs(study, ([10.0], [9.0], [9.5]))
+    assert best_run(study) == tmp_path / "runs" / "lr_entropy" / "seed-1"
+    (tmp_path / "runs").rename(tmp_path / "moved")
+    with pytest.raises(BadInput, match="is gone"):
+        best_run(study)
+    assert best_run(study, tmp_path / "moved").parents[1] == tmp_path / "moved"
+
+
+def test_best_of_a_study_leads_to_the_run_of_its_best_trial(tmp_path):
+    study = new_study(tmp_path)
+    with_runs(study, ([10.0], [9.0]))
+    folder = tmp_path / "lr_entropy"
+    # Something faster, trained by hand under the same name, was never compared with the trials.
+    (folder / "by-hand" / "checkpoints" / "best").mkdir(parents=True)
+    (folder / "by-hand" / "config.yaml").write_text("name: lr_entropy\n")
+    summary = {"best": {"metric": "x", "rank": [1, 1], "eval_completion": 100.0, "eval_lap_time_s": 1.0}}
+    (folder / "by-hand" / "summary.json").write_text(json.dumps(summary))
+    assert resolve("best:lr_entropy", tmp_path, None).path == folder / "by-hand"
+    write_best(study, tmp_path)
+    assert resolve("best:lr_entropy", tmp_path, None).path == folder / "seed-1"
+    told = read_best_of_sweep(folder)
+    assert told is not None
+    assert (told.study, told.trial, told.values) == ("lr_entropy", 0, {"race_score": 9.5})
+
+
+@pytest.mark.parametrize("name", ["../elsewhere", "/etc", "..", ".", "", "a/b", "a\\b", "seed-0\n", 3, None])
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+    write_metrics(tmp_path / "elsewhere", 1)
+    folder = tmp_path / "study"
+    folder.mkdir()
+    told = {"study": "study", "trial": 0, "run_dir": name, "values": {}}
+    (folder / BEST_OF_SWEEP).write_text(json.dumps(told))
+    with pytest.raises(BadInput, match="run_dir") as refused:
+        run_of_sweep(folder)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path):
+    write_metrics(tmp_path / "elsewhere", 1)
+    folder = tmp_path / "study"
+    folder.mkdir()
+    (folder / "run").symlink_to(tmp_path / "elsewhere")
+    (folder / BEST_OF_SWEEP).write_text('{"study": "study", "trial": 0, "run_dir": "run", "values": {}}')
+    with pytest.raises(BadInput, match="leads out of"):
+        run_of_sweep(folder)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"study": "x"}', '{"study": "x", "trial": -1}'])
+def test_a_file_that_no_sweep_has_written_is_named(tmp_path, text):
+    (tmp_path / BEST_OF_SWEEP).write_text(text)
+    with pytest.raises(BadInput, match=BEST_OF_SWEEP):
+        run_of_sweep(tmp_path)
+
+
+def test_a_best_run_that_is_gone_is_told(tmp_path):
+    assert run_of_sweep(tmp_path) is None
+    (tmp_path / BEST_OF_SWEEP).write_text('{"study": "s", "trial": 7, "run_dir": "run", "values": {}}')
+    with pytest.raises(BadInput, match="run run of trial 7 is gone"):
+        run_of_sweep(tmp_path)

@@ -1,0 +1,170 @@
+import re
+from html.parser import HTMLParser
+
+import pytest
+from optuna.distributions import FloatDistribution
+
+from deepracer_exp.errors import BadInput
+from sweeps.report import fates, headline, report, write_report
+
+from .studies import add, new_study, season, write_metrics
+
+
+class Page(HTMLParser):
+    """What a browser would make of a page: its tags, its text outside scripts, what it would load."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.loads: list[str] = []
+        self.words: list[str] = []
+        self._script = False
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.loads += [
+            value for key, value in attrs if key in ("src", "href") and not value.startswith("data:")
+        ]
+        self._script = tag in ("script", "style")
+
+    def handle_endtag(self, tag):
+        self._script = self._script and tag not in ("script", "style")
+
+    def handle_data(self, data):
+        if not self._script:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    return season(tmp_path_factory.mktemp("runs"), 60)
+
+
+def test_the_page_holds_everything_and_loads_nothing(study, tmp_path):
+    path = write_report(study, tmp_path / "report.html")
+    html = path.read_text(encoding="utf-8")
+    page = Page(html)
+    assert page.loads == []
+    assert "link" not in page.tags[page.tags.index("body") :]
+    assert path.stat().st_size < 6_000_000
+    assert html.count("plotly.js v") == 1
+    for name in ("history", "importance", "slice", "parallel", "entropy"):
+        assert f'id="figure-{name}"' in html
+    assert f"Trial {study.best_trial.number} is the best" in page.text
+    assert "deepracer-exp train algorithm.lr=" in page.text
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.slow
+def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_six_megabytes(tmp_path):
+    study = new_study(tmp_path, objectives=["lap_time", "completion"])
+    wide = {f"reward.constants.LONG_NAME_{at}": FloatDistribution(0.0, 1.0) for at in range(16)}
+    for number in range(1000):
+        params = {key: (number * (at + 7) % 1009) / 1009 for at, key in enumerate(wide)}
+        values = [9 + number % 97 / 50, 80 + number % 89 / 10]
+        add(study, values, params=params, distributions=wide, reason="a reason " * 30)
+    write_metrics(tmp_path / "lr_entropy" / "run-0", 250)
+    for trial in study.get_trials(deepcopy=False):  # all of them learn alike, which saves a thousand files
+        trial.user_attrs["runs"] = [{"run_dir": str(tmp_path / "lr_entropy" / "run-0")}]
+    html = report(study)
+    assert len(html.encode()) < 6_000_000
+    assert "The last 700 in this order are left out" in Page(html).text
+
+
+NASTY = "<script>alert(1)</script>&'\"</script>"
+
+
+def test_nothing_that_a_study_holds_becomes_part_of_the_page(tmp_path):
+    clean, nasty = new_study(tmp_path / "a"), new_study(tmp_path / "b", f"x{NASTY}".replace("/", "|"))
+    for study, word in ((clean, "word"), (nasty, NASTY)):
+        study.set_user_attr("space", {word: word})
+        study.set_user_attr("base", [word])
+        study.set_user_attr("protocol", word)
+        study.set_user_attr("mlflow_run_id", word)
+        for score in (9.0, 10.0):
+            add(study, [score], reason=word, overrides=[word], metrics=3)
+        add(study, None, "failed", reason=word, traceback=word)
+        study.set_user_attr("reranked", [{"trial": 0, "values": [9.5], "interval": [9.0, 10.0]}])
+    assert Page(report(nasty)).tags == Page(report(clean)).tags
+    assert Page(report(nasty)).text.count(NASTY) >= 6
+
+
+def test_the_fates_add_up_to_all_trials_and_all_steps(study):
+    found = fates(study.trials)
+    assert sum(one["count"] for one in found) == len(study.trials)
+    assert sum(one["trials_share"] for one in found) == pytest.approx(100)
+    assert sum(one["steps_share"] for one in found) == pytest.approx(100)
+
+
+def test_the_headline_tells_the_steps_of_trials_that_came_to_nothing(tmp_path):
+    study = new_study(tmp_path)
+    add(study, [9.5], env_steps=750_000)
+    add(study, None, "collapsed", env_steps=200_000)
+    add(study, None, "failed", env_steps=50_000)
+    assert headline(study) == [
+        "Trial 0 is the best: race score 9.50 s.",
+        "3 of 60 trials ended, 1 of them complete; they drove 1.0 M control steps, 25 % of them in trials that were "
+        "pruned or failed.",
+    ]
+
+
+def test_a_best_trial_without_a_lap_says_so(tmp_path):
+    study = new_study(tmp_path)
+    add(study, [75.0], lap_time_s=None, completion=40.0)
+    assert "It completed no lap." in headline(study)
+
+
+def test_a_study_without_a_complete_trial_has_a_page(tmp_path):
+    study = new_study(tmp_path)
+    assert "No trial is complete" in Page(report(study)).text
+    add(study, None, "not_learning", seen=80.0)
+    page = Page(report(study))
+    assert "No trial is complete" in page.text
+    assert "to paste" not in page.text
+
+
+def test_failures_of_one_reason_are_told_once_the_most_frequent_first(tmp_path):
+    study = new_study(tmp_path)
+    for reason in ("rare", "often", "often"):
+        add(study, None, "failed", reason=f"{reason} error", traceback=f"Traceback of {reason}")
+    text = Page(report(study)).text
+    found = re.findall(r"(\d) × (\w+) error", text)  # noqa: RUF001
+    assert found == [("2", "often"), ("1", "rare")]
+    assert text.count("Traceback of often") == 1
+
+
+def test_the_table_begins_with_the_best_and_ends_with_the_failed(tmp_path):
+    study = new_study(tmp_path)
+    add(study, None, "failed")
+    add(study, [10.0], reason="tenth")
+    add(study, None, "median", seen=20.0, reason="pruned one")
+    add(study, [9.0], reason="ninth")
+    text = Page(report(study)).text
+    order = [text.rindex(word) for word in ("ninth", "tenth", "pruned one", "failed: for a reason")]
+    assert order == sorted(order)
+
+
+def test_the_winners_on_fresh_laps_stand_with_interval_and_old_value(tmp_path):
+    study = new_study(tmp_path)
+    add(study, [9.0])
+    add(study, [9.1])
+    again = [{"trial": 0, "values": [9.87], "interval": [9.61, 10.23]}, {"trial": 1, "values": [9.3]}]
+    study.set_user_attr("reranked", again)
+    text = Page(report(study)).text
+    assert "Trial 1 is the best: race score 9.30 s on fresh laps." in text
+    assert "9.61 s to 10.23 s" in text
+
+
+def test_a_page_that_cannot_be_written_leaves_the_old_one(study, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("old")
+    study = season(tmp_path / "runs", 3)
+    study.set_user_attr("objectives", ["theirs"])
+    with pytest.raises(BadInput, match="no objectives"):
+        write_report(study, path)
+    assert path.read_text() == "old"

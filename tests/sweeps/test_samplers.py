@@ -1,0 +1,223 @@
+import functools
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+import optuna
+import pytest
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.trial import TrialState, create_trial
+
+from deepracer_exp.config.sweep import SweepConfig, compose_sweep
+from deepracer_exp.errors import BadInput
+from sweeps.samplers import build_sampler
+from sweeps.space import SearchSpace
+
+NAMES = ("tpe", "gp", "cmaes", "qmc", "random", "nsga2")
+"""Every sampler that searches ranges; grid has a space of its own."""
+
+
+@dataclass
+class Dimension:
+    key: str
+    distribution: optuna.distributions.BaseDistribution
+
+
+class Space:
+    """A mixed space with a key that only one of the options has."""
+
+    dimensions = (
+        Dimension("network", CategoricalDistribution(("mlp", "mlp_shared"))),
+        Dimension("network.hidden", IntDistribution(16, 128, step=16)),
+        Dimension("algorithm.lr", FloatDistribution(1e-5, 1e-3, log=True)),
+        Dimension("algorithm.entropy_coeff", FloatDistribution(0.0, 0.05)),
+    )
+
+    def suggest(self, trial: optuna.Trial) -> dict:
+        values = {}
+        for one in self.dimensions:
+            if one.key != "network.hidden" or values["network"] == "mlp":
+                values[one.key] = trial._suggest(one.key, one.distribution)
+        return values
+
+
+class Choices(Space):
+    dimensions = (
+        Dimension("track", CategoricalDistribution(("reinvent_base", "Oval_track", "Bowtie_track"))),
+        Dimension("reward", CategoricalDistribution(("progress", "racing_line"))),
+    )
+
+    def grid(self) -> dict:
+        return {one.key: list(one.distribution.choices) for one in self.dimensions}
+
+
+def settings(sampler: str, **changes) -> SweepConfig:
+    given = {"sampler": sampler, "seed": 5, "startup_trials": 4, "trials": 6}
+    return replace(standard(), **{**given, **changes})
+
+
+@functools.cache
+def standard() -> SweepConfig:
+    return compose_sweep([]).entry.sweep
+
+
+def score(values: dict) -> float:
+    """Return what a search lowers: best at lr 1e-4 without an entropy bonus."""
+    hidden = values.get("network.hidden", 64)
+    return abs(np.log10(values["algorithm.lr"]) + 4) + values["algorithm.entropy_coeff"] + hidden / 1000
+
+
+def searched(sampler: str, trials: int = 10, **changes) -> list[dict]:
+    """Return the values of each trial of a study; every third one is pruned."""
+    study = optuna.create_study(sampler=build_sampler(settings(sampler, **changes), Space()))
+    for number in range(trials):
+        trial = study.ask()
+        values = Space().suggest(trial)
+        trial.report(score(values), 1)
+        if number % 3 == 2:
+            study.tell(trial, state=TrialState.PRUNED)
+        else:
+            study.tell(trial, score(values))
+    return [trial.params for trial in study.trials]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", NAMES)
+def test_each_sampler_stays_within_a_mixed_space_with_a_conditional_key(name):
+    found = searched(name, startup_trials=5)
+    assert len(found) == 10
+    for values in found:
+        assert ("network.hidden" in values) == (values["network"] == "mlp")
+        for one in Space.dimensions:
+            if one.key in values:
+                assert one.distribution._contains(one.distribution.to_internal_repr(values[one.key]))
+    assert len({tuple(values.items()) for values in found}) == 10
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_same_seed_gives_the_same_values_and_another_seed_others(name):
+    first = searched(name, trials=7)
+    assert searched(name, trials=7) == first
+    assert searched(name, trials=1, seed=6)[0] != first[0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_workers_that_begin_together_try_different_values_and_the_same_at_each_start(name):
+    def begun() -> list[dict]:
+        study = optuna.create_study()
+        found = []
+        for _ in range(4):  # each asks while those before it run
+            study.sampler = build_sampler(settings(name), Space())
+            found.append(Space().suggest(study.ask()))
+        return found
+
+    found = begun()
+    assert len({values["algorithm.lr"] for values in found}) == 4
+    assert begun() == found
+
+
+@pytest.mark.parametrize("name", ["tpe", "random", "qmc"])
+def test_a_trial_draws_by_its_slot_whatever_number_it_has(name):
+    def drawn(others: int) -> dict:
+        study = optuna.create_study(sampler=build_sampler(settings(name), Space()))
+        for _ in range(others):
+            study.add_trial(create_trial(state=TrialState.FAIL))
+        study.add_trial(create_trial(state=TrialState.RUNNING, user_attrs={"slot": 7}))
+        return Space().suggest(optuna.Trial(study, study.trials[-1]._trial_id))
+
+    assert drawn(others=0) == drawn(others=3)
+
+
+def test_tpe_keeps_away_from_what_a_running_trial_tries():
+    space = {one.key: one.distribution for one in Space.dimensions if one.key.startswith("algorithm")}
+    center = {"algorithm.lr": 1e-4, "algorithm.entropy_coeff": 0.01}
+
+    def next_distances(state: TrialState) -> list[float]:
+        """Return how far from the centre the next trial is, in decades of lr, for some seeds."""
+        distances = []
+        for seed in range(20):
+            study = optuna.create_study(sampler=build_sampler(settings("tpe", seed=seed), Space()))
+            for lr in np.geomspace(1e-5, 1e-3, 11):
+                params = {"algorithm.lr": lr, "algorithm.entropy_coeff": 0.01}
+                study.add_trial(create_trial(params=params, distributions=space, value=score(params)))
+            for _ in range(6):
+                study.add_trial(create_trial(params=center, distributions=space, state=state))
+            trial = study.ask(space)
+            distances.append(abs(np.log10(trial.params["algorithm.lr"]) + 4))
+        return distances
+
+    # A failed trial says nothing of its values.
+    assert np.mean(next_distances(TrialState.RUNNING)) > 1.2 * np.mean(next_distances(TrialState.FAIL))
+
+
+def test_qmc_covers_every_key_evenly_however_many_workers_ask():
+    found = searched("qmc", trials=16)
+    decades = Counter(int((np.log10(values["algorithm.lr"]) + 5) * 4) for values in found)
+    assert set(decades.values()) == {2}  # 16 points of a Sobol sequence, eight equal parts
+    assert Counter(values["network"] for values in found) == {"mlp": 8, "mlp_shared": 8}
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_grid_visits_each_point_once_and_two_workers_share_it():
+    study = optuna.create_study()
+    workers = [build_sampler(settings("grid"), Choices()) for _ in range(2)]
+    for number in range(6):
+        study.sampler = workers[number % 2]
+        trial = study.ask()
+        Choices().suggest(trial)
+        study.tell(trial, 1.0)
+    assert len({tuple(trial.params.items()) for trial in study.trials}) == 6
+
+
+def test_more_trials_than_a_grid_has_points_are_refused():
+    with pytest.raises(BadInput, match=r"^sweep\.trials=7: the grid has 6 points.*accepted: 1 to 6$"):
+        build_sampler(settings("grid", trials=7), Choices())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "cmaes"])
+def test_a_sampler_that_can_follows_several_objectives(name):
+    objectives = ("lap_time", "completion")
+    study = optuna.create_study(
+        directions=["minimize", "maximize"],
+        sampler=build_sampler(settings(name, objectives=objectives), Space()),
+    )
+    for _ in range(6):
+        trial = study.ask()
+        values = Space().suggest(trial)
+        study.tell(trial, [score(values), 100 * values["algorithm.entropy_coeff"]])
+    assert len({trial.params["algorithm.lr"] for trial in study.trials}) == 6
+
+
+def test_cmaes_refuses_several_objectives_and_a_space_of_choices_only():
+    with pytest.raises(BadInput, match=r"^sweep\.sampler=cmaes: follows one objective.*has 2; accepted"):
+        build_sampler(settings("cmaes", objectives=("lap_time", "completion")), Space())
+    with pytest.raises(BadInput, match=r"^sweep\.sampler=cmaes: searches ranges"):
+        build_sampler(settings("cmaes"), Choices())
+
+
+@pytest.mark.parametrize("name", ["tpe", "cmaes"])  # gp as well, in half a minute
+def test_a_sampler_that_learns_finds_better_values_than_chance(name):
+    def mean_late(sampler: str) -> float:
+        return float(np.mean([score(values) for values in searched(sampler, trials=40)[20:]]))
+
+    assert mean_late(name) < mean_late("random")
+
+
+@pytest.mark.parametrize("name", ["tpe", "cmaes", "qmc", "nsga2"])
+def test_a_sampler_searches_the_space_of_a_sweep(name):
+    lines = ["network=mlp,mlp_small", "algorithm.lr=tag(log, interval(1e-5, 1e-3))"]
+    space = real_space(*lines)
+    study = optuna.create_study(sampler=build_sampler(settings(name), space))
+    drawn = []
+    for _ in range(6):
+        trial = study.ask()
+        drawn.append(tuple(space.suggest(trial)))
+        study.tell(trial, 1e4 * trial.params["algorithm.lr"])
+    assert len(set(drawn)) == 6
+    assert all(1e-5 <= trial.params["algorithm.lr"] <= 1e-3 for trial in study.trials)
+
+
+@functools.cache
+def real_space(*lines: str) -> SearchSpace:
+    return SearchSpace.from_request(compose_sweep(list(lines)))

@@ -1,0 +1,239 @@
+"""Storages of studies: opened by several processes at once, killed, stopped and started, and refused in one line."""
+
+import random
+import signal
+import sqlite3
+import threading
+import time
+from pathlib import Path
+
+import optuna
+import pytest
+import sqlalchemy as sa
+
+from deepracer_exp.errors import BadInput, RunFailed
+from sweeps.database import resolve_database
+from sweeps.ledger import Ledger
+from sweeps.storage import open_storage, patiently
+
+HOUR_S = 3600.0
+
+
+def _refused(url: str | None, runs_dir: Path) -> str:
+    with pytest.raises(BadInput) as refused:
+        open_storage(url, runs_dir)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+def _make_study(url: str) -> optuna.Study:
+    return optuna.create_study(study_name="study", storage=open_storage(url, Path()).optuna)
+
+
+@pytest.mark.parametrize("name", ["runs", "two words", "{0}", "50%41", "who?x=1", "#1", "läufe", "[a]*"])
+def test_the_default_is_a_file_in_the_folder_of_the_runs_whatever_its_name(tmp_path, name):
+    storage = open_storage(None, tmp_path / name)
+    optuna.create_study(study_name="study", storage=storage.optuna)
+    assert sorted(path.name for path in (tmp_path / name).iterdir() if path.suffix == ".db") == ["sweeps.db"]
+    with sqlite3.connect(tmp_path / name / "sweeps.db") as connection:
+        assert connection.execute("SELECT study_name FROM studies").fetchall() == [("study",)]
+        assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def test_processes_that_begin_together_share_one_study_and_number_their_trials_once(url, race):
+    lines = race("storage", url, ("anna", "ben", "cleo"), 2).lines()
+    assert sorted(int(line) for printed in lines for line in printed) == list(range(6))
+    trials = optuna.load_study(study_name="study", storage=open_storage(url, Path()).optuna).trials
+    assert [trial.number for trial in trials] == list(range(6))
+    assert all(trial.state.name == "COMPLETE" for trial in trials)
+
+
+def test_a_process_killed_while_it_makes_the_tables_leaves_nothing_in_the_way(url, race):
+    racers = race("storage", url, ("anna", "ben"), 1)
+    for number in (0, 1):
+        time.sleep(random.uniform(0.0, 0.2))
+        racers[number].kill()
+    racers.lines()
+    storage = open_storage(url, Path())
+    study = optuna.create_study(study_name="study", storage=storage.optuna, load_if_exists=True)
+    study.tell(study.ask(), 1.0)
+    assert Ledger(storage.engine, "study").claim("next", 1, HOUR_S).slot == 0
+
+
+def test_half_a_file_of_a_killed_process_is_made_anew(tmp_path):
+    (tmp_path / "sweeps.db").touch()
+    (tmp_path / "sweeps.db.new").write_bytes(b"half a file")
+    (tmp_path / "sweeps.db.new-wal").write_bytes(b"and its journal")
+    open_storage(None, tmp_path)
+    assert not list(tmp_path.glob("*.new*"))
+
+
+def test_a_file_that_optuna_made_is_taken_as_it_is(tmp_path):
+    url = f"sqlite:///{tmp_path}/mine.db"
+    optuna.create_study(study_name="mine", storage=url)
+    storage = open_storage(url, tmp_path)
+    assert [study.study_name for study in storage.optuna.get_all_studies()] == ["mine"]
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("postgresql//racer:s3cret@host/db", ["sweep.storage: not the URL of a database", "accepted: "]),
+        ("postgresql://racer:s3cret@host:port/db", ["not the URL of a database"]),
+        ("s3cret", ["not the URL of a database"]),
+        ("postgres://racer:s3cret@host/db", ["did you mean postgresql?"]),
+        ("oracle://racer:s3cret@host/db", ["no database for sweeps", "accepted: "]),
+        ("postgresql+nope://racer:s3cret@host/db", ["no such driver"]),
+        ("sqlite+aiosqlite:///x.db", ["asynchronous"]),
+        ("mysql+mysqldb://racer:s3cret@host/db", ["pip install 'mysqlclient'"]),
+        ("postgresql://racer:s3cret@host", ["names no database"]),
+        ("sqlite://", ["names no file"]),
+        ("sqlite:///:memory:", ["names no file"]),
+        ("sqlite:////proc/1/sweeps.db", ["/proc/1/sweeps.db"]),
+        ("sqlite:////dev/null/sweeps.db", ["/dev/null"]),
+        ("sqlite:////tmp", ["/tmp is a folder"]),
+        ("postgresql://racer:s3cret@127.0.0.1:1/db", ["refused"]),
+        ("postgresql://racer@127.0.0.1:1/db?password=s3cret", ["refused"]),
+    ],
+)
+def test_what_can_never_work_is_refused_in_one_line_without_the_password(url, words, tmp_path):
+    message = _refused(url, tmp_path)
+    for word in words:
+        assert word in message
+    assert "s3cret" not in message
+    assert message.startswith("sweep.storage")
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path):
+    (tmp_path / "sweeps.db").write_text("my notes, long enough to be looked at " * 100)
+    assert "not a database" in _refused(None, tmp_path)
+    assert (tmp_path / "sweeps.db").read_text().startswith("my notes")
+
+
+def test_a_database_of_another_program_is_refused_and_left_as_it_is(url):
+    engine = sa.create_engine(url)
+    with engine.begin() as connection:
+        connection.execute(sa.text("CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL)"))
+        connection.execute(sa.text("INSERT INTO alembic_version VALUES ('1b5f0d9ad7c1')"))
+    assert "a database of their own" in _refused(url, Path())
+    assert sa.inspect(engine).get_table_names() == ["alembic_version"]
+    engine.dispose()
+
+
+def test_no_password_is_shown_by_a_server_that_refuses(postgres_server):
+    wrong = postgres_server.url(password="wr0ng/{p}@ss%")
+    missing = postgres_server.url("nowhere")
+    messages = [_refused(wrong, Path()), _refused(missing, Path())]
+    assert "password authentication failed" in messages[0]
+    assert '"nowhere" does not exist' in messages[1]
+    for message in messages:
+        assert "wr0ng" not in message
+        assert "s3cr" not in message
+
+
+def test_a_storage_never_shows_its_password(postgres_server):
+    storage = open_storage(postgres_server.new_database(), Path())
+    for text in (
+        repr(storage),
+        str(storage),
+        storage.url,
+        repr(resolve_database(postgres_server.url(), Path())),
+    ):
+        assert "s3cr" not in text
+    assert "127.0.0.1" in storage.url
+
+
+def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
+    """A thousand workers would need as many connections otherwise; PostgreSQL has a hundred."""
+    url = postgres_server.new_database()
+    storage = open_storage(url, Path())
+    optuna.create_study(study_name="study", storage=storage.optuna).ask()
+    Ledger(storage.engine, "study").claim("one", 1, HOUR_S)
+    name = sa.make_url(url).database
+    count = f"SELECT count(*) FROM pg_stat_activity WHERE datname = '{name}'"
+    until = time.monotonic() + 60.0
+    while postgres_server.execute(count)[0][0]:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_a_stopped_process_holds_a_row_of_postgresql_for_a_minute_at_most(postgres_server):
+    url = postgres_server.new_database()
+    with open_storage(url, Path()).engine.connect() as connection:
+        for setting in ("idle_in_transaction_session_timeout", "lock_timeout"):
+            assert connection.execute(sa.text(f"SHOW {setting}")).scalar_one() == "1min"
+
+
+@pytest.mark.parametrize("how", ["SIGINT", "SIGQUIT"])
+def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
+    storage = open_storage(url := postgres.new_database(), Path())
+    study = optuna.create_study(study_name="study", storage=storage.optuna)
+    ledger = Ledger(storage.engine, "study")
+    claim = ledger.claim("one", 2, HOUR_S)
+    trial = study.ask()
+    postgres.stop(signal.Signals[how])
+    done = []
+    calls = [
+        lambda: ledger.renew(claim, HOUR_S),
+        lambda: ledger.note(claim, trial_id=trial._trial_id),
+        lambda: study.tell(trial, 1.0, skip_if_finished=True).state.name,
+        lambda: open_storage(url, Path(), patience_s=HOUR_S).optuna.get_n_trials(study._study_id),
+    ]
+    threads = [
+        threading.Thread(target=lambda call=call: done.append(patiently(call, HOUR_S)), daemon=True)
+        for call in calls
+    ]
+    for thread in threads:
+        thread.start()
+    time.sleep(0.5)
+    assert done == []
+    postgres.start()
+    for thread in threads:
+        thread.join(120.0)
+    assert sorted(map(str, done)) == ["1", "COMPLETE", "True", "True"]
+    assert ledger.slots()[0].trial_id == trial._trial_id
+
+
+def test_a_server_that_stays_away_ends_the_wait_in_one_line(postgres):
+    ledger = Ledger(open_storage(postgres.new_database(), Path()).engine, "study")
+    postgres.stop()
+    with pytest.raises(RunFailed, match=r"has not answered for 0\.3 s") as failed:
+        patiently(ledger.slots, 0.3)
+    assert "s3cr" not in str(failed.value)
+    assert "\n" not in str(failed.value)
+    with pytest.raises(BadInput, match="refused"):
+        open_storage(postgres.url(), Path(), patience_s=0.3)
+
+
+def test_a_locked_file_is_waited_for(tmp_path):
+    url = f"sqlite:///{tmp_path}/sweeps.db"
+    study = _make_study(url)
+    impatient = sa.create_engine(url, connect_args={"timeout": 0.0})
+    ledger = Ledger(impatient, "study")
+    other = sqlite3.connect(tmp_path / "sweeps.db", isolation_level=None, check_same_thread=False)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(RunFailed, match="locked"):
+        patiently(lambda: ledger.claim("one", 1, HOUR_S), 0.0)
+    end = threading.Timer(0.5, lambda: other.execute("COMMIT"))
+    end.start()
+    assert patiently(lambda: ledger.claim("one", 1, HOUR_S), HOUR_S).slot == 0
+    assert patiently(study.ask, HOUR_S).number == 0
+    end.join()
+    other.close()
+
+
+def test_what_no_waiting_changes_is_told_at_once(tmp_path):
+    storage = open_storage(None, tmp_path)
+    ledger = Ledger(storage.engine, "study")
+    study = optuna.create_study(study_name="study", storage=storage.optuna)
+    with storage.engine.begin() as connection:
+        connection.execute(sa.text("DROP TABLE deepracer_slots"))
+        connection.execute(sa.text("DROP TABLE trials"))
+    for call in (ledger.slots, study.ask):
+        with pytest.raises(RunFailed, match="cannot be used: no such table"):
+            patiently(call, HOUR_S)
+
+
+def test_other_errors_are_not_the_databases():
+    with pytest.raises(ZeroDivisionError):
+        patiently(lambda: 1 / 0, HOUR_S)

@@ -1,0 +1,129 @@
+"""`deepracer-exp sweep`, as typed."""
+
+import json
+import shlex
+
+import optuna
+import pytest
+
+from deepracer_exp.formats.run_files import read_config, read_object
+from sweeps.storage import open_storage
+
+TINY = (
+    *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=2"),
+    *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=4", "sweep.protocol=three_trials"),
+    *("sweep.workers=1", "sweep.rerank_laps=2"),
+)
+LR = "algorithm.lr=tag(log,interval(1e-5,1e-3))"
+
+
+def load(cwd, name):
+    return optuna.load_study(study_name=name, storage=open_storage(None, cwd / "runs").optuna)
+
+
+def assert_nothing_begun(ended):
+    assert not list(ended.cwd.glob("runs/**/*")), "something was made"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ((), ("nothing to search", "KEY='interval(LOW,HIGH)'")),
+        (("algorithm.lrr=interval(0,1)",), ("algorithm.lrr: no such key", "did you mean lr?")),
+        (("algorithm.lr=interval(-1,1)",), ("algorithm.lr=-1", "greater than 0")),
+        (("network=mlp,mlp_smal",), ("network=mlp_smal: no such network", "did you mean mlp_small?")),
+        ((LR, "sweep.workers=0"), ("sweep.workers=0",)),
+        ((LR, "sweep.trials=0"), ("sweep.trials=0",)),
+        ((LR, "sweep.sampler=tpee"), ("sweep.sampler", "tpe")),
+        ((LR, "sweep.pruners=[median]", "sweep.objectives=[lap_time,completion]"), ("median", "several")),
+        ((LR, "sweep.protocol=three_trial"), ("three_trials",)),
+        ((LR, "seed=0,1"), ("sweep.seeds",)),
+        ((LR, "study=../evil"), ("study",)),
+        ((LR, "parent=no_such_run"), ("no_such_run",)),
+        ((LR, "reward.file=missing.py"), ("missing.py",)),
+        (
+            (LR, "sweep.storage=postgresql+psycopg://me:secret@127.0.0.1:1/none"),
+            ("sweep.storage=postgresql+psycopg://", "127.0.0.1"),
+        ),
+        ((LR, "sweep.storage=oracle://x"), ("sweep.storage",)),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
+)
+def test_what_cannot_be_swept_is_refused_before_anything_is_made(call, overrides, words):
+    ended = call("sweep", *overrides)
+    assert ended.code == 2, ended.stderr
+    for word in words:
+        assert word in ended.complaint
+    assert "secret" not in ended.stderr + ended.stdout
+    assert_nothing_begun(ended)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory, run_at):
+    """Return a folder in which a study of two trials was made."""
+    folder = tmp_path_factory.mktemp("swept")
+    ended = run_at(folder, *TINY, "study=s", LR, "sweep.trials=2")
+    assert ended.code == 0, ended.stderr
+    return ended
+
+
+def test_the_printed_line_trains_the_winner(swept):
+    (line,) = [line for line in swept.stdout.splitlines() if line.startswith("  deepracer-exp train ")]
+    study = load(swept.cwd, "s")
+    told = read_object(swept.cwd / "runs" / "s" / "best_of_sweep.json")
+    trial = study.trials[told["trial"]]
+    assert shlex.split(line)[2:] == trial.user_attrs["overrides"]
+    config = read_config(swept.cwd / "runs" / "s" / told["run_dir"])
+    assert config["algorithm"]["lr"] == trial.params["algorithm.lr"]
+
+
+def test_a_trial_is_a_run_like_any_other(swept, call, tmp_path):
+    run = load(swept.cwd, "s").trials[0].user_attrs["run_dir"]
+    ended = call("train", *load(swept.cwd, "s").trials[0].user_attrs["overrides"], f"runs_dir={tmp_path}")
+    assert ended.code == 0, ended.stderr
+    (again,) = [path.parent for path in tmp_path.glob("tiny/*/summary.json")]
+    assert (
+        read_object(again / "summary.json")["last"]["entropy"]
+        == (json.loads((swept.cwd / run / "summary.json").read_text())["last"]["entropy"])
+    )
+
+
+def test_what_is_there_is_not_made_again(swept, run_at):
+    before = {path: path.stat().st_mtime_ns for path in swept.cwd.glob("runs/s/*/summary.json")}
+    ended = run_at(swept.cwd, "sweep", "study=s")
+    assert ended.code == 0, ended.stderr
+    assert {path: path.stat().st_mtime_ns for path in swept.cwd.glob("runs/s/*/summary.json")} == before
+    assert len(load(swept.cwd, "s").trials) == 2
+
+
+def test_another_search_under_the_same_name_is_refused_with_the_difference(swept, call_at):
+    ended = call_at(
+        swept.cwd, *TINY, "study=s", "algorithm.lr=tag(log,interval(1e-5,1e-2))", "sweep.trials=2"
+    )
+    assert ended.code == 2
+    for word in ("study=s: exists", "algorithm.lr", "1e-3", "1e-2"):
+        assert word in ended.complaint
+
+
+def test_report_and_best_need_no_more_than_the_name(swept, call_at):
+    best = call_at(swept.cwd, "sweep", "best", "s")
+    assert "deepracer-exp train " in best.stdout
+    report = call_at(swept.cwd, "sweep", "report", "s")
+    assert (swept.cwd / report.stdout.strip()).is_file()
+    nobody = call_at(swept.cwd, "sweep", "best", "t")
+    assert nobody.code == 2
+    assert "studies: s" in nobody.complaint
+
+
+def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_path):
+    (tmp_path / "broken.py").write_text(
+        "def reward_function(params):\n    return 1 / (params['steps'] < 5)\n"
+    )
+    ended = start(*TINY, "study=f", LR, "sweep.trials=30", "reward.file=broken.py").end()
+    assert ended.code == 3, ended.stderr
+    assert "all 3 trials so far failed" in ended.complaint
+    assert "ZeroDivisionError" in ended.complaint
+    states = [trial.state for trial in load(tmp_path, "f").trials]
+    assert states.count(optuna.trial.TrialState.FAIL) >= 3
+    assert optuna.trial.TrialState.PRUNED not in states
+    assert all("ZeroDivisionError" in t.user_attrs["traceback"] for t in load(tmp_path, "f").trials[:3])

@@ -1,0 +1,203 @@
+import threading
+
+import pytest
+from mlflow import MlflowClient
+
+from deepracer_exp.config.running import TrackingOff
+from deepracer_exp.tracking.mlflow_run import MLflowRun, StoreUnavailableError
+from deepracer_exp.tracking.store import Store
+from deepracer_exp.tracking.study_run import (
+    Progress,
+    StudyRun,
+    end_trial_run,
+    open_study_run,
+    open_trial_run,
+)
+from deepracer_exp.tracking.tracking_file import Told
+
+SPACE = {"algorithm.lr": "tag(log, interval(1e-5, 1e-3))"}
+BASE = ["track=reinvent_base", "+reward.constants.X=a<b"]
+
+
+def progress(ended=3, **changes) -> Progress:
+    told = {
+        "total": 60,
+        "complete": ended - 2,
+        "pruned": 1,
+        "failed": 1,
+        "env_steps": 12_000,
+        "best_trial": 7,
+    }
+    told |= {"best_values": {"race_score": 9.5}, "best_line": "deepracer-exp train a=1", "lap_time_s": 9.4}
+    return Progress(**(told | {"completion": 98.0} | changes))
+
+
+def runs_of(store: Store, name="spring"):
+    client = MlflowClient(tracking_uri=store.uri)
+    return client.search_runs([client.get_experiment_by_name(name).experiment_id])
+
+
+def test_the_run_of_a_study_tells_its_search_its_progress_and_its_best(store, tmp_path):
+    run = StudyRun(store, "spring", SPACE, BASE)
+    run_id = run.wait_for_id(60)
+    run.update(progress())
+    report = tmp_path / "report.html"
+    report.write_text("<p>old</p>")
+    run.pictures([report])
+    assert run.finish("FINISHED", 60)
+    (found,) = runs_of(store)
+    assert (found.info.run_id, found.info.status, found.info.run_name) == (run_id, "FINISHED", "sweep spring")
+    assert found.data.params == {**SPACE, "track": "reinvent_base", "reward.constants.X": "a<b"}
+    assert found.data.tags["sweep.progress"] == "3 of 60 trials: 1 complete, 1 pruned, 1 failed"
+    assert (found.data.tags["sweep.best_trial"], found.data.tags["end"]) == ("7", "finished")
+    assert "deepracer-exp train a=1" in found.data.tags["mlflow.note.content"]
+    assert found.data.metrics["best_race_score"] == 9.5
+    assert (found.data.metrics["eval_lap_time_s"], found.data.metrics["trials_complete"]) == (9.4, 1)
+    client = MlflowClient(tracking_uri=store.uri)
+    assert [file.path for file in client.list_artifacts(run_id)] == ["report.html"]
+
+
+def test_whoever_goes_on_with_a_study_goes_on_with_its_run(store):
+    first = StudyRun(store, "spring", SPACE, BASE)
+    first.update(progress(3))
+    assert first.finish("KILLED", 60)
+    second = StudyRun(store, "spring", SPACE, BASE)
+    assert second.wait_for_id(60) == first.run_id
+    (found,) = runs_of(store)
+    assert (found.info.status, "end" in found.data.tags) == ("RUNNING", False)
+    second.update(progress(3))
+    second.update(progress(4))
+    assert second.finish("FINISHED", 60)
+    client = MlflowClient(tracking_uri=store.uri)
+    assert [point.step for point in client.get_metric_history(first.run_id, "trials_complete")] == [3, 4]
+
+
+def test_another_search_of_the_same_name_gets_a_run_of_its_own(store):
+    ids = set()
+    for space in (SPACE, {"algorithm.lr": "interval(0, 1)"}):
+        run = StudyRun(store, "spring", space, BASE)
+        ids.add(run.wait_for_id(60))
+        assert run.finish("FINISHED", 60)
+    assert len(ids) == 2
+
+
+def test_two_drivers_that_begin_at_once_share_one_run(store):
+    drivers = [StudyRun(store, "spring", SPACE, BASE) for _ in range(4)]
+    ids = {driver.wait_for_id(120) for driver in drivers}
+    assert all(driver.finish("FINISHED", 60) for driver in drivers)
+    (found,) = runs_of(store)
+    assert ids == {found.info.run_id}
+
+
+def test_of_two_runs_created_at_the_same_moment_the_older_one_stays(store, monkeypatch):
+    told = Told(None, "sweep", "spring", 2000, store.shown, tags={"sweep.study": "spring"})
+    mine, theirs = MLflowRun(store), MLflowRun(store)
+    mine.connect()
+    theirs.connect()
+    create = MLflowRun.create
+
+    def create_after_the_other(run, told, *, again):
+        # The other one looked before this run was there, and created its own a little earlier.
+        create(theirs, Told(None, "sweep", "spring", 1000, store.shown, tags=told.tags), again=False)
+        create(run, told, again=again)
+
+    monkeypatch.setattr(MLflowRun, "create", create_after_the_other)
+    mine.create_once(told, ["sweep.study"])
+    assert mine.run_id == theirs.run_id
+    assert [run.info.run_id for run in runs_of(store)] == [theirs.run_id]
+
+
+def test_a_store_that_comes_late_gets_the_newest_progress_only(store, monkeypatch, caplog):
+    is_up, connect = threading.Event(), MLflowRun.connect
+
+    def connect_if_up(run):
+        if not is_up.is_set():
+            raise StoreUnavailableError("down")
+        connect(run)
+
+    monkeypatch.setattr(MLflowRun, "connect", connect_if_up)
+    run = StudyRun(store, "spring", SPACE, BASE)
+    assert run.wait_for_id(1.0) is None
+    for ended in range(3, 9):
+        run.update(progress(ended))
+    is_up.set()
+    run_id = run.wait_for_id(60)
+    assert run.finish("FINISHED", 60)
+    client = MlflowClient(tracking_uri=store.uri)
+    assert [point.step for point in client.get_metric_history(run_id, "trials_complete")] == [8]
+    assert sum("does not answer" in record.message for record in caplog.records) == 1
+
+
+def test_a_store_that_never_answers_holds_up_nothing(free_port, caplog):
+    nobody = Store(f"http://127.0.0.1:{free_port}", None)
+    run = StudyRun(nobody, "spring", SPACE, BASE)
+    run.update(progress())
+    assert not run.finish("FINISHED", 1.0)
+    assert run.run_id is None
+    assert "could not be marked FINISHED" in caplog.text
+    assert open_trial_run(nobody, "spring", 7, "0" * 32, []) is None
+    assert "trial 7 has no run there" in caplog.text
+
+
+def test_a_missing_file_stops_no_other(store, tmp_path, caplog):
+    run = StudyRun(store, "spring", SPACE, BASE)
+    run_id = run.wait_for_id(60)
+    (tmp_path / "there.html").write_text("x")
+    run.pictures([tmp_path / "there.html", tmp_path / "missing.html"])
+    assert run.finish("FINISHED", 60)
+    client = MlflowClient(tracking_uri=store.uri)
+    assert [file.path for file in client.list_artifacts(run_id)] == ["there.html"]
+    assert "missing.html is gone" in caplog.text
+
+
+def test_a_run_deleted_in_the_ui_is_told_once_and_holds_up_nothing(store, wait_until, caplog):
+    run = StudyRun(store, "spring", SPACE, BASE)
+    MlflowClient(tracking_uri=store.uri).delete_run(run.wait_for_id(60))
+    run.update(progress(3))
+    wait_until(lambda: "refused" in caplog.text)
+    run.update(progress(4))
+    assert not run.finish("FINISHED", 60)
+    assert sum("refused" in record.message for record in caplog.records) == 1
+
+
+def test_the_seeds_of_a_trial_stand_under_one_run_whoever_asks(store):
+    study = StudyRun(store, "spring", SPACE, BASE)
+    parent = study.wait_for_id(60)
+    ids = {open_trial_run(store, "spring", 7, parent, ["algorithm.lr=0.001"]) for _ in range(2)}
+    other = open_trial_run(store, "spring", 8, parent, ["algorithm.lr=0.002"])
+    (run_id,) = ids
+    end_trial_run(store, "spring", run_id, "FINISHED", "finished: converged", {"eval_lap_time_s": 9.1})
+    study.finish("FINISHED", 60)
+    found = {run.info.run_id: run for run in runs_of(store)}
+    assert set(found) == {parent, run_id, other}
+    assert found[run_id].data.tags["mlflow.parentRunId"] == parent
+    assert found[run_id].data.params == {"algorithm.lr": "0.001"}
+    assert (found[run_id].info.status, found[run_id].data.metrics) == ("FINISHED", {"eval_lap_time_s": 9.1})
+    assert found[other].info.status == "RUNNING"
+
+
+def test_a_store_that_hangs_holds_up_a_trial_for_its_deadline_at_most(store, monkeypatch, caplog):
+    goes_on = threading.Event()
+
+    def hang(run):
+        goes_on.wait(60)
+        raise StoreUnavailableError("gone")
+
+    monkeypatch.setattr(MLflowRun, "connect", hang)
+    assert open_trial_run(store, "spring", 7, "0" * 32, [], deadline_s=0.2) is None
+    goes_on.set()
+    assert "trial 7 has no run there" in caplog.text
+
+
+def test_without_tracking_a_study_has_no_run(tmp_path):
+    assert open_study_run(TrackingOff(kind="off"), tmp_path, "spring", SPACE, BASE) is None
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("status", ["FAILED", "KILLED"])
+def test_a_study_that_ended_badly_says_so(store, status):
+    run = StudyRun(store, "spring", SPACE, BASE)
+    assert run.finish(status, 60)
+    (found,) = runs_of(store)
+    assert found.info.status == status
+    assert found.data.tags["end"] in ("failed", "interrupted")
