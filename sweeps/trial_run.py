@@ -2,10 +2,10 @@
 
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import optuna
 from optuna.storages import BaseStorage
@@ -35,7 +35,10 @@ from .ledger import Ledger
 from .plan import Plan
 from .pruners import AnyPruner, is_beaten_across_seeds
 from .score import value_on_the_way, values_of
+from .storage import patiently
+from .verdict import Verdict
 
+Value = TypeVar("Value")
 Start = tuple[ActorCritic, Lineage]
 _SHOWN = ("iteration", "env_steps", "completion", "entropy", "eval_completion", "eval_lap_time_s")
 """Columns of metrics.jsonl for the live table."""
@@ -158,36 +161,39 @@ class TrialRun:
         run = {"seed": self._now, "run_dir": str(run_dir.resolve()), "status": None, "value": None}
         self._note(self._now, run)
         # The entropy pruner reads the run's rows there.
-        self._trial.set_user_attr("run_dir", run["run_dir"])
+        self._patiently(lambda: self._trial.set_user_attr("run_dir", run["run_dir"]))
 
     def sees(self, row: Mapping[str, Any]) -> str | None:
         """Keep the claim and ask the pruners."""
         self._lease.confirm()
         self._lease.show({name: row.get(name) for name in _SHOWN} | {"number": self._number})
-        objectives = self._plan.config.objectives
-        value = value_on_the_way(row, objectives[0], self._plan.protocol.time_s)
+        value = value_on_the_way(row, self._plan.config.objectives[0], self._plan.protocol.time_s)
         if value is None or self._now > 0:
             return None
-        if len(objectives) == 1:
+        verdict = self._patiently(lambda: self._compared(value))
+        if verdict is None:
+            return None
+        self._pruned_by, reason = verdict
+        return f"{self._pruned_by}: {reason}"
+
+    def _compared(self, value: float) -> Verdict | None:
+        """Tell Optuna of an evaluation, and return what the pruners say."""
+        if len(self._plan.config.objectives) == 1:
             # Optuna compares trials by one number only.
             rows = read_metrics(Path(self._runs[0]["run_dir"]) / "metrics.jsonl")
             step = 1 + sum(row["eval_completion"] is not None for row in rows)
             if step not in self._storage.get_trial(self._trial_id).intermediate_values:
                 self._trial.report(value, step)
         assert isinstance(self._study.pruner, AnyPruner)
-        verdict = self._study.pruner.verdict(self._study, self._storage.get_trial(self._trial_id))
-        if verdict is None:
-            return None
-        self._pruned_by, reason = verdict
-        return f"{self._pruned_by}: {reason}"
+        return self._study.pruner.verdict(self._study, self._storage.get_trial(self._trial_id))
 
     def _overrides(self) -> list[str]:
         """Return what the trial is, as told to `deepracer-exp train` (of a clone: `clone`)."""
         told = self._trial.user_attrs.get("overrides")
         if told is None:
-            told = self._plan.space.suggest(self._trial)
+            told = self._patiently(lambda: self._plan.space.suggest(self._trial))
             self._lease.confirm()
-            self._trial.set_user_attr("overrides", told)
+            self._patiently(lambda: self._trial.set_user_attr("overrides", told))
         return list(told)
 
     def _made(self, index: int, overrides: Sequence[str]) -> dict[str, Any]:
@@ -248,7 +254,7 @@ class TrialRun:
             run_dir = copied(run_dir, self._lease.claim.attempt)
             self.begins(run_dir)
         else:
-            self._trial.set_user_attr("run_dir", str(run_dir))
+            self._patiently(lambda: self._trial.set_user_attr("run_dir", str(run_dir)))
         try:
             return resume(run_dir, [], Console(quiet=True), self)
         except RunEnded:
@@ -292,6 +298,9 @@ class TrialRun:
         status: Status = "FAILED" if result.outcome == "FAIL" else "FINISHED"
         told = f"{result.outcome.lower()}: {result.attrs['reason']}"
         end_trial_run(self._plan.store, self._plan.study, above, status, told, values)
+
+    def _patiently(self, call: Callable[[], Value]) -> Value:
+        return patiently(call, self._plan.config.patience_s)
 
     def _note(self, index: int, run: dict[str, Any]) -> None:
         self._runs[index:] = [run]

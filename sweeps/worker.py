@@ -78,7 +78,9 @@ class Worker:
 
     def _result(self, lease: Lease) -> Result:
         study, trial_id = self._study(), self._trial_id(lease)
-        run = TrialRun(self._plan, self._ledger, lease, study, self._storage.optuna, trial_id)
+        run = self._patiently(
+            lambda: TrialRun(self._plan, self._ledger, lease, study, self._storage.optuna, trial_id)
+        )
         try:
             return run.make()
         except BadInput as error:

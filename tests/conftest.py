@@ -21,6 +21,10 @@ from hypothesis import settings
 
 from deepracer_exp.cli import main
 
+from .postgres import postgres, postgres_server
+
+__all__ = ["postgres", "postgres_server"]
+
 # A deadline is a timed test: it fails on a busy machine.
 settings.register_profile("no_deadline", deadline=None)
 settings.load_profile("no_deadline")

@@ -5,6 +5,7 @@
 
 import os
 import random
+import signal
 import time
 from pathlib import Path
 
@@ -225,3 +226,19 @@ def test_two_drivers_share_one_study(sweep, tmp_path, seed):
     for one in both:
         one.end()
     assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+@pytest.mark.parametrize("seed", TIMES)
+def test_while_the_database_is_away_everybody_waits_and_then_goes_on(sweep, tmp_path, postgres, seed):
+    moment, url = random.Random(seed), postgres.new_database()
+    running = sweep("sweep.workers=2", f"sweep.storage={url}", at_random=moment)
+    postgres.stop(moment.choice([signal.SIGINT, signal.SIGQUIT]))
+    time.sleep(moment.uniform(1.0, 9.0))  # shorter and longer than a lease
+    assert running.command.popen.poll() is None
+    postgres.start()
+    running.end()
+    assert_every_trial_is_accounted_for_once(tmp_path, url)
+    said = running.log() + "".join(path.read_text() for path in tmp_path.glob("std*.txt"))
+    assert postgres.password not in said
+    study = optuna.load_study(study_name="s", storage=open_storage(url, tmp_path).optuna)
+    assert postgres.password not in str(study.user_attrs)
