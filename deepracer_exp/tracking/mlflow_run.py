@@ -108,7 +108,8 @@ class MLflowRun:
     def create_once(self, told: Told, mark: Sequence[str]) -> None:
         """Create a run, or go on with the oldest one in its experiment that has the same values of some tags.
 
-        Of two processes that create it at once both go on with one run, and the other run is deleted.
+        Of two processes that create it at once one sees the other's, goes on with that and deletes its own; MLflow has
+        no way to be sure of it, so that rarely there may be two.
 
         Args:
             told: of the run.

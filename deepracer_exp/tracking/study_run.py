@@ -70,7 +70,7 @@ class StudyRun:
     """Keeps a study's run in MLflow up to date, from a thread of its own.
 
     Only the newest progress counts: while the store does not answer, older ones are forgotten. Whoever goes on with
-    the study goes on with its run; several drivers may do so at once.
+    the study goes on with its run.
     """
 
     def __init__(self, store: Store, study: str, space: Mapping[str, str], base: Sequence[str]) -> None:
