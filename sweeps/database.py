@@ -79,7 +79,7 @@ class Database:
 
     @contextmanager
     def creation_lock(self, engine: sa.Engine | None) -> Iterator[None]:
-        """Let one process at a time make the tables.
+        """Let one process at a time make what there shall be one of: the tables, the study's run in MLflow.
 
         Optuna has no lock of its own here: of processes that begin together all but one fail, with "table already
         exists" or with a version that stands there twice. The lock goes with the process that holds it.

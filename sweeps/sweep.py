@@ -15,7 +15,7 @@ from rich.console import Console
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.running import TrackingOff
+from deepracer_exp.config.running import TrackingConfig, TrackingOff
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import build_setup
@@ -25,6 +25,7 @@ from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
 from .best import best_line, best_trial, best_values, complete_trials, write_best
+from .database import resolve_database
 from .driver import Driver
 from .ledger import Ledger, Slot
 from .plan import Plan
@@ -72,7 +73,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     storage = open_storage(config.storage, runs_dir)
     study = open_study(request, overrides, space, storage, runs_dir)
     workers = config.workers or _cores()
-    study_run = open_study_run(experiment.tracking, runs_dir, request.study, space.as_text(), request.base)
+    study_run, study_run_id = begin_study_run(request, space, experiment.tracking, storage, runs_dir)
     plan = Plan(
         study=request.study,
         runs_dir=runs_dir,
@@ -81,7 +82,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
         space=space,
         parent=request.entry.parent,
         store=_store(experiment, runs_dir),
-        study_run_id=None if study_run is None else study_run.wait_for_id(),
+        study_run_id=study_run_id,
         evaluations=_evaluations(experiment),
         cores=max(1, _cores() // workers),
     )
@@ -95,6 +96,27 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
         if study_run is not None:
             study_run.finish(status)
     return study, plan.folder, code
+
+
+def begin_study_run(
+    request: SweepRequest, space: SearchSpace, tracking: TrackingConfig, storage: Storage, runs_dir: Path
+) -> tuple[StudyRun | None, str | None]:
+    """Begin the run of a study in MLflow, or go on with it; return it with its id.
+
+    Args:
+        request: what is asked for.
+        space: of the request.
+        tracking: of the trials.
+        storage: of the study.
+        runs_dir: where its runs are.
+
+    Returns:
+        None, None with `tracking=off`; no id where the store does not answer.
+    """
+    # MLflow cannot be told to make a run only where there is none: one driver at a time looks and makes it.
+    with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
+        run = open_study_run(tracking, runs_dir, request.study, space.as_text(), request.base)
+        return run, None if run is None else run.wait_for_id()
 
 
 def _driven(

@@ -5,10 +5,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
 from deepracer_exp.errors import BadInput
 
+from .typed_file import read_typed
 from .whole_file import write_whole
 
 BEST_OF_SWEEP = "best_of_sweep.json"
@@ -41,17 +42,7 @@ def read_best_of_sweep(folder: Path) -> BestOfSweep | None:
     Raises:
         BadInput: the file cannot be read or holds something else.
     """
-    file = folder / BEST_OF_SWEEP
-    try:
-        return _ADAPTER.validate_json(file.read_bytes(), strict=True)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise BadInput(f"{file}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        finding = error.errors(include_url=False)[0]
-        where = "".join(f" {part}:" for part in finding["loc"])
-        raise BadInput(f"{file}:{where} {finding['msg']}; wanted is what a sweep writes there") from error
+    return read_typed(folder / BEST_OF_SWEEP, _ADAPTER, "a sweep")
 
 
 def run_of_sweep(folder: Path) -> Path | None:

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 
-from deepracer_exp.errors import BadInput
+from .typed_file import read_typed
 
 LINEAGE = "lineage.json"
 
@@ -40,14 +40,4 @@ def read_lineage(run: Path) -> Lineage | None:
     Raises:
         BadInput: the file cannot be read or holds something else.
     """
-    file = run / LINEAGE
-    try:
-        return _ADAPTER.validate_json(file.read_bytes(), strict=True)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise BadInput(f"{file}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        finding = error.errors(include_url=False)[0]
-        where = "".join(f" {part}:" for part in finding["loc"])
-        raise BadInput(f"{file}:{where} {finding['msg']}; wanted is what a clone writes there") from error
+    return read_typed(run / LINEAGE, _ADAPTER, "a clone")

@@ -28,11 +28,12 @@ from deepracer_exp.tracking.store import redact
 from .alerts import Alerts
 from .budget import Budget, refuse_spent
 from .checkpoints import read_training
+from .header import track_names
 from .origin import refuse_changes
 from .outcome import Outcome
 from .run_folder import RunFolder
 from .signals import Interruption
-from .training import SPENT, TIMES, Training, track_names
+from .training import SPENT, TIMES, Training
 from .watching import TakenOver, Watch
 
 __all__ = ["TIMES", "Outcome", "RunEnded", "read_files", "resume", "train"]

@@ -22,7 +22,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.formats.trace import TraceWriter, to_table
 from deepracer_exp.tracking.delivery import ENDS
-from deepracer_exp.tracking.names import END_TAG, joined
+from deepracer_exp.tracking.names import END_TAG
 from deepracer_exp.tracking.recorder import Tracker
 
 from .alerts import Alerts
@@ -30,10 +30,11 @@ from .best import Best
 from .budget import Budget
 from .checkpoints import CheckpointStore, read_agent
 from .collection import Collection, worker_count
-from .display import ProgressDisplay, RunHeader
+from .display import ProgressDisplay
 from .episodes import Finished
 from .examination import NOT_EVALUATED, Examination, Mark
 from .faults import write_fault
+from .header import run_header, track_names
 from .iterations import frames_per_batch, iterations
 from .log_file import log_to
 from .origin import origin
@@ -98,7 +99,9 @@ class Training:
         self._results = Results(self._tracks, cars, experiment.car.control_period_s, experiment.stopping)
         self._ranking = Ranking([course.tracks[0].length_m for course in setup.courses])
         self._trace = TraceWriter(folder.path / "trace")
-        self._display = ProgressDisplay(console, self._header())
+        self._display = ProgressDisplay(
+            console, run_header(folder, setup, names, self._results, self._budget)
+        )
         # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
         # update took 25 times as long.
         torch.set_num_threads(1)
@@ -396,22 +399,3 @@ class Training:
             "episodes": self._results.book.all.finished,
             "laps": self._results.book.all.laps,
         }
-
-    def _header(self) -> RunHeader:
-        return RunHeader(
-            name=self.folder.name,
-            track=joined([course.tracks[0].title for course in self.setup.courses], " + "),
-            track_labels=tuple(self._results.labels),
-            remembered=self._results.remembered,
-            reward=self._names["reward"],
-            network=self._names["network"],
-            actions=self._names["action_space"],
-            budget=str(self._budget),
-            folder=str(self.folder.path),
-        )
-
-
-def track_names(setup: RaceSetup) -> list[str]:
-    """Return what the courses are called: one by its own name, which may stand in a file; several by their options."""
-    courses = setup.courses
-    return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
