@@ -95,6 +95,8 @@ class SweepView:
         running = [slot for slot in slots if slot.outcome is None]
         if running:
             parts += [Text(), self._running(running)]
+        elif not slots and not self.stage:
+            parts += [Text(), Text("workers start", style="dim")]
         if self.stage:
             parts += [Text(), Text(self.stage, style="dim")]
         return Panel(Group(*parts), title=self._plan.study, title_align="left", border_style="dim")
@@ -103,17 +105,17 @@ class SweepView:
         total = self._plan.config.trials
         counts = collections.Counter(slot.outcome for slot in slots)
         ended = sum(counts[one] for one in _OUTCOMES)
-        told = "  ".join(f"{counts[one]} {word}" for one, word in _OUTCOMES.items())
+        told = ", ".join(f"{counts[one]} {word}" for one, word in _OUTCOMES.items())
         here = ended - len(self._before or ())
         hours = (time.monotonic() - self._began) / 3600
         rate = here / hours if here else None
         grid = Table.grid(padding=(0, 2))
         grid.add_column(style="dim")
         grid.add_column()
-        grid.add_row("trials", Group(ProgressBar(total, min(ended, total), width=40), Text(told)))
-        speed = NOTHING if rate is None else f"{rate:.0f} an hour"
-        left = NOTHING if rate is None else duration((total - ended) / rate * 3600)
-        grid.add_row("speed", f"{speed}, {left} left")
+        grid.add_row("trials", ProgressBar(total, min(ended, total), width=40))
+        grid.add_row("", f"{ended} of {total}: {told}")
+        left = NOTHING if rate is None else duration(max(total - ended, 0) / rate * 3600)
+        grid.add_row("speed", NOTHING if rate is None else f"{rate:.0f} an hour, {left} left")
         grid.add_row("best", _best(slots, self._plan.config.objectives))
         return grid
 
