@@ -87,10 +87,10 @@ class Collection:
             )
         self._watchdog: Watchdog | None = None
         parts = self._workers if config.mode == "sync" else 1
-        self._steps_per_batch = -(-frames_per_batch // (parts * config.cars))
+        steps_per_batch = -(-frames_per_batch // (parts * config.cars))
         factory = functools.partial(EnvFactory, setup=setup, n_cars=config.cars, run_dir=run_dir)
         options: dict[str, Any] = {
-            "frames_per_batch": self._steps_per_batch * parts * config.cars,
+            "frames_per_batch": steps_per_batch * parts * config.cars,
             "total_frames": -1,
             "use_buffers": True,
             "trust_policy": True,
@@ -113,6 +113,8 @@ class Collection:
             ]
             self._collector = self._start(envs, policy, options)
             self._watchdog.workers_started(self._collector.procs)
+            if config.mode == "sync":
+                _tell_deliveries(self._collector.queue_out, self._watchdog)
         self._source = iter(self._collector)
         if self._begun_from:
             with contextlib.ExitStack() as undo:
@@ -287,7 +289,7 @@ class Collection:
         if self._watchdog is None:
             with self._own_stream():
                 return next(self._source)
-        self._watchdog.expect(self._batches * self._steps_per_batch)
+        self._watchdog.expect()
         try:
             batch = next(self._source)
         except (RuntimeError, ValueError, OSError, EOFError) as error:  # what TorchRL and a broken pipe raise
@@ -331,6 +333,20 @@ class Collection:
             with contextlib.suppress(ValueError):  # a handle TorchRL has closed: that worker is gone
                 process.kill()
                 process.join()
+
+
+def _tell_deliveries(queue: Any, watchdog: Watchdog) -> None:
+    """Let the watchdog know of each worker's part that is taken from the queue of TorchRL's synchronous collector."""
+    get = queue.get
+
+    def get_and_tell(*args: Any, **options: Any) -> Any:
+        message = get(*args, **options)
+        # A worker's number; the first time its buffer and its number.
+        part, _ = message
+        watchdog.delivered(part if isinstance(part, int) else part[1])
+        return message
+
+    queue.get = get_and_tell
 
 
 def _name(worker: int) -> str:

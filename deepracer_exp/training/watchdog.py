@@ -34,8 +34,8 @@ class Watchdog:
             heartbeat: file to create, one int64 per worker.
             workers: number of workers.
             timeout_s: seconds without a step that count as hanging.
-            lockstep: every worker takes the same number of steps per batch, so that one which has done its part
-                may rest (synchronous collection).
+            lockstep: every worker delivers one part of each batch, and may rest until the next is asked for
+                (synchronous collection).
         """
         self._file = heartbeat
         np.full(workers, -1, np.int64).tofile(heartbeat)
@@ -43,7 +43,7 @@ class Watchdog:
         self._timeout_s = timeout_s
         self._start_timeout_s = max(_START_TIMEOUT_S, timeout_s)
         self._lockstep = lockstep
-        self._due = 0
+        self._delivered = np.zeros(workers, bool)
         self._processes: Sequence[BaseProcess] | None = None
         self._waiting = threading.Event()
         self._waiting.set()
@@ -65,10 +65,14 @@ class Watchdog:
 
         threading.Thread(target=wait_for_a_death, name="first death", daemon=True).start()
 
-    def expect(self, steps: int) -> None:
-        """Note that each worker has been asked to reach `steps` control steps, and that we wait for it."""
-        self._due = steps
+    def expect(self) -> None:
+        """Note that each worker has been asked for its part of a batch, and that we wait for it."""
+        self._delivered[:] = False
         self._waiting.set()
+
+    def delivered(self, worker: int) -> None:
+        """Note that a worker's part has arrived: its last step alone is no proof, it may hang right after that."""
+        self._delivered[worker] = True
 
     def rest(self) -> None:
         """Note that nothing is waited for."""
@@ -87,8 +91,7 @@ class Watchdog:
         while not self._over.wait(_LOOK_EVERY_S):
             now = time.monotonic()
             beats = np.array(self._beats)
-            resting = self._lockstep and self._due > 0
-            owes = (beats < self._due) if resting else np.ones(len(beats), bool)
+            owes = ~self._delivered if self._lockstep else np.ones(len(beats), bool)
             # A longer pause was ours: the whole run stopped with Ctrl-Z, or the machine asleep.
             idle_s += min(now - looked, 2 * _LOOK_EVERY_S) if self._waiting.is_set() else 0.0
             idle_s[(beats != seen) | ~owes] = 0.0

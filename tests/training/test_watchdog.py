@@ -61,7 +61,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     dog.workers_started(processes)
     counters = beats()
     counters[:] = 1
-    dog.expect(100)
+    dog.expect()
     _keep_beating(counters, [1], 4.0)
     _wait_until(lambda: dog.verdict)
     assert list(dog.verdict) == [0]
@@ -71,14 +71,28 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     assert processes[1].is_alive()
 
 
-def test_a_worker_that_has_done_its_part_may_rest_in_lockstep(watch, beats, processes):
+def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats, processes):
+    dog = watch(lockstep=True)
+    dog.workers_started(processes)
+    beats()[:] = 10
+    dog.expect()
+    dog.delivered(0)
+    _wait_until(lambda: dog.verdict)
+    assert list(dog.verdict) == [1]
+
+
+def test_what_arrived_is_no_excuse_for_the_next_batch(watch, beats, processes):
+    """A worker may hang after the last step of its part as well as within it."""
     dog = watch(lockstep=True)
     dog.workers_started(processes)
     counters = beats()
-    counters[:] = [10, 1]
-    dog.expect(10)
+    counters[:] = 10
+    dog.expect()
+    dog.delivered(0)
+    dog.expect()
+    _keep_beating(counters, [1], 4.0)
     _wait_until(lambda: dog.verdict)
-    assert list(dog.verdict) == [1]
+    assert list(dog.verdict) == [0]
 
 
 def test_nobody_is_ended_while_nothing_is_waited_for(watch, beats, processes):
