@@ -15,7 +15,8 @@ draws that no evaluation of the training had, so that the figures are not those 
 - `steps_saved`: share of all runs' control steps that need not have been driven;
 - `lap_time_loss`: how much slower the kept checkpoint's mean lap is, as a share; mean over the runs where both
   checkpoints complete laps (`without_lap` counts the others);
-- `completion_kept`, `completion_full`: per cent of the lap, mean over runs; likewise on held-out conditions.
+- `completion_kept`, `completion_full`: per cent of the lap, mean over runs; likewise on held-out conditions;
+  `completion_change` is their difference, with its interval over runs.
 
 The tracks differ in length and shape: the default one (17.7 m, 0.76 m wide), the narrowest (Oval_track, 19.6 m, 0.67 m
 wide) and a real circuit more than three times as long, driven clockwise (Spain_track, 60.0 m).
@@ -149,12 +150,15 @@ def summarize(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures over runs."""
     losses = [run["lap_time_loss"] for run in runs]
     loss = mean_and_interval(losses)
+    change = mean_and_interval([run["completion_kept"] - run["completion_full"] for run in runs])
     total = sum(run["env_steps"] + run["saved_steps"] for run in runs)
     return {
         "steps_saved": round(sum(run["saved_steps"] for run in runs) / total, 4),
         "lap_time_loss": loss["mean"],
         "lap_time_loss_interval": loss["interval"],
         "without_lap": losses.count(None),
+        "completion_change": change["mean"],
+        "completion_change_interval": change["interval"],
         **{
             f"{key}_{which}": round(statistics.fmean(run[f"{key}_{which}"] for run in runs), 4)
             for key in _MEANS

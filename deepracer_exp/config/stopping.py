@@ -59,6 +59,10 @@ class ConvergedRule:
     """Growth of the laps per step that counts, as a share of their best."""
     entropy_change: NonNegative
     """Change of the normalised entropy that is flat."""
+    best_patience: Count
+    """Iterations without a better policy, as far as policies are evaluated."""
+    best_gain: Fraction
+    """How much better its race score must be, as a share."""
 
 
 @dataclass(frozen=True, kw_only=True)

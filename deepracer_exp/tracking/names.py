@@ -21,6 +21,7 @@ METRICS: Mapping[str, str] = {
     "eval_completion": "per cent of the lap driven in the evaluation, mean",
     "held_out_completion": "the same on conditions that were not trained on",
     "eval_lap_time_s": "mean time of the evaluation's complete laps",
+    "eval_race_score_s": "seconds per complete lap of the evaluation on all its conditions, failed laps included",
     "mean_return": "sum of rewards per finished episode, mean",
     "entropy": "entropy of the policy",
     "kl": "change of the policy in this iteration (KL divergence)",
@@ -45,10 +46,13 @@ END_TAG = "end"
 
 _LONGEST_LABEL = 80  # MLflow takes 250 characters, older servers fewer; the UI shows about 40
 
+_MOST_PARAMS = 12  # columns of the table; a tag of an experiment takes 5,000 characters
+
 VIEW = "racing"
 """Name of the view of the runs table that the UI opens with."""
 
 _COLUMNS = (
+    "attributes.Duration",
     "metrics.`eval_lap_time_s`",
     "metrics.`eval_completion`",
     "metrics.`best_lap_time_s`",
@@ -60,16 +64,47 @@ _COLUMNS = (
     "params.`algorithm.lr`",
     "params.`track`",
     "params.`seed`",
-    "attributes.`Duration`",
 )
+
+
+def _view(columns: Sequence[str], **more: Any) -> dict[str, str]:
+    """Return the tag of an experiment that makes its runs table open with these columns, in this order."""
+    # As wide as their names; MLflow cuts them off at 100 pixels.
+    widths = {column: max(100, 44 + 8 * len(column.partition(".")[2].strip("`"))) for column in columns}
+    state = {"selectedColumns": columns, "columnOrder": columns, "columnWidths": widths, **more}
+    return {f"mlflow.sharedViewState.{VIEW}": json.dumps(state)}
+
 
 EXPERIMENT_TAGS: Mapping[str, str] = {
     # Shows runs: MLflow's UI takes an experiment of unknown kind for chats of a language model.
     "mlflow.experimentKind": "custom_model_development",
     # Without it the runs table has no metric and no parameter until somebody chooses its columns.
-    f"mlflow.sharedViewState.{VIEW}": json.dumps({"selectedColumns": _COLUMNS}),
+    **_view(_COLUMNS),
 }
 """Tags of an experiment, set when it is created."""
+
+
+def trial_metric(objective: str) -> str:
+    """Return the name of a trial's value in MLflow, which no metric of its training has."""
+    return f"trial_{objective}"
+
+
+def study_view(objectives: Sequence[str], searched: Sequence[str], run_id: str) -> dict[str, str]:
+    """Return the tag of an experiment that makes its runs table open as that of a study.
+
+    Args:
+        objectives: of the study; its trials' values come first.
+        searched: parameters that trials differ in.
+        run_id: of the study's run, which is unfolded.
+    """
+    metrics = (*map(trial_metric, objectives), "eval_lap_time_s", "eval_completion")
+    columns = [
+        "attributes.Duration",
+        *(f"metrics.`{name}`" for name in metrics),
+        *(f"params.`{name}`" for name in searched[:_MOST_PARAMS]),
+        f"tags.`{END_TAG}`",
+    ]
+    return _view(columns, runsExpanded={run_id: True})
 
 
 def in_order(metrics: Mapping[str, float | None]) -> list[tuple[str, float | None]]:

@@ -20,13 +20,15 @@ class Mark:
     """The same on the held-out conditions; None where there are none."""
     eval_lap_time_s: float | None
     """Mean time of the complete laps on the usual conditions, over all tracks."""
+    eval_race_score_s: float | None
+    """Seconds per complete lap on all conditions, failed laps included; None without a lap on each track."""
 
     def columns(self) -> dict[str, float | None]:
         """Return what stands in a row of metrics.jsonl."""
         return {name: getattr(self, name) for name in COLUMNS}
 
 
-COLUMNS = ("eval_completion", "held_out_completion", "eval_lap_time_s")
+COLUMNS = ("eval_completion", "held_out_completion", "eval_lap_time_s", "eval_race_score_s")
 NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(COLUMNS)
 
 
@@ -68,4 +70,5 @@ class Examination:
             eval_completion=usual.completion,
             held_out_completion=evaluation.on(HELD_OUT).completion if has_held_out else None,
             eval_lap_time_s=usual.mean_lap_time_s,
+            eval_race_score_s=evaluation.race_score_s,
         )

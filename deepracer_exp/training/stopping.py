@@ -99,6 +99,7 @@ class Stopping:
         window = config.window if isinstance(config, PlateauStopping | EntropyStopping) else 1
         names = ("entropy", "completion", "mean_return", "laps_per_1000_steps", *EVALUATED)
         self._seen = {name: _Average(window) for name in names}
+        self._race_scores_s: list[float] = []  # infinite where none is known
         self._rows = 0
 
     def observe(self, row: Row) -> Decision | None:
@@ -111,6 +112,8 @@ class Stopping:
         self._rows += 1
         for name, value in self._watched(row).items():
             self._seen[name].add(value)
+        score_s = row.get("eval_race_score_s")
+        self._race_scores_s.append(math.inf if score_s is None else score_s)
         return self._plateau(config) if isinstance(config, PlateauStopping) else self._entropy(config)
 
     def _watched(self, row: Row) -> dict[str, float | None]:
@@ -228,8 +231,14 @@ class Stopping:
             before, since = self._seen[name].bests(rule.patience)
             values |= {f"{name}_before": before, f"{name}_since": since}
             grew = grew or since > before + enough
+        scores_s = self._race_scores_s
+        before_s = min(scores_s[: -rule.best_patience], default=math.inf)
+        since_s = min(scores_s[-rule.best_patience :])
+        if math.isfinite(before_s) and math.isfinite(since_s):
+            values |= {"race_score_s_before": before_s, "race_score_s_since": since_s}
         if (
             grew
+            or since_s < before_s * (1 - rule.best_gain)
             or completion.now < completion.best - rule.completion_near
             or values["entropy_change"] > rule.entropy_change
         ):

@@ -90,11 +90,20 @@ def test_progress_without_a_lap_ranks_below_the_same_with_one():
     assert group(attempt(progress=50.0)).rank("progress") == (50.0, 0.0)
 
 
-def test_the_rank_is_that_of_the_usual_conditions():
-    held_out = group(attempt(1, progress=3.0), condition="held_out")
-    evaluation = Evaluation((group(attempt(0)), held_out))
-    assert evaluation.rank("progress") == group(attempt(0)).rank("progress")
-    assert evaluation.on("held_out").completion == 3.0
+def test_the_rank_is_that_of_all_conditions_together():
+    held_out = group(attempt(1, 12.0, progress=50.0), condition="held_out")
+    evaluation = Evaluation((group(attempt(0, 10.0)), held_out))
+    assert evaluation.rank("progress") == (75.0, 0.1)
+    assert evaluation.rank("lap_time") == (1.0, -10.0)
+    assert evaluation.rank("race_score") == (1.0, -22.0)
+    assert evaluation.race_score_s == 22.0
+    assert evaluation.on("held_out").completion == 50.0
+
+
+def test_there_is_no_race_score_without_a_lap_on_each_track():
+    lap, failed = group(attempt(0, 10.0), track="a"), group(attempt(1, progress=50.0), track="b")
+    assert Evaluation((lap,)).race_score_s == 10.0
+    assert Evaluation((lap, failed)).race_score_s is None
 
 
 def test_one_more_track_with_a_lap_is_worth_more_than_any_time():

@@ -40,6 +40,7 @@ def history(
     laps_per_iteration=5.0,
     lap_share=None,
     held_out=None,
+    race_score_s=None,
     noise: float = 0.0,
     seed: int = 0,
 ) -> list[dict]:
@@ -63,8 +64,9 @@ def history(
             "entropy": at(entropy, iteration) * math.log(ACTIONS),
             "lap_share": at(lap_share, iteration),
         }
-        if held_out is not None and iteration % 5 == 0:
-            row["held_out_completion"] = at(held_out, iteration)
+        if iteration % 5 == 0:
+            evaluated = {"held_out_completion": held_out, "eval_race_score_s": race_score_s}
+            row |= {name: at(value, iteration) for name, value in evaluated.items() if value is not None}
         rows.append(row)
     return rows
 
@@ -107,6 +109,16 @@ def test_a_run_that_has_learned_ends_as_converged_when_patience_is_over(until, n
 )
 def test_a_run_in_which_anything_still_moves_has_not_converged(still):
     assert stopped_at(converging(30, **still), rule()) == (None, None)
+
+
+@pytest.mark.parametrize("share", [0.98, 0.999])
+def test_a_policy_that_has_just_been_evaluated_as_better_puts_off_the_end(share):
+    """60 iterations after a gain of 2 per cent; one of a tenth per cent is none."""
+    better_at = 105
+    run = converging(30, race_score_s=lambda i: 10.0 * (share if i >= better_at else 1.0))
+    number, decision = stopped_at(run, rule())
+    assert decision.rule == "converged"
+    assert number == (better_at + 60 if share < 0.99 else stopped_at(converging(30), rule())[0])
 
 
 def test_a_run_that_drives_worse_than_it_did_has_not_converged():
