@@ -19,7 +19,7 @@ from benchmarks.report import number, table, write_json
 from benchmarks.simple_cars import bicycle, fit_formula
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.formats.recorded import read_recorded
+from deepracer_exp.formats.recording_reader import read_recording
 from deepracer_exp.sim.calibrate import FIT_STEPS, REPORT_STEPS, car_named, held_out
 from deepracer_exp.sim.recordings import Windows, cut_windows
 from deepracer_exp.sim.replay import errors, replay
@@ -111,7 +111,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         car = car_named(options.car)
-        recorded = read_recorded(options.traces)
+        recording = read_recording(options.traces)
+        for problem in recording.problems:
+            print(problem, file=sys.stderr)
+        recorded = recording.steps
         figures = measure(car, recorded, options.held_out, options.threads)
     except (BadInput, RunFailed) as error:
         print(error, file=sys.stderr)

@@ -79,10 +79,9 @@ def _held(action: Floats) -> NDArray[np.int64]:
 def _laps(car: CarConfig, recorded: pd.DataFrame) -> plt.Figure:
     """Draw the fastest laps of the last three held-out iterations, the simulated car put back every three seconds."""
     held = recorded[held_out(recorded["iteration"].to_numpy())]
-    of = ["file", "iteration", "episode"]
-    laps = (
-        held.groupby(of, sort=False).agg(rows=("steps", "size"), progress=("progress", "max")).reset_index()
-    )
+    of = ["stream", "worker", "iteration", "episode"]
+    episodes = held.groupby(of, sort=False, observed=True)
+    laps = episodes.agg(rows=("steps", "size"), progress=("progress", "max")).reset_index()
     # Complete laps before others, then the shortest.
     laps = laps.sort_values(["progress", "rows"], ascending=[False, True]).drop_duplicates("iteration")
     laps = laps.sort_values("iteration").tail(3)

@@ -73,10 +73,14 @@ class Hyperparameters:
         return tuple(outside)
 
 
-def read_hyperparameters(path: str | Path) -> Hyperparameters:
+def read_hyperparameters(path: str | Path, raw: bytes | None = None) -> Hyperparameters:
     """Read a hyperparameters.json.
 
     Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
+
+    Args:
+        path: the file.
+        raw: what it holds, where that is known.
 
     Raises:
         BadInput: the file cannot be read or holds something the service's trainer could not use; one line with
@@ -84,7 +88,7 @@ def read_hyperparameters(path: str | Path) -> Hyperparameters:
 
     Source of the rules: deepracer-simapp, markov/sagemaker_graph_manager.py.
     """
-    json = JsonObject(path, "a hyperparameters.json", "a JSON object with batch_size, lr, ...")
+    json = JsonObject(path, "a hyperparameters.json", "a JSON object with batch_size, lr, ...", raw)
     values: dict[str, int | float | str] = {}
     for key, value in json.data.items():
         if key in _WHOLE:

@@ -15,19 +15,20 @@ MAX_BYTES = 2**20
 class JsonObject:
     """The object in one JSON file; of a key that is there twice the last one counts, as in the service."""
 
-    def __init__(self, path: str | Path, kind: str, accepted: str) -> None:
+    def __init__(self, path: str | Path, kind: str, accepted: str, raw: bytes | None = None) -> None:
         """Read the file.
 
         Args:
             path: the file.
             kind: what it should be, e.g. ``a model_metadata.json``.
             accepted: what its JSON should hold, e.g. ``a JSON object with action_space``.
+            raw: what the file holds, where that is known: of a member of an archive, or taken out of a log.
 
         Raises:
             BadInput: it cannot be read, is no plain file, too large, not JSON, or holds something else.
         """
         self.path = Path(path)
-        text = self._text(kind)
+        text = self._decoded(self._raw(kind) if raw is None else raw, kind)
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -85,7 +86,7 @@ class JsonObject:
             raise self.bad(key, value, f"a whole number from {low} to {high}")
         return int(number)
 
-    def _text(self, kind: str) -> str:
+    def _raw(self, kind: str) -> bytes:
         try:
             # A pipe or a device would never end, or never begin.
             if self.path.exists() and not self.path.is_file():
@@ -95,6 +96,9 @@ class JsonObject:
         except (OSError, ValueError) as error:  # ValueError: a null character in the path
             reason = error.strerror if isinstance(error, OSError) else str(error)
             raise BadInput(f"{self.path}: cannot be read ({reason}); accepted: {kind}") from error
+        return raw
+
+    def _decoded(self, raw: bytes, kind: str) -> str:
         if len(raw) > MAX_BYTES:
             raise BadInput(f"{self.path}: is larger than {MAX_BYTES // 2**20} MiB; accepted: {kind}")
         try:

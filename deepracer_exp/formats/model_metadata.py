@@ -76,10 +76,14 @@ class ModelMetadata:
     """Whether an action's `index` is not its position; the position counts."""
 
 
-def read_model_metadata(path: str | Path) -> ModelMetadata:
+def read_model_metadata(path: str | Path, raw: bytes | None = None) -> ModelMetadata:
     """Read a model_metadata.json of any version from 1 to 6.
 
     Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
+
+    Args:
+        path: the file.
+        raw: what it holds, where that is known.
 
     Raises:
         BadInput: the file cannot be read or holds something the service would not accept; one line with
@@ -87,14 +91,14 @@ def read_model_metadata(path: str | Path) -> ModelMetadata:
 
     Source of the rules: deepracer-simapp, markov/boto/s3/files/model_metadata.py.
     """
-    return _Reader(path).read()
+    return _Reader(path, raw).read()
 
 
 class _Reader:
     """Turns the JSON of one file into a `ModelMetadata`, naming the file in every complaint."""
 
-    def __init__(self, path: str | Path) -> None:
-        self.json = JsonObject(path, "a model_metadata.json", "a JSON object with action_space")
+    def __init__(self, path: str | Path, raw: bytes | None) -> None:
+        self.json = JsonObject(path, "a model_metadata.json", "a JSON object with action_space", raw)
 
     def read(self) -> ModelMetadata:
         data = self.json.data

@@ -22,7 +22,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import find
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.formats.recorded import read_recorded
+from deepracer_exp.formats.recording_reader import read_recording
 
 from .recordings import Windows, cut_windows
 from .replay import Errors, errors, replay
@@ -205,7 +205,10 @@ def run(options: argparse.Namespace) -> None:
         raise BadInput(f"--windows {options.windows}: accepted: {_LEAST_WINDOWS} or more")
     if options.output is not None:
         _require_writable(options.output)
-    recorded = read_recorded(options.traces)
+    recording = read_recording(options.traces)
+    for problem in recording.problems:
+        print(problem, file=sys.stderr)
+    recorded = recording.steps
     windows, long = (cut_windows(recorded, car.front_point_m, steps) for steps in (FIT_STEPS, REPORT_STEPS))
     held = held_out(windows.iteration)
     for part, count in (("to fit to", (~held).sum()), ("to hold out", held.sum())):

@@ -1,7 +1,6 @@
 """Recorded drives cut into windows; a model has to predict where the car goes in each."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -70,7 +69,7 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
     """Cut every episode into windows of `steps` that begin every 15 rows, the first where the car begins to move.
 
     Args:
-        recorded: rows of `formats.recorded.read_recorded`.
+        recorded: the steps of a `formats.recording.Recording`.
         front_point_m: how far the recorded point is ahead of the chassis origin.
         steps: control steps to predict.
 
@@ -88,18 +87,18 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
     rows: list[Ids] = []
     first: list[int] = []
     standing: list[bool] = []
-    end_of_last, last_folder = np.zeros(0, np.intp), None
-    for (file, _, _), places in recorded.groupby(
-        ["file", "iteration", "episode"], sort=False
+    end_of_last, last_car = np.zeros(0, np.intp), None
+    for (stream, worker, _, _), places in recorded.groupby(
+        ["stream", "worker", "iteration", "episode"], sort=False, observed=True
     ).indices.items():
-        folder = Path(file).parent
+        car = stream, worker
         for at in range(_FIRST_MOVING_ROW, len(places) - steps, WARM_UP_STEPS):
             ahead = places[at : at + steps + 1]
             if broken[ahead[:-1]].any():
                 continue
             stands = at == _FIRST_MOVING_ROW
             if stands:
-                before = end_of_last if folder == last_folder else end_of_last[:0]
+                before = end_of_last if car == last_car else end_of_last[:0]
             else:
                 before = places[max(_FIRST_MOVING_ROW, at - WARM_UP_STEPS) : at]
                 before = before[int(np.max(np.flatnonzero(broken[before]) + 1, initial=0)) :]
@@ -108,7 +107,7 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
             rows.append(np.concatenate([np.full(missing, known[0]), known]))
             first.append(missing)
             standing.append(stands)
-        end_of_last, last_folder = places[-WARM_UP_STEPS:], folder
+        end_of_last, last_car = places[-WARM_UP_STEPS:], car
     at_rows = np.array(rows, np.intp).reshape(len(rows), WARM_UP_STEPS + 1 + steps)
     turned = np.unwrap(yaw[at_rows], axis=1)
     return Windows(

@@ -9,7 +9,7 @@ import pytest
 from deepracer_exp.env.referee import Referee
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.reward_source import RewardSource
-from deepracer_exp.formats.recorded import read_recorded
+from deepracer_exp.formats.recording_reader import read_recording
 from deepracer_exp.formats.trace import EPISODE_STATUS
 from deepracer_exp.sim.batch import CarState
 
@@ -46,8 +46,8 @@ def recorded(folder: str) -> pd.DataFrame:
     """Return the recorded steps with their poses; episodes are numbered over all files."""
     if not (TRACES / folder).is_dir():
         pytest.skip("the recordings of the real service are not on this machine")
-    rows = read_recorded(TRACES / folder)
-    rows["episode"] = rows.groupby(["file", "episode"], sort=False).ngroup()
+    rows = read_recording(TRACES / folder).steps
+    rows["episode"] = rows.groupby(["stream", "episode"], sort=False, observed=True).ngroup()
     return rows.sort_values(["episode", "steps"], kind="stable", ignore_index=True)
 
 

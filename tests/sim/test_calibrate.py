@@ -11,7 +11,7 @@ import yaml
 from pydantic import TypeAdapter
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.formats.recorded import read_recorded
+from deepracer_exp.formats.recording_reader import read_recording
 from deepracer_exp.sim import calibrate
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.sim.recordings import WARM_UP_STEPS, cut_windows
@@ -23,7 +23,7 @@ TRACES = Path(__file__).parents[3] / "shared/reference/console_training/sim-trac
 
 
 def record(car: CarConfig, cars: int = 20, episodes: int = 4, rows: int = 35) -> pd.DataFrame:
-    """Let cars drive and write down what the service would: one folder a car, one iteration an episode."""
+    """Let cars drive and write down what the service would: one worker a car, one iteration an episode."""
     rng = np.random.default_rng(0)
     batch, everyone, tables = CarBatch(car, cars, 1), np.arange(cars), []
     for episode in range(episodes):
@@ -36,7 +36,8 @@ def record(car: CarConfig, cars: int = 20, episodes: int = 4, rows: int = 35) ->
             tables.append(
                 pd.DataFrame(
                     {
-                        "file": [f"worker{c}/{episode}-iteration.csv" for c in everyone],
+                        "stream": "training",
+                        "worker": everyone,
                         "iteration": episode,
                         "episode": episode,
                         "steps": row + 1,
@@ -52,7 +53,7 @@ def record(car: CarConfig, cars: int = 20, episodes: int = 4, rows: int = 35) ->
             if row:
                 batch.drive(speed, np.radians(steering_deg))
     table = pd.concat(tables, ignore_index=True)
-    return table.sort_values(["file", "iteration", "steps"], ignore_index=True)
+    return table.sort_values(["worker", "iteration", "steps"], ignore_index=True)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,7 @@ def test_windows_begin_where_the_car_begins_to_move_and_every_second_from_there(
 def test_what_comes_before_a_standing_start_is_the_same_cars_episode_before(recorded):
     windows = cut_windows(recorded, CAR.front_point_m, 15)
     first, second = windows.choose(windows.standing & (windows.iteration < 2)).action[:2]
-    last = recorded[(recorded["file"] == "worker0/0-iteration.csv")].tail(WARM_UP_STEPS)
+    last = recorded[(recorded["worker"] == 0) & (recorded["iteration"] == 0)].tail(WARM_UP_STEPS)
     np.testing.assert_array_equal(second[:WARM_UP_STEPS, 0], last["throttle"])
     # Of the first episode of a folder nothing is known.
     assert windows.first[windows.iteration == 0].tolist() == [WARM_UP_STEPS, 0] * 20
@@ -80,7 +81,7 @@ def test_what_comes_before_a_standing_start_is_the_same_cars_episode_before(reco
 
 
 def test_no_window_goes_over_a_place_where_the_car_was_put_elsewhere_or_paused(recorded):
-    one = recorded[recorded["file"] == "worker0/0-iteration.csv"].reset_index(drop=True)
+    one = recorded[(recorded["worker"] == 0) & (recorded["iteration"] == 0)].reset_index(drop=True)
     assert len(cut_windows(one, CAR.front_point_m, 15)) == 2
     moved = one.copy()
     moved.loc[20:, "X"] += 5.0
@@ -153,7 +154,7 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
     recorded, tmp_path, capsys, monkeypatch
 ):
     # Episodes of all cars become one car's.
-    rows = recorded.assign(episode=recorded.groupby(["iteration", "file"], sort=False).ngroup())
+    rows = recorded.assign(episode=recorded.groupby(["iteration", "worker"], sort=False).ngroup())
     traces = write(rows, tmp_path)
     monkeypatch.setattr(calibrate, "PARAMETERS", calibrate.PARAMETERS[-1:])
     (tmp_path / "conf/car").mkdir(parents=True)
@@ -188,7 +189,7 @@ def test_bad_input_is_refused_in_one_line_before_the_fit(
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
     Path("few").mkdir()
-    write(recorded[recorded["file"].str.startswith("worker3/")], Path("few"))
+    write(recorded[recorded["worker"] == 3], Path("few"))
     assert calibrate.main(arguments) == 2
     error = capsys.readouterr().err.strip()
     assert told in error
@@ -202,7 +203,7 @@ def test_the_fitted_car_predicts_held_out_recordings_and_the_bicycle_does_not(tm
 
     for iteration in (11, 23):
         shutil.copy(TRACES / f"{iteration}-iteration.csv", tmp_path)
-    windows = cut_windows(read_recorded(tmp_path), CAR.front_point_m, 15)
+    windows = cut_windows(read_recording(tmp_path).steps, CAR.front_point_m, 15)
     off = errors(replay(CAR, windows), windows).distance_m[:, -1]
     assert np.median(off) < 0.08
     assert np.median(off) < 0.2 * np.median(errors(bicycle(CAR, windows), windows).distance_m[:, -1])

@@ -1,0 +1,72 @@
+"""Large files read in blocks of whole lines."""
+
+import codecs
+import lzma
+import tarfile
+import zlib
+from collections.abc import Iterator
+from typing import IO
+
+READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError)
+"""How a file or a member of an archive refuses to be read on."""
+_SIZE = 2**23
+_LONGEST_LINE = 2**24
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+class Blocks:
+    """Reads a stream in blocks that end with a line; memory does not grow with the file.
+
+    A file that begins with the mark of UTF-16, as PowerShell writes logs, comes out as UTF-8.
+    """
+
+    def __init__(self, stream: IO[bytes], size: int = _SIZE) -> None:
+        self.stream = stream
+        self.size = size
+        self.lines = 0
+        """Lines before the block that is out."""
+        self.refused: list[tuple[int | None, str]] = []
+        """Line (None: from here on) and reason of what could not be read."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Yield blocks; only the last may end without a line break."""
+        rest, skipping = b"", False
+        for chunk in self._chunks():
+            if skipping:
+                _, found, chunk = chunk.partition(b"\n")
+                if not found:
+                    continue
+                skipping = False
+                self.lines += 1
+            end = chunk.rfind(b"\n") + 1
+            if not end:
+                rest += chunk
+                if len(rest) > _LONGEST_LINE:
+                    self.refused.append((self.lines + 1, f"a line of more than {_LONGEST_LINE // 2**20} MiB"))
+                    rest, skipping = b"", True
+                continue
+            block = rest + chunk[:end]
+            yield block
+            self.lines += block.count(b"\n")
+            rest = chunk[end:]
+        if rest:
+            yield rest
+
+    def _chunks(self) -> Iterator[bytes]:
+        decoder = None
+        chunk = self._read()
+        if chunk[:2] in _UTF_16:
+            decoder = codecs.getincrementaldecoder("utf-16")(errors="replace")
+        elif chunk.startswith(codecs.BOM_UTF8):
+            chunk = chunk[len(codecs.BOM_UTF8) :]
+        while chunk:
+            yield chunk if decoder is None else decoder.decode(chunk).encode("utf-8", "replace")
+            chunk = self._read()
+
+    def _read(self) -> bytes:
+        try:
+            return self.stream.read(self.size)
+        except READ_ERRORS as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            self.refused.append((None, f"cannot be read to its end ({reason})"))
+            return b""

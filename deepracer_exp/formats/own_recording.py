@@ -1,0 +1,262 @@
+"""A run of ours as a recording, in the schema of everybody's."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from deepracer_exp.errors import BadInput
+
+from .model_metadata import NEURAL_NETWORKS, Action, LidarConfig, ModelMetadata, read_model_metadata
+from .recording import EVALUATED_COLUMNS, STEP_COLUMNS, TOLD_COLUMNS, UPDATE_COLUMNS, LogProblem, Recording
+from .run_files import read_config
+from .trace import EPISODE_STATUS
+
+STREAM = "training"
+LEARNING = {
+    "batch_size": "batch_size",
+    "num_epochs": "epochs",
+    "lr": "lr",
+    "beta_entropy": "entropy_coeff",
+    "discount_factor": "discount",
+    "loss_type": "loss_type",
+    "num_episodes_between_training": "episodes_per_iteration",
+}
+"""The service's words for values of the group `algorithm`."""
+_CONSTANT = {"stream": STREAM, "worker": 0, "wall_clock": np.nan}
+_WORDS = ("episode_status", "track")
+_READ = [name for name in STEP_COLUMNS if name not in _CONSTANT]
+
+
+def is_own_run(folder: Path) -> bool:
+    """Tell whether a folder is that of a run of ours with its trace."""
+    return (folder / "config.yaml").is_file() and (folder / "trace").is_dir()
+
+
+def read_own_recording(folder: Path) -> Recording:
+    """Read a run of ours.
+
+    The rows are those of its trace in the order of iterations; the rows of one episode may run on into the next
+    iteration. What cannot be read of it is left out and listed.
+
+    Args:
+        folder: of the run, with `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
+
+    Raises:
+        BadInput: there is no trace, or nothing of it can be read.
+    """
+    problems: list[LogProblem] = []
+    files: list[Path] = []
+    steps = _steps(folder, problems, files)
+    config = _config(folder, problems, files)
+    updates, evaluated = _metrics(folder, problems, files)
+    return Recording(
+        name=folder.resolve().name,
+        steps=steps,
+        updates=updates,
+        told=_table(TOLD_COLUMNS, []),
+        evaluated=evaluated,
+        metadata=_metadata(folder, config, problems),
+        hyperparameters=_hyperparameters(config),
+        reward_source=_reward(folder, problems, files),
+        track=_track(config),
+        problems=tuple(problems),
+        files=tuple(files),
+    )
+
+
+def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
+    """Read the trace into arrays made once, so that there is never a second copy of the whole."""
+    found = sorted(path for path in (folder / "trace").glob("*-iteration.parquet") if path.name[0] != ".")
+    if not found:
+        raise BadInput(
+            f"{folder / 'trace'}: no *-iteration.parquet; accepted: the folder of a run with its trace"
+        )
+    counts = [_count(path, problems) for path in found]
+    total = sum(counts)
+    columns = {name: np.empty(total, STEP_COLUMNS[name][0]) for name in _READ if name not in _WORDS}
+    codes = {name: np.zeros(total, np.int16) for name in _WORDS}
+    words = {"episode_status": dict.fromkeys(EPISODE_STATUS), "track": dict[str, None]()}
+    place = {name: {word: code for code, word in enumerate(known)} for name, known in words.items()}
+    at = 0
+    for path, count in zip(found, counts, strict=True):
+        if not count:
+            continue
+        rows = slice(at, at + count)
+        try:
+            table = pq.ParquetFile(path).read(columns=_READ, use_threads=False)
+            for name, column in columns.items():
+                column[rows] = _numbers(table[name])
+            for name in _WORDS:
+                codes[name][rows] = _codes(table[name], place[name])
+        except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+            problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
+            continue
+        at += count
+        files.append(path)
+    if not files:
+        raise BadInput(f"{problems[0]}; nothing of the trace can be read")
+    whole: dict[str, Any] = {}
+    for name in STEP_COLUMNS:
+        if name in _CONSTANT:
+            whole[name] = _constant(name, at)
+        elif name in _WORDS:
+            whole[name] = pd.Categorical.from_codes(codes[name][:at], list(place[name]))
+        else:
+            whole[name] = columns[name][:at]
+    return pd.DataFrame(whole, copy=False)
+
+
+def _count(path: Path, problems: list[LogProblem]) -> int:
+    """Return the rows of a file, 0 for one that cannot be read."""
+    try:
+        return int(pq.read_metadata(path).num_rows)
+    except (OSError, pa.ArrowException) as error:
+        problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
+        return 0
+
+
+def _numbers(column: pa.ChunkedArray) -> np.ndarray:
+    if column.null_count:  # the action of a policy that gives [steer, throttle] itself
+        column = column.cast(pa.float64())
+    return column.to_numpy()
+
+
+def _codes(column: pa.ChunkedArray, place: dict[str, int]) -> np.ndarray:
+    """Return the words as numbers; a word that is new gets the next one."""
+    parts = []
+    for chunk in column.chunks:
+        chunk = chunk if pa.types.is_dictionary(chunk.type) else chunk.dictionary_encode()
+        number = [place.setdefault(word, len(place)) for word in chunk.dictionary.to_pylist()]
+        parts.append(np.array(number, np.int16)[chunk.indices.to_numpy()])
+    return np.concatenate(parts)
+
+
+def _constant(name: str, count: int) -> Any:
+    if name == "stream":
+        return pd.Categorical.from_codes(np.zeros(count, np.int8), [STREAM])
+    return np.full(count, _CONSTANT[name], STEP_COLUMNS[name][0])
+
+
+def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapping[str, Any]:
+    file = folder / "config.yaml"
+    try:
+        config = read_config(file.parent)
+    except BadInput as error:
+        problems.append(LogProblem(str(file), None, str(error).removeprefix(f"{file}: ")))
+        return {}
+    files.append(file)
+    return config
+
+
+def _metrics(
+    folder: Path, problems: list[LogProblem], files: list[Path]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return updates and evaluations; the file counts iterations from 1, the trace from 0."""
+    file = folder / "metrics.jsonl"
+    updates, evaluated = [], []
+    for number, line in enumerate(_text(file, problems, files).splitlines(), start=1):
+        try:
+            row = json.loads(line)
+            iteration = int(row["iteration"]) - 1
+            losses = {
+                name: _number(row.get(name)) for name in UPDATE_COLUMNS if name not in ("iteration", "epoch")
+            }
+            tried = {name: _number(row.get(f"eval_{name}")) for name in ("completion", "lap_time_s")}
+            tried["held_out_completion"] = _number(row.get("held_out_completion"))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            problems.append(LogProblem(str(file), number, f"left out: {_one_line(error)}"))
+            continue
+        updates.append({"iteration": iteration, "epoch": 0, **losses})
+        if np.isfinite(tried["completion"]):
+            evaluated.append({"iteration": iteration, **tried})
+    return _table(UPDATE_COLUMNS, updates), _table(EVALUATED_COLUMNS, evaluated)
+
+
+def _table(columns: Mapping[str, tuple[str, str]], rows: list[dict[str, Any]]) -> pd.DataFrame:
+    return pd.DataFrame(rows, columns=list(columns)).astype(
+        {name: kind for name, (kind, _) in columns.items()}
+    )
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _metadata(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> ModelMetadata | None:
+    """Return the action space; our policies have no camera, and the service's default stands in for it."""
+    space = config.get("action_space")
+    if space is None:
+        return None
+    try:
+        if space.get("file") is not None:
+            return read_model_metadata(space["file"])
+        discrete = space["kind"] != "continuous"
+        steering, speed = (space.get(name) for name in ("steering_angle", "speed"))
+        return ModelMetadata(
+            action_space_type="discrete" if discrete else "continuous",
+            actions=_actions(space) if discrete else (),
+            low=None if discrete else Action(float(steering["low"]), float(speed["low"])),
+            high=None if discrete else Action(float(steering["high"]), float(speed["high"])),
+            sensor=("FRONT_FACING_CAMERA",),
+            neural_network=NEURAL_NETWORKS[0],
+            version=5,
+            training_algorithm="clipped_ppo",
+            lidar_config=LidarConfig(),
+            given=(),
+            renumbered=False,
+        )
+    except (BadInput, TypeError, ValueError, KeyError, AttributeError) as error:
+        problems.append(
+            LogProblem(str(folder / "config.yaml"), None, f"action_space is not told: {_one_line(error)}")
+        )
+        return None
+
+
+def _actions(space: Mapping[str, Any]) -> tuple[Action, ...]:
+    """Return the choices; a grid has every steering level with every speed level, steering in the outer loop."""
+    if space["kind"] == "discrete":
+        return tuple(Action(float(one["steering_angle"]), float(one["speed"])) for one in space["actions"])
+    steering, speed = (
+        np.linspace(space[name]["low"], space[name]["high"], space[levels]).tolist()
+        for name, levels in (("steering_angle", "steering_levels"), ("speed", "speed_levels"))
+    )
+    return tuple(Action(angle, pace) for angle in steering for pace in speed)
+
+
+def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return what the service has a word for."""
+    own = config.get("algorithm")
+    if not isinstance(own, Mapping):
+        return None
+    return {word: own[name] for word, name in LEARNING.items() if own.get(name) is not None}
+
+
+def _track(config: Mapping[str, Any]) -> str | None:
+    """Return the name of the course, None where there are several."""
+    track = config.get("track")
+    name = track.get("name") if isinstance(track, Mapping) else None
+    return name if isinstance(name, str) else None
+
+
+def _reward(folder: Path, problems: list[LogProblem], files: list[Path]) -> str | None:
+    return _text(folder / "reward_function.py", problems, files) or None
+
+
+def _text(file: Path, problems: list[LogProblem], files: list[Path]) -> str:
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        problems.append(LogProblem(str(file), None, f"cannot be read: {_one_line(error)}"))
+        return ""
+    files.append(file)
+    return text
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())

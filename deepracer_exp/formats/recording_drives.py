@@ -1,0 +1,223 @@
+"""The drives of a recording: whose they are, which stand there twice, and how their episodes count."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from .log_folder import Place
+from .recording import STEP_COLUMNS, empty
+from .sim_trace import COMMON
+from .training_log import TrainingLog
+
+EPISODES_PER_ITERATION = 20
+"""The service's default, where nothing tells it."""
+_NEAR_S, _NEAR_M = 0.03, 0.001
+_LARGEST_RAD_OF_YAW, _LARGEST_RAD_OF_STEER = 2 * math.pi, math.pi / 3
+
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(eq=False)
+class Drives:
+    """What one worker drove in one training, or the car of one evaluation."""
+
+    place: Place
+    table: pa.Table
+    """Columns of `sim_trace.SCHEMA`, in the order of time."""
+    iteration: Ints
+    world: str = ""
+    names: list[str] = field(default_factory=list)
+    """Of its folder and of the logs that tell the same."""
+
+    @cached_property
+    def key(self) -> Ints:
+        """Episode and step in one number."""
+        episode, steps = (self.table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
+        return (episode << 32) | steps
+
+    def choose(self, rows: Flags) -> "Drives":
+        """Return some of the rows."""
+        return Drives(self.place, self.table.filter(rows), self.iteration[rows], self.world, self.names)
+
+
+def in_degrees(table: pa.Table) -> pa.Table:
+    """Turn the radians of 2019 into degrees; the rows must be those of one file.
+
+    Only lines of 15 values have them, and of those only the older: they are known by their size.
+    """
+    old = table["values"].to_numpy() == len(COMMON)
+    if not old.any():
+        return table
+    yaw, steer = (table[name].to_numpy()[old] for name in ("yaw", "steer"))
+    if np.abs(yaw).max() > _LARGEST_RAD_OF_YAW or np.abs(steer).max() > _LARGEST_RAD_OF_STEER:
+        return table
+    for name in ("yaw", "steer"):
+        values = table[name].to_numpy()
+        turned = np.where(old, np.degrees(values), values)
+        table = table.set_column(table.schema.get_field_index(name), name, pa.array(turned))
+    return table
+
+
+def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int) -> Ints:
+    """Return the iteration of each row of a text log: what it says itself, or by counting episodes."""
+    episode = table["episode"].to_numpy().astype(np.int64)
+    if not any(log.iteration_of.values()):
+        return episode // _episodes_between(log, episodes_per_iteration)
+    known = np.array(sorted(log.iteration_of))
+    told = np.array([log.iteration_of[number] for number in known.tolist()], np.int64)
+    place = np.searchsorted(known, episode)
+    # Behind the last episode told: it was being driven when the log ended.
+    counts = np.unique(told, return_counts=True)[1]
+    usual = int(counts[:-1].max()) if len(counts) > 1 else episodes_per_iteration
+    behind = episode - known[-1] - (usual - int(counts[-1]))
+    beyond = told[-1] + np.where(behind > 0, 1 + (behind - 1) // usual, 0)
+    return np.where(place < len(known), told[np.minimum(place, len(known) - 1)], beyond)
+
+
+def _episodes_between(log: TrainingLog, usual: int) -> int:
+    """Return how many episodes an iteration has: as many as lie between two evaluations."""
+    ends = log.evaluated_after
+    if len(ends) > 1:
+        return ends[1] - ends[0]
+    return ends[0] if ends and 0 in log.iteration_of else usual
+
+
+def rows_also_in(log: Drives, other: Drives) -> Flags:
+    """Tell of each row of a log whether the other drives have it, which may tell it in more digits."""
+    mine, theirs = log.key, other.key
+    if not len(mine) or not len(theirs):
+        return np.zeros(len(mine), np.bool_)
+    if _rises(theirs):
+        match = np.minimum(np.searchsorted(theirs, mine), len(theirs) - 1)
+    else:
+        order = np.argsort(theirs, kind="stable")
+        match = order[np.minimum(np.searchsorted(theirs[order], mine), len(theirs) - 1)]
+    same = theirs[match] == mine
+    for name, near in (("tstamp", _NEAR_S), ("X", _NEAR_M), ("Y", _NEAR_M)):
+        same &= np.abs(log.table[name].to_numpy() - other.table[name].to_numpy()[match]) <= near
+    return same
+
+
+def repeated(drives: Drives) -> Flags:
+    """Tell which rows stand there a second time: of a file that was copied."""
+    key = drives.key
+    if _rises(key) or len(np.unique(key)) == len(key):
+        return np.zeros(len(key), np.bool_)
+    told = {name: drives.table[name].to_numpy() for name in ("tstamp", "X", "Y", "yaw")}
+    return pd.DataFrame({"key": key, **told}).duplicated().to_numpy()
+
+
+def number_episodes(
+    rounds: Ints, worker: Ints, raw: Ints, iteration: Ints, steps: Ints
+) -> tuple[Ints, Mapping[tuple[int, int, int], int]]:
+    """Number the episodes of a stream so that no two share a number.
+
+    One worker's own numbers stay. Those of several, which each count from 0, are numbered in the order of iteration,
+    worker and own number; a training goes on where the one before it ended.
+
+    Args:
+        rounds: which training of several, one value a row, not falling.
+        worker: that drove.
+        raw: the worker's own number.
+        iteration: of that training.
+        steps: control step.
+
+    Returns:
+        The numbers, and the number of each (round, worker, own number).
+    """
+    if not len(raw):
+        return raw, {}
+    alone = rounds[-1] == rounds[0] and bool((worker == worker[0]).all())
+    own = {(int(rounds[0]), int(worker[0]), int(one)): int(one) for one in np.unique(raw)}
+    if alone and _rises((raw << 32) | steps):
+        return raw, own
+    new = np.ones(len(raw), np.bool_)
+    new[1:] = (np.diff(rounds) != 0) | (np.diff(worker) != 0) | (np.diff(raw) != 0) | (np.diff(steps) <= 0)
+    drive = np.cumsum(new) - 1
+    starts = np.flatnonzero(new)
+    table = pd.DataFrame(
+        {name: values[starts] for name, values in
+         {"rounds": rounds, "iteration": iteration, "worker": worker, "raw": raw}.items()}
+    )  # fmt: skip
+    # The same number again is another episode only where its steps begin anew.
+    table["again"] = (
+        table.assign(fresh=steps[starts] == 1).groupby(["rounds", "worker", "raw"])["fresh"].cumsum()
+    )
+    table["again"] = table["again"].clip(lower=1)
+    if alone and (table["again"] == 1).all():
+        return raw, own
+    by = ["rounds", "iteration", "worker", "raw", "again"]
+    # An episode that runs on into the next iteration is one.
+    table["iteration"] = table.groupby(["rounds", "worker", "raw", "again"])["iteration"].transform("min")
+    number = table.groupby(by, sort=True).ngroup().to_numpy()
+    keys = zip(table["rounds"], table["worker"], table["raw"], strict=True)
+    numbers: dict[tuple[int, int, int], int] = {}
+    for key, value in zip(keys, number.tolist(), strict=True):
+        numbers.setdefault((int(key[0]), int(key[1]), int(key[2])), value)
+    return number[drive], numbers
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Drives of one stream, with what counts over all of them."""
+
+    stream: str
+    table: pa.Table
+    """Columns of `sim_trace.SCHEMA`."""
+    worker: Ints
+    iteration: Ints
+    episode: Ints
+    track: Sequence[str]
+    """Name of the course of each row's `track_code`."""
+    track_code: Ints
+
+
+def steps_of(parts: Sequence[Rows]) -> pd.DataFrame:
+    """Return the rows of all streams, one after the other, with the columns of `STEP_COLUMNS`."""
+    if not parts:
+        return empty(STEP_COLUMNS)
+    table = concatenated([part.table for part in parts])
+    sizes = [part.table.num_rows for part in parts]
+    tracks = list(dict.fromkeys(name for part in parts for name in part.track))
+    codes = [np.array([tracks.index(name) for name in part.track])[part.track_code] for part in parts]
+    status = table["episode_status"].chunk(0) if table.num_rows else None
+    own: dict[str, Any] = {
+        "stream": pd.Categorical.from_codes(
+            np.repeat(np.arange(len(parts)), sizes), [part.stream for part in parts]
+        ),
+        "worker": np.concatenate([part.worker for part in parts]),
+        "iteration": np.concatenate([part.iteration for part in parts]),
+        "episode": np.concatenate([part.episode for part in parts]),
+        "episode_status": pd.Categorical([])
+        if status is None
+        else pd.Categorical.from_codes(status.indices.to_numpy(), status.dictionary.to_pylist()),
+        "speed_mps": np.full(sum(sizes), np.nan),
+        "track": pd.Categorical.from_codes(np.concatenate(codes), tracks),
+    }
+    columns = {}
+    for name, (kind, _) in STEP_COLUMNS.items():
+        values = own[name] if name in own else table[name].to_numpy()
+        columns[name] = values if kind == "category" else values.astype(kind, copy=False)
+    return pd.DataFrame(columns, copy=False)
+
+
+def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
+    """Return tables of `sim_trace.SCHEMA` as one, its words in one dictionary."""
+    return pa.concat_tables(tables).unify_dictionaries().combine_chunks()
+
+
+def _rises(key: Ints) -> bool:
+    return bool((key[1:] > key[:-1]).all())
+
+
+def first_row(table: pa.Table) -> tuple[int, int]:
+    """Return episode and step of the first row."""
+    return int(table["episode"][0].as_py()), int(table["steps"][0].as_py())

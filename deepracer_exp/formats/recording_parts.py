@@ -1,0 +1,208 @@
+"""What each file of a recording tells, before it is put together."""
+
+import json
+import re
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import pyarrow as pa
+import yaml
+
+from deepracer_exp.errors import BadInput
+
+from .hyperparameters import Hyperparameters, read_hyperparameters
+from .json_object import MAX_BYTES
+from .log_blocks import READ_ERRORS
+from .log_folder import LogFile, LogFolder, Place, place_of
+from .metrics_json import MetricsJson, read_metrics_json
+from .model_metadata import ModelMetadata, read_model_metadata
+from .recording import LogProblem
+from .sim_trace_csv import read_trace_csv
+from .training_log import MARKER, TrainingLog, read_training_log
+
+MOST_LISTED = 20
+"""Lines of one file that are listed one by one; the others are counted."""
+_LOG = re.compile(r"(?:\.(?:log|txt|out|err)(?:\.\d{1,4})?|^(?:stdout|stderr))$", re.IGNORECASE)
+_NUMBER = re.compile(r"(\d{1,9})-iteration")
+_METADATA = re.compile(r"model_metadata.*\.json")
+_HYPERPARAMETERS = re.compile(r"hyper_?parameters.*?(?:\.json)?")
+_PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")
+# What lies beside the logs of a model and tells nothing of its drives.
+_BESIDE = re.compile(
+    r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
+    r"|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
+)
+_MOST_NAMED = 3
+_THREADS = 4
+
+
+@dataclass
+class TraceFile:
+    """One CSV."""
+
+    file: LogFile
+    place: Place
+    number: int | None
+    """That in its name."""
+    table: pa.Table
+
+
+@dataclass
+class Parts:
+    """All that was read, file by file."""
+
+    traces: list[TraceFile] = field(default_factory=list)
+    logs: list[tuple[LogFile, TrainingLog]] = field(default_factory=list)
+    metrics: list[tuple[LogFile, MetricsJson]] = field(default_factory=list)
+    metadata: list[tuple[LogFile, ModelMetadata]] = field(default_factory=list)
+    hyperparameters: list[tuple[LogFile, dict[str, Any]]] = field(default_factory=list)
+    reward: list[tuple[LogFile, str]] = field(default_factory=list)
+    worlds: dict[str, str] = field(default_factory=dict)
+    """Course by kind of job, of the files that start it."""
+    files: list[LogFile] = field(default_factory=list)
+    problems: list[LogProblem] = field(default_factory=list)
+
+    def add(self, other: "Parts") -> None:
+        """Add what other files tell."""
+        for part in fields(self):
+            if part.name == "worlds":
+                self.worlds |= other.worlds
+            else:
+                getattr(self, part.name).extend(getattr(other, part.name))
+
+    def refuse(self, file: LogFile, refused: list[tuple[int | None, str]]) -> None:
+        """List what cannot be read of a file."""
+        rest = refused[MOST_LISTED:] if len(refused) > MOST_LISTED + 1 else []
+        for line, reason in refused[: len(refused) - len(rest)]:
+            self.problems.append(LogProblem(str(file.path), line, reason))
+        if rest:
+            lines = [line for line, _ in rest if line is not None]
+            last = f", the last one line {lines[-1]}" if lines else ""
+            reason = f"and {len(rest)} more that cannot be read{last}"
+            self.problems.append(LogProblem(str(file.path), rest[0][0], reason, lines=len(rest)))
+
+
+def read_parts(folder: LogFolder) -> Parts:
+    """Read every file that may tell something, each by itself."""
+    alone = len(folder.files) == 1
+    whole = Parts(problems=list(folder.problems))
+    others: list[LogFile] = []
+    # The members of an archive come out of one stream.
+    with ThreadPoolExecutor(_THREADS if folder.apart else 1) as pool:
+        found = pool.map(lambda file: _read_one(file, alone), folder.files)
+        for file, (parts, known) in zip(folder.files, found, strict=True):
+            whole.add(parts)
+            if known:
+                whole.files.append(file)
+            elif not parts.problems and not _BESIDE.fullmatch(file.name):
+                others.append(file)
+    if others:
+        named = ", ".join("/".join(file.parts[-2:]) for file in others[:_MOST_NAMED])
+        more = ", …" if len(others) > _MOST_NAMED else ""
+        reason = f"no log of the service: {named}{more}"
+        whole.problems.append(LogProblem(f"{len(others)} other files", None, reason))
+    return whole
+
+
+def _read_one(file: LogFile, alone: bool) -> tuple[Parts, bool]:
+    """Return what a file tells, and whether it was read."""
+    parts = Parts()
+    try:
+        return parts, _read(parts, file, alone)
+    except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
+        reason = " ".join(str(error).split()).removeprefix(f"{file.path}: ")
+        parts.problems.append(LogProblem(str(file.path), None, reason or type(error).__name__))
+        return parts, False
+
+
+def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
+    """Read one file; return whether it was one that tells something."""
+    name = file.name
+    if name.endswith(".csv"):
+        return _read_csv(parts, file)
+    if _METADATA.fullmatch(name):
+        with file.open() as stream:
+            parts.metadata.append((file, read_model_metadata(file.path, stream.read(MAX_BYTES + 1))))
+        return True
+    if _HYPERPARAMETERS.fullmatch(name):
+        with file.open() as stream:
+            known = read_hyperparameters(file.path, stream.read(MAX_BYTES + 1))
+        parts.hyperparameters.append((file, told_hyperparameters(known)))
+        return True
+    if name.endswith(".json") and not _BESIDE.fullmatch(name):
+        with file.open() as stream:
+            metrics = read_metrics_json(stream)
+        parts.metrics.append((file, metrics))
+        parts.refuse(file, [(None, reason) for reason in metrics.refused])
+        return True
+    if name.startswith("reward_function") and name.endswith(".py"):
+        with file.open() as stream:
+            parts.reward.append((file, stream.read(MAX_BYTES).decode("utf-8", "replace")))
+        return True
+    params = _PARAMS.fullmatch(name)
+    if params is not None:
+        with file.open() as stream:
+            world = _world(stream.read(MAX_BYTES))
+        if world:
+            parts.worlds[params[1]] = world
+        return True
+    return _read_log(parts, file) if alone or _LOG.search(name) else False
+
+
+def _read_csv(parts: Parts, file: LogFile) -> bool:
+    with file.open() as stream:
+        try:
+            trace = read_trace_csv(stream)
+        except ValueError as error:
+            reason = str(error)
+        else:
+            number = _NUMBER.search(file.name)
+            place = place_of(file.parts)
+            parts.traces.append(TraceFile(file, place, int(number[1]) if number else None, trace.steps))
+            parts.refuse(file, trace.refused)
+            return True
+    # CloudWatch exports logs as CSV too.
+    if reason != "empty" and _read_log(parts, file):
+        return True
+    raise BadInput(f"{reason}; accepted: a trace of the service")
+
+
+def _read_log(parts: Parts, file: LogFile) -> bool:
+    with file.open() as stream:
+        log = read_training_log(stream)
+    parts.refuse(file, log.refused)
+    if not log.tells and not log.refused:
+        raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
+    parts.logs.append((file, log))
+    if log.metadata is not None:
+        try:
+            raw = json.dumps(log.metadata).encode()
+            parts.metadata.append((file, read_model_metadata(file.path, raw)))
+        except BadInput as error:
+            parts.refuse(file, [(None, f"action space: {str(error).removeprefix(f'{file.path}: ')}")])
+    if log.hyperparameters is not None:
+        try:
+            raw = json.dumps(log.hyperparameters).encode()
+            known = read_hyperparameters(file.path, raw)
+            parts.hyperparameters.append((file, told_hyperparameters(known)))
+        except BadInput as error:
+            parts.refuse(file, [(None, f"hyperparameters: {str(error).removeprefix(f'{file.path}: ')}")])
+    return True
+
+
+def told_hyperparameters(known: Hyperparameters) -> dict[str, Any]:
+    """Return the values that a file gives itself."""
+    return {key: getattr(known, key) for key in known.given if hasattr(known, key)}
+
+
+def _world(raw: bytes) -> str:
+    """Return the course that a job's parameters name, the first of several."""
+    try:
+        data = yaml.safe_load(raw)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadInput(f"not YAML ({' '.join(str(error).split())})") from error
+    world = data.get("WORLD_NAME") if isinstance(data, Mapping) else None
+    world = world[0] if isinstance(world, list) and world else world
+    return world if isinstance(world, str) else ""

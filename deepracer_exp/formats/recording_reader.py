@@ -1,0 +1,382 @@
+"""Reads what anybody recorded of a training or a race: folders and archives of all layouts, single files, our runs."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from deepracer_exp.errors import BadInput
+
+from .log_folder import LogFile, Place, label, log_folder, natural, place_of, same_job
+from .metrics_json import MetricsJson
+from .own_recording import is_own_run, read_own_recording
+from .recording import (
+    EVALUATED_COLUMNS,
+    TOLD_COLUMNS,
+    UPDATE_COLUMNS,
+    LogProblem,
+    Recording,
+    Round,
+    empty,
+)
+from .recording_drives import (
+    EPISODES_PER_ITERATION,
+    Drives,
+    Rows,
+    concatenated,
+    first_row,
+    in_degrees,
+    iterations_of,
+    number_episodes,
+    repeated,
+    rows_also_in,
+    steps_of,
+)
+from .recording_parts import Parts, TraceFile, read_parts
+from .training_log import TrainingLog, Update
+
+TRAINING = "training"
+_KINDS = (TRAINING, "evaluation", "leaderboard")
+Numbers = Mapping[tuple[int, int, int], int]
+
+
+def read_recording(path: Path) -> Recording:
+    """Read the recorded drives in a file, in an archive or anywhere below a folder, and what is told of them.
+
+    Layouts are found by looking: archives of the console and of DeepRacer on AWS, model folders of
+    deepracer-for-cloud with one or several workers, uploaded models, single CSVs and text logs, rolled logs, run
+    folders of ours. Where the same drives stand in a CSV and in a text log, the CSV's are taken: it has all digits.
+    Several trainings are put one after the other, as rounds of clones.
+
+    Raises:
+        BadInput: nothing is there, or nothing of it can be read.
+    """
+    if is_own_run(path):
+        return read_own_recording(path)
+    with log_folder(path) as folder:
+        parts = read_parts(folder)
+    name = path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".tgz")
+    recording = _Assembly(parts).recording(name)
+    if not (len(recording.steps) or len(recording.updates) or len(recording.told)):
+        why = f" ({recording.problems[0]})" if recording.problems else ""
+        raise BadInput(f"{path}: no recorded drive{why}; accepted: trace CSVs or logs of the service")
+    return recording
+
+
+class _Assembly:
+    """Puts the parts together."""
+
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self.problems = list(parts.problems)
+        # Of several files of settings the one nearest to the top counts, files before logs.
+        self.settings = _uppermost(parts.hyperparameters) or {}
+        self.logs = _rolled(parts.logs)
+        self.drives = [*self._drives_of_csv()]
+        self.roots: dict[int, tuple[str, ...]] = {}
+        for number, (files, log) in enumerate(self.logs):
+            self._add_log(number, files, log)
+        self._without_repeats()
+        self.training = [one for one in self.drives if one.place.kind == TRAINING]
+        self.rounds = sorted(
+            {one.place.root for one in self.training}, key=lambda root: natural("/".join(root))
+        )
+        if not self.rounds:
+            self.rounds = [()]
+
+    def recording(self, name: str) -> Recording:
+        """Return the whole."""
+        rows, numbers, first = self._training_rows()
+        parts = self.parts
+        worlds = [one.world for one in self.training if one.world]
+        rounds = [
+            Round("/".join(root), *first[number])
+            for number, root in enumerate(self.rounds)
+            if number in first
+        ]
+        return Recording(
+            name=name,
+            steps=steps_of([*rows, *self._evaluation_rows()]),
+            updates=self._updates({number: begin[0] for number, begin in first.items()}),
+            told=self._told(numbers),
+            evaluated=empty(EVALUATED_COLUMNS),
+            metadata=_uppermost(parts.metadata),
+            hyperparameters=self.settings or None,
+            reward_source=_uppermost(parts.reward),
+            track=worlds[0] if worlds else parts.worlds.get(TRAINING),
+            problems=tuple(self.problems),
+            files=tuple(file.path for file in parts.files),
+            rounds=tuple(rounds) if len(rounds) > 1 else (),
+        )
+
+    @property
+    def _per_iteration(self) -> int:
+        return int(self.settings.get("num_episodes_between_training", EPISODES_PER_ITERATION))
+
+    def _drives_of_csv(self) -> Iterable[Drives]:
+        groups: dict[Place, list[TraceFile]] = {}
+        for trace in self.parts.traces:
+            place = trace.place
+            if place.kind == TRAINING:
+                place = replace(place, name=place.root[-1] if place.root else TRAINING)
+            groups.setdefault(place, []).append(trace)
+        for place, traces in groups.items():
+            traces.sort(key=lambda trace: (-1 if trace.number is None else trace.number, trace.file.order))
+            tables = [in_degrees(trace.table) for trace in traces]
+            iterations = [
+                table["episode"].to_numpy().astype(np.int64) // self._per_iteration
+                if trace.number is None
+                else np.full(len(table), trace.number, np.int64)
+                for trace, table in zip(traces, tables, strict=True)
+            ]
+            world = self.parts.worlds.get(place.kind, "")
+            yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
+
+    def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
+        """Add the drives of a log, or what it tells of those that are there."""
+        file = files[0]
+        place = place_of(file.parts)
+        if place.kind == TRAINING:
+            name = place.name.replace(str(place.worker), "#") if place.worker else place.name
+            place = replace(place, root=(*place.root, name))
+        self.roots[number] = place.root
+        if not log.steps.num_rows:
+            return
+        settings = log.hyperparameters or {}
+        per_iteration = settings.get("num_episodes_between_training", self._per_iteration)
+        whole = per_iteration if isinstance(per_iteration, int) and per_iteration > 0 else self._per_iteration
+        table = in_degrees(concatenated([log.steps]))
+        mine = Drives(place, table, iterations_of(table, log, whole), log.world or "", [place.name])
+        if place.kind != TRAINING:
+            mine.iteration[:] = 0
+        left = np.ones(len(mine.iteration), np.bool_)
+        for other in self.drives:
+            same = rows_also_in(mine, other)
+            if same.any():
+                left &= ~same
+                other.world = log.world or other.world
+                other.names.append(place.name)
+                self.roots[number] = other.place.root
+        if left.all():
+            mine.world = mine.world or self.parts.worlds.get(place.kind, "")
+            self.drives.append(mine)
+        elif left.any():
+            self._add_rest(file, mine.choose(left), self.roots[number], int(mine.iteration.max()))
+
+    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], last: int) -> None:
+        """Add iterations that only the log tells; the last one was not finished, or there would be its CSV."""
+        others = [one for one in self.drives if one.place.root == root and one.place.kind == rest.place.kind]
+        known = np.unique(np.concatenate([one.iteration for one in others]))
+        whole = ~np.isin(rest.iteration, known) & (rest.iteration < last)
+        if rest.place.kind == TRAINING and whole.any():
+            more, into = rest.choose(whole), others[0]
+            iteration = np.concatenate([into.iteration, more.iteration])
+            order = np.argsort(iteration, kind="stable")
+            table = concatenated([into.table, more.table]).take(order)
+            whole_drives = Drives(into.place, table, iteration[order], into.world, into.names)
+            self.drives[self.drives.index(into)] = whole_drives
+            rest = rest.choose(~whole)
+        if rest.table.num_rows:
+            episodes = rest.table["episode"].to_numpy()
+            reason = (
+                f"{rest.table.num_rows} steps of the episodes {episodes.min()} to {episodes.max()} stand in the log "
+                "only, not in the CSVs of the same drives: left out"
+            )
+            self.problems.append(LogProblem(str(file.path), None, reason, lines=rest.table.num_rows))
+
+    def _without_repeats(self) -> None:
+        for number, one in enumerate(self.drives):
+            twice = repeated(one)
+            if twice.any():
+                count = int(twice.sum())
+                reason = f"{count} rows stand there a second time: left out"
+                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=count))
+                self.drives[number] = one.choose(~twice)
+
+    def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, tuple[int, int]]]:
+        """Return the rows, the episodes' numbers, and first iteration and episode of each round."""
+        place = {root: number for number, root in enumerate(self.rounds)}
+        drives = sorted(self.training, key=lambda one: (place[one.place.root], one.place.worker))
+        if not drives:
+            return [], {}, {}
+        rounds = np.concatenate([np.full(len(one.iteration), place[one.place.root]) for one in drives])
+        worker = np.concatenate([np.full(len(one.iteration), one.place.worker) for one in drives])
+        iteration = np.concatenate([one.iteration for one in drives])
+        table = concatenated([one.table for one in drives])
+        if len(drives) > 1:
+            # Rows of several workers stand in the order of iterations.
+            order = np.lexsort((worker, iteration, rounds))
+            table = table.take(order)
+            rounds, worker, iteration = rounds[order], worker[order], iteration[order]
+        raw, steps = (table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
+        episode, numbers = number_episodes(rounds, worker, raw, iteration, steps)
+        first: dict[int, tuple[int, int]] = {}
+        so_far = 0
+        for number in np.unique(rounds).tolist():
+            of = rounds == number
+            iteration[of] += so_far
+            first[number] = (so_far, int(episode[of].min()))
+            so_far = int(iteration[of].max()) + 1
+        worlds = [
+            next((one.world for one in drives if one.place.root == root and one.world), "")
+            for root in self.rounds
+        ]
+        return [Rows(TRAINING, table, worker, iteration, episode, worlds, rounds)], numbers, first
+
+    def _evaluation_rows(self) -> list[Rows]:
+        found = []
+        for name, one in self._evaluations().items():
+            raw, steps = (one.table[key].to_numpy().astype(np.int64) for key in ("episode", "steps"))
+            none = np.zeros_like(raw)
+            episode, _ = number_episodes(none, none, raw, none, steps)
+            found.append(Rows(name, one.table, none, one.iteration, episode, [one.world], none))
+        return found
+
+    def _evaluations(self) -> dict[str, Drives]:
+        """Return evaluations and races by their names, which are unique, in the order of time."""
+        drives = [one for one in self.drives if one.place.kind != TRAINING]
+        drives.sort(key=lambda one: (_KINDS.index(one.place.kind), natural(one.place.name)))
+        named: dict[str, Drives] = {}
+        for one in drives:
+            name = one.place.name if one.place.name != TRAINING else "evaluation"
+            if name in named:
+                name = "/".join((*one.place.root[-2:], name))
+            while name in named:
+                name += "+"
+            named[name] = one
+        return named
+
+    def _updates(self, first: Mapping[int, int]) -> pd.DataFrame:
+        rows: dict[tuple[int, int], dict[str, Any]] = {}
+        for number, (files, log) in enumerate(self.logs):
+            if not log.updates:
+                continue
+            begin = first.get(self._round(files[0], self.roots[number]), 0)
+            for iteration, update in zip(_iterations(log.updates), log.updates, strict=True):
+                row = {"iteration": begin + iteration, "value_loss": np.nan, **update._asdict()}
+                rows.setdefault((row["iteration"], update.epoch), row)
+        return _table([rows[key] for key in sorted(rows)], UPDATE_COLUMNS)
+
+    def _round(self, file: LogFile, root: tuple[str, ...]) -> int:
+        """Return the round that a file tells of: by its drives, its name, or the folder it is in."""
+        if root in self.rounds or len(self.rounds) == 1:
+            return self.rounds.index(root) if root in self.rounds else 0
+        names: dict[tuple[str, ...], list[str]] = {}
+        for one in self.training:
+            names.setdefault(one.place.root, []).extend(one.names)
+
+        def nearness(number: int) -> tuple[bool, int]:
+            of = self.rounds[number]
+            common = next(
+                (at for at, (a, b) in enumerate(zip(of, file.parts, strict=False)) if a != b), len(of)
+            )
+            return any(same_job(file.name, known) for known in names[of]), common
+
+        return max(range(len(self.rounds)), key=nearness)
+
+    def _told(self, numbers: Numbers) -> pd.DataFrame:
+        rows: list[dict[str, Any]] = []
+        evaluations = self._evaluations()
+        for file, metrics in self.parts.metrics:
+            if not metrics.rows:
+                continue
+            if _of_training(file, metrics):
+                worker, number = place_of(file.parts).worker, self._round(file, ())
+                for row in metrics.rows:
+                    key = (number, worker, row["episode"])
+                    episode = numbers.get(key)
+                    if episode is None:
+                        episode = _behind(numbers, key)
+                    rows.append({**row, "stream": TRAINING, "worker": worker, "episode": episode})
+            else:
+                stream = label(file.name)
+                for name, one in evaluations.items():
+                    if any(same_job(file.name, known) for known in one.names):
+                        stream = name
+                        break
+                rows += [{**row, "stream": stream, "worker": 0} for row in metrics.rows]
+        rows.sort(key=lambda row: (0, row["episode"]) if row["stream"] == TRAINING else (1, 0))
+        return _table(rows, TOLD_COLUMNS)
+
+
+def _behind(numbers: Numbers, key: tuple[int, int, int]) -> int:
+    """Return a number for an episode without rows: as far behind the last one of its worker as it says."""
+    mine = [(own, number) for (of, worker, own), number in numbers.items() if (of, worker) == key[:2]]
+    if not mine:
+        return key[2]
+    own, _ = max(mine)
+    same = all(own == number for own, number in mine)
+    return key[2] if same else max(numbers.values()) + max(1, key[2] - own)
+
+
+def _of_training(file: LogFile, metrics: MetricsJson) -> bool:
+    told = file.name.lower()
+    if "training" in told or "evaluation" in told:
+        return told.rfind("training") > told.rfind("evaluation")
+    return any(row["phase"] == TRAINING for row in metrics.rows)
+
+
+def _iterations(updates: Sequence[Update]) -> list[int]:
+    """Return the iteration of each update: that of the episodes before it, or one more than the last."""
+    found: list[int] = []
+    for number, update in enumerate(updates):
+        last = updates[number - 1] if number else None
+        if last is None:
+            found.append(update.told or 0)
+        elif update.epoch > last.epoch and update.told in (last.told, None):
+            found.append(found[-1])
+        else:
+            found.append(max(-1 if update.told is None else update.told, found[-1] + 1))
+    return found
+
+
+def _rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[LogFile], TrainingLog]]:
+    """Put the pieces of rolled logs together, the earliest first: by their episodes, or else by their numbers."""
+    groups: dict[tuple[str, ...], list[tuple[LogFile, TrainingLog]]] = {}
+    for file, log in logs:
+        stem, _, number = file.name.rpartition(".")
+        name = stem if number.isdigit() else file.name
+        groups.setdefault((*file.parts[:-1], name), []).append((file, log))
+    joined = []
+    for pieces in groups.values():
+        pieces.sort(key=_time_of_piece)
+        whole = TrainingLog(
+            tables=[table for _, log in pieces for table in log.tables],
+            updates=[update for _, log in pieces for update in log.updates],
+            evaluated_after=[count for _, log in pieces for count in log.evaluated_after],
+            iteration_of={key: value for _, log in pieces for key, value in log.iteration_of.items()},
+            hyperparameters=next((log.hyperparameters for _, log in pieces if log.hyperparameters), None),
+            world=next((log.world for _, log in pieces if log.world), None),
+        )
+        joined.append(([file for file, _ in pieces], whole))
+    return joined
+
+
+def _time_of_piece(piece: tuple[LogFile, TrainingLog]) -> tuple[int, int, int]:
+    file, log = piece
+    number = file.name.rpartition(".")[2]
+    # The highest number is the oldest piece; that without one is being written.
+    age = -int(number) if number.isdigit() else 1
+    if log.steps.num_rows:
+        return (*first_row(log.steps), age)
+    return (next(iter(log.iteration_of), -1), 0, age)
+
+
+def _uppermost(found: Sequence[tuple[LogFile, Any]]) -> Any:
+    """Return what the file nearest to the top tells; files of settings go before logs, a training's before others."""
+
+    def rank(one: tuple[LogFile, Any]) -> tuple[bool, bool, int]:
+        parts = one[0].parts
+        return not one[0].name.endswith((".json", ".py")), place_of(parts).kind != TRAINING, len(parts)
+
+    return min(found, key=rank)[1] if found else None
+
+
+def _table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
+    if not rows:
+        return empty(columns)
+    frame = pd.DataFrame(list(rows), columns=list(columns))
+    return frame.astype({name: kind for name, (kind, _) in columns.items()})

@@ -1,0 +1,187 @@
+"""The text log of a simulation or of a trainer: trace lines, policy updates, and what it says of the job."""
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import IO, Any, NamedTuple
+
+import pyarrow as pa
+
+from .log_blocks import Blocks
+from .sim_trace import SCHEMA, line_layout, read_rows
+
+MARKER = b"SIM_TRACE_LOG:"
+"""Begins the values of a control step; anything may stand before it."""
+# What stands behind the values: a tab, an escape of colours, the rest of a JSON string in Docker's own logs.
+_TRACE = re.compile(rb'SIM_TRACE_LOG:([^\t\r\n\x1b"\\]*)[^\n]*')
+_NUMBER = rb"([-+\w.]+)"
+_UPDATE = re.compile(
+    rb"Policy training> Surrogate loss=%b, KL divergence=%b, Entropy=%b, training epoch=(\d{1,9}), "
+    rb"learning_rate=%b" % (_NUMBER, _NUMBER, _NUMBER, _NUMBER)
+)
+_EPISODE = re.compile(rb"Training> Name=[^\n]*?Episode=(\d{1,9}),[^\n]*?Training iteration=(\d{1,9})")
+_WORLD = re.compile(rb"WORLD_NAME['\"]?\s*[=:]\s*\[?u?['\"]?([\w-]+(?:\.\.\.)?)")
+_SETTING = re.compile(rb'"(\w+)"\s*:\s*("[^"\n]*"|[-+.\deE]+|true|false)')
+_SENSORS = re.compile(
+    rb"Sensor list (\[[^\]\n]*\]), network (\w+), simapp_version ([\d.]+)"
+    rb"(?:, training_algorithm (\w+), action_space_type (\w+))?(?: lidar_config (\{[^}\n]*\}))?"
+)
+_LONGEST_SETTINGS = 10_000
+
+
+class Update(NamedTuple):
+    """One line of a policy update."""
+
+    told: int | None
+    """The iteration that the episodes before it in the log are of."""
+    epoch: int
+    policy_loss: float
+    kl: float
+    entropy: float
+    lr: float
+
+
+@dataclass
+class TrainingLog:
+    """What one log tells."""
+
+    tables: list[pa.Table] = field(default_factory=list)
+    updates: list[Update] = field(default_factory=list)
+    iteration_of: dict[int, int] = field(default_factory=dict)
+    """Iteration of an episode; both count from 0. The log of a simulation says 0 of all, that of a trainer knows."""
+    evaluated_after: list[int] = field(default_factory=list)
+    """Episodes driven when the policy was evaluated, which is after every iteration."""
+    hyperparameters: dict[str, Any] | None = None
+    action_space: Any = None
+    sensors: dict[str, Any] | None = None
+    """Keys of a model_metadata.json but for the action space."""
+    world: str | None = None
+    refused: list[tuple[int | None, str]] = field(default_factory=list)
+    """Line (None: from somewhere on) and reason of what cannot be read."""
+
+    @property
+    def steps(self) -> pa.Table:
+        """All rows, columns of `sim_trace.SCHEMA`."""
+        return pa.concat_tables(self.tables) if self.tables else SCHEMA.empty_table()
+
+    @property
+    def tells(self) -> bool:
+        """Whether it is a log of the service at all."""
+        told = (self.tables, self.updates, self.iteration_of, self.hyperparameters, self.sensors, self.world)
+        return any(map(bool, told))
+
+    @property
+    def metadata(self) -> dict[str, Any] | None:
+        """What would stand in a model_metadata.json; None where the log has no action space."""
+        return (
+            None if self.action_space is None else {"action_space": self.action_space, **(self.sensors or {})}
+        )
+
+
+def read_training_log(stream: IO[bytes]) -> TrainingLog:
+    """Read a log block by block; lines of other programs are passed over."""
+    log, blocks = TrainingLog(), Blocks(stream)
+    before: int | None = None
+    for block in blocks:
+        if MARKER in block:
+            before = _read_trace(log, block, blocks.lines, before)
+        _read_updates(log, block, blocks.lines)
+        _read_job(log, block)
+    log.refused += blocks.refused
+    return log
+
+
+def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
+    lines = _TRACE.findall(block)
+    table, refused = read_rows(lines, line_layout, before)
+    log.tables.append(table)
+    if refused:
+        starts = [found.start() for found in _TRACE.finditer(block)]
+        log.refused += [(_line(block, starts[one.place], lines_before), one.reason) for one in refused]
+    return int(lines[-1].count(b",")) + 1
+
+
+def _read_updates(log: TrainingLog, block: bytes, lines_before: int) -> None:
+    marks = (b"Policy training>", b"Training> Name=", b"Starting evaluation phase")
+    places = [place for mark in marks for place in _find(block, mark)]
+    for start, line in sorted(places):
+        episode = _EPISODE.match(line)
+        if episode is not None:
+            log.iteration_of[int(episode[1]) - 1] = int(episode[2])
+            continue
+        if line.startswith(b"Starting"):
+            driven = next(reversed(log.iteration_of), -1) + 1
+            if driven > (log.evaluated_after[-1] if log.evaluated_after else 0):
+                log.evaluated_after.append(driven)
+            continue
+        update = _UPDATE.match(line)
+        if update is not None:
+            try:
+                loss, kl, entropy, rate = (float(update[place]) for place in (1, 2, 3, 5))
+            except ValueError:
+                update = None
+        if update is not None:
+            epoch = int(update[4])
+            told = next(reversed(log.iteration_of.values()), None)
+            log.updates.append(Update(told, epoch, loss, kl, entropy, rate))
+        elif line.startswith(b"Policy"):
+            log.refused.append((_line(block, start, lines_before), "a policy update that cannot be read"))
+
+
+def _read_job(log: TrainingLog, block: bytes) -> None:
+    if log.hyperparameters is None:
+        for start, _ in _find(block, b"Using the following hyper-parameters"):
+            text = block[start : start + _LONGEST_SETTINGS].partition(b"}")[0]
+            pairs = b", ".join(b'"%b": %b' % pair for pair in _SETTING.findall(text))
+            value = _parsed(json.loads, b"{" + pairs + b"}")
+            log.hyperparameters = value or None
+    if log.action_space is None:
+        for _, line in _find(block, b"ction space from file: "):
+            log.action_space = _parsed(ast.literal_eval, line.partition(b": ")[2].strip())
+    if log.sensors is None:
+        for _, line in _find(block, b"Sensor list ["):
+            log.sensors = log.sensors or _sensors(line)
+    if log.world is None:
+        names = [found[1] for _, line in _find(block, b"WORLD_NAME") if (found := _WORLD.match(line))]
+        # ROS shortens what it prints; the whole name may stand elsewhere.
+        log.world = next((name.decode() for name in names if not name.endswith(b"...")), None)
+
+
+def _sensors(line: bytes) -> dict[str, Any] | None:
+    found = _SENSORS.match(line)
+    if found is None:
+        return None
+    sensor, network, version, algorithm, kind, lidar = found.groups()
+    told = {
+        "sensor": _parsed(ast.literal_eval, sensor),
+        "neural_network": network.decode(),
+        "version": version.decode().partition(".")[0],
+        "training_algorithm": None if algorithm is None else algorithm.decode(),
+        "action_space_type": None if kind is None else kind.decode(),
+        "lidar_config": None if lidar is None else _parsed(ast.literal_eval, lidar),
+    }
+    return {key: value for key, value in told.items() if value is not None}
+
+
+def _parsed(read: Any, text: bytes) -> Any:
+    """Return a value written in Python or JSON, None if it is none."""
+    try:
+        return read(text.decode("utf-8", "replace"))
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        return None
+
+
+def _find(block: bytes, mark: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the place of each mark and the line from there on."""
+    start = block.find(mark)
+    while start >= 0:
+        end = block.find(b"\n", start)
+        end = len(block) if end < 0 else end
+        yield start, block[start:end]
+        start = block.find(mark, end)
+
+
+def _line(block: bytes, start: int, lines_before: int) -> int:
+    return lines_before + block.count(b"\n", 0, start) + 1
