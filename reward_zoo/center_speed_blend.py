@@ -13,13 +13,20 @@ TOP_SPEED_MPS = 4.0  # pays SPEED_WEIGHT
 FLOOR = 0.001  # pay with a wheel off the road
 
 
+def terms(params: dict) -> dict:
+    """Return what each part pays; a log analysis shows them one by one."""
+    share = min(1.0, params["distance_from_center"] / (0.5 * params["track_width"]))
+    on_road = params["all_wheels_on_track"]
+    return {
+        "floor": FLOOR,
+        "center": CENTER_WEIGHT * (1.0 - share * share) if on_road else 0.0,
+        "speed": SPEED_WEIGHT * (params["speed"] / TOP_SPEED_MPS) if on_road else 0.0,
+    }
+
+
 def reward_function(params: dict) -> float:
     """Pay for nearness to the centre line and for speed."""
-    if not params["all_wheels_on_track"]:
-        return FLOOR
-    share = min(1.0, params["distance_from_center"] / (0.5 * params["track_width"]))
-    speed = params["speed"] / TOP_SPEED_MPS
-    return FLOOR + CENTER_WEIGHT * (1.0 - share * share) + SPEED_WEIGHT * speed
+    return sum(terms(params).values())
 
 
 def reward_batch(params: dict) -> np.ndarray:

@@ -12,12 +12,21 @@ OFF_ROAD_COST = 5.0
 _last = {"progress": 0.0, "steps": 0.0}
 
 
-def reward_function(params: dict) -> float:
-    """Pay for progress since the last call."""
+def terms(params: dict) -> dict:
+    """Return what each part pays or costs; a log analysis shows them one by one."""
     gained = params["progress"] - _last["progress"]
     # Anything but the very next step belongs to another episode, whose first step gained nothing yet.
     if params["steps"] != _last["steps"] + 1.0:
         gained = 0.0
     _last["progress"], _last["steps"] = params["progress"], params["steps"]
-    cost = STEP_COST + (OFF_ROAD_COST if params["is_offtrack"] else 0.0)
-    return PROGRESS_WEIGHT * gained - cost
+    return {
+        "progress": PROGRESS_WEIGHT * gained,
+        "time": -STEP_COST,
+        "off_road": -OFF_ROAD_COST if params["is_offtrack"] else 0.0,
+    }
+
+
+def reward_function(params: dict) -> float:
+    """Pay for progress since the last call."""
+    paid = terms(params)
+    return paid["progress"] + (paid["time"] + paid["off_road"])

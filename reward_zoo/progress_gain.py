@@ -28,18 +28,24 @@ def _direction(params: dict) -> tuple:
     return dx / length, dy / length
 
 
-def reward_function(params: dict) -> float:
-    """Pay for speed along the centre line, less a cost near and beyond the border."""
+def terms(params: dict) -> dict:
+    """Return what each part pays or costs; a log analysis shows them one by one."""
     dx, dy = _direction(params)
     heading = math.radians(params["heading"])
     gain = params["speed"] * (dx * math.cos(heading) + dy * math.sin(heading))
     share = params["distance_from_center"] / (0.5 * params["track_width"])
-    cost = EDGE_COST * min(1.0, max(0.0, share - EDGE_START) / (1.0 - EDGE_START))
-    if not params["all_wheels_on_track"]:
-        cost += WHEEL_OFF_COST
-    if params["is_offtrack"]:
-        cost += OFF_ROAD_COST
-    return SPEED_WEIGHT * gain - cost
+    return {
+        "progress": SPEED_WEIGHT * gain,
+        "edge": -EDGE_COST * min(1.0, max(0.0, share - EDGE_START) / (1.0 - EDGE_START)),
+        "wheel_off": 0.0 if params["all_wheels_on_track"] else -WHEEL_OFF_COST,
+        "off_road": -OFF_ROAD_COST if params["is_offtrack"] else 0.0,
+    }
+
+
+def reward_function(params: dict) -> float:
+    """Pay for speed along the centre line, less a cost near and beyond the border."""
+    paid = terms(params)
+    return paid["progress"] + (paid["edge"] + paid["wheel_off"] + paid["off_road"])
 
 
 def _directions(params: dict) -> tuple:

@@ -71,10 +71,10 @@ def _racing_line(params: dict) -> tuple:
     return _lines[key]
 
 
-def reward_function(params: dict) -> float:
-    """Pay for line, direction and target speed."""
+def terms(params: dict) -> dict:
+    """Return what each part pays; a log analysis shows them one by one."""
     if not params["all_wheels_on_track"]:
-        return FLOOR
+        return {"floor": FLOOR, "line": 0.0, "speed": 0.0}
     x, y, direction, target = _racing_line(params)
     squared = (x - params["x"]) ** 2 + (y - params["y"]) ** 2
     i = int(squared.argmin())
@@ -82,7 +82,13 @@ def reward_function(params: dict) -> float:
     along = max(0.0, direction[i, 0] * math.cos(heading) + direction[i, 1] * math.sin(heading))
     on_line = math.exp(-squared[i] / LINE_WIDTH_M**2)
     fit = math.exp(-(((params["speed"] - target[i]) / SPEED_WIDTH_MPS) ** 2)) * target[i] / TOP_SPEED_MPS
-    return float(FLOOR + along * (LINE_WEIGHT * on_line + SPEED_WEIGHT * fit))
+    line, speed = float(along * LINE_WEIGHT * on_line), float(along * SPEED_WEIGHT * fit)
+    return {"floor": FLOOR, "line": line, "speed": speed}
+
+
+def reward_function(params: dict) -> float:
+    """Pay for line, direction and target speed."""
+    return sum(terms(params).values())
 
 
 def reward_batch(params: dict) -> np.ndarray:

@@ -13,14 +13,20 @@ FINISH_BONUS = 20.0  # pay for a finish on schedule
 FLOOR = 0.001
 
 
-def reward_function(params: dict) -> float:
-    """Pay for being ahead of schedule, and for the finish."""
+def terms(params: dict) -> dict:
+    """Return what each part pays; a log analysis shows them one by one."""
     steps = max(1.0, params["steps"])
     ahead = params["progress"] / 100.0 - steps / TARGET_STEPS
-    pay = max(FLOOR, 1.0 + SCHEDULE_WEIGHT * ahead) if params["all_wheels_on_track"] else FLOOR
-    if params["progress"] >= 100.0:
-        pay += FINISH_BONUS * TARGET_STEPS / steps
-    return pay
+    finished = params["progress"] >= 100.0
+    return {
+        "schedule": max(FLOOR, 1.0 + SCHEDULE_WEIGHT * ahead) if params["all_wheels_on_track"] else FLOOR,
+        "finish": FINISH_BONUS * TARGET_STEPS / steps if finished else 0.0,
+    }
+
+
+def reward_function(params: dict) -> float:
+    """Pay for being ahead of schedule, and for the finish."""
+    return sum(terms(params).values())
 
 
 def reward_batch(params: dict) -> np.ndarray:

@@ -10,6 +10,9 @@ _EPILOG = """\
   deepracer-exp export run=champion format=onnx             the checkpoint of that alias (deepracer-exp promote)
   deepracer-exp export run=RUN format=aws -o custom_files   reward_function.py, model_metadata.json and
                                                             hyperparameters.json
+  deepracer-exp export run=RUN format=aws-logs              trace, metrics and logs of its training, as in an archive
+                                                            of the AWS console (deepracer-utils reads it)
+  deepracer-exp export run=RUN format=aws-logs layout=deepracer-for-cloud
 """
 
 
@@ -18,11 +21,12 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     export = commands.add_parser(
         "export",
         help="write a trained policy, or what it was trained with, for other programs",
-        description="Write a run's policy as ONNX, or the files that AWS's console and deepracer-for-cloud train from.",
+        description="Write a run's policy as ONNX, the files that AWS's console and deepracer-for-cloud train from, or "
+        "its logs as these two write them.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    export.add_argument("overrides", nargs="*", metavar="run=RUN | format=onnx|aws | KEY=VALUE")
+    export.add_argument("overrides", nargs="*", metavar="run=RUN | format=onnx|aws|aws-logs | KEY=VALUE")
     export.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )

@@ -15,8 +15,10 @@ class ExportConfig:
     run: Annotated[str, Field(min_length=1)]
     """Folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias of a
     registered model."""
-    format: Literal["onnx", "aws"]
-    """The network as a file, or what another training begins with on AWS."""
+    format: Literal["onnx", "aws", "aws-logs"]
+    """The network as a file, what another training begins with on AWS, or the run's logs as AWS writes them."""
+    layout: Literal["console", "deepracer-for-cloud"]
+    """Whose folders `aws-logs` are written in."""
     checkpoint: Annotated[str, AfterValidator(checkpoint_name)] | None
     """`best`, `last` or an iteration; null: what the alias names that the run is given by, else `best`. Of the network
     alone."""

@@ -42,7 +42,7 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> AwsF
         actions: its action space.
         reward: text of the reward function, its constants in place.
     """
-    metadata = _metadata(actions)
+    metadata = metadata_of(actions)
     learning, changed = _hyperparameters(experiment)
     return AwsFiles(
         {
@@ -70,7 +70,8 @@ def write_aws_files(files: AwsFiles, folder: Path) -> None:
         ) from error
 
 
-def _metadata(actions: ActionSpace) -> ModelMetadata:
+def metadata_of(actions: ActionSpace) -> ModelMetadata:
+    """Return an action space as a model's metadata; our policies have no camera, the service's default stands in."""
     discrete = isinstance(actions, DiscreteActions)
     listed: tuple[Action, ...] = ()
     if isinstance(actions, DiscreteActions):
@@ -111,19 +112,23 @@ def _action_notes(metadata: ModelMetadata) -> list[str]:
     return notes
 
 
-def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]]:
+def hyperparameters_of(experiment: Experiment) -> Hyperparameters:
+    """Return the values an experiment has of the service's; the service's own where it has none."""
     own = {}
     for key, target in TAKEN.items():
         group, name = target.split(".")
         own[key] = getattr(getattr(experiment, group), name)
+    return replace(Hyperparameters(), **{key: value for key, value in own.items() if value is not None})
+
+
+def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]]:
     notes = []
-    learning = Hyperparameters()
-    if own["num_episodes_between_training"] is None:
+    learning = hyperparameters_of(experiment)
+    if experiment.algorithm.episodes_per_iteration is None:
         notes.append(
             f"hyperparameters.json: num_episodes_between_training={learning.num_episodes_between_training}, the "
             f"service's own; {experiment.algorithm.frames_per_iteration} control steps decide here"
         )
-    learning = replace(learning, **{key: value for key, value in own.items() if value is not None})
     for key in learning.beyond_console():
         value = getattr(learning, key)
         low, high = CONSOLE_RANGES[key]

@@ -11,9 +11,11 @@ from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.run import StoredRun, read_run
+from deepracer_exp.formats.own_recording import read_own_recording
 from deepracer_exp.validation.console import console_findings
 
 from .aws_files import aws_files, write_aws_files
+from .aws_logs import write_aws_logs
 from .onnx_file import DeployedPolicy, write_onnx
 
 
@@ -33,6 +35,8 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
     if config.format == "onnx":
         checkpoint = run.meant(config.checkpoint)
         return _onnx(run, checkpoint, Path(output or run.path / "export" / "policy.onnx"), out)
+    if config.format == "aws-logs":
+        return _aws_logs(run, Path(output or run.path / "export" / "aws-logs"), config.layout, out)
     return _aws(run, Path(output or run.path / "export" / "aws"), out)
 
 
@@ -60,6 +64,18 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
         f"on {comparison.observations:,} observations"
     )
     return path
+
+
+def _aws_logs(run: StoredRun, folder: Path, layout: str, out: Console) -> Path:
+    recording = read_own_recording(run.path)
+    logs = write_aws_logs(recording, run.experiment, folder, layout)
+    out.print(f"{folder}", soft_wrap=True)
+    out.print(
+        f"  {logs.rows:,} rows, {logs.episodes:,} episodes, {logs.iterations:,} iterations, as {layout} has them"
+    )
+    for note in (*logs.notes, *map(str, recording.problems)):
+        out.print(f"  {note}", soft_wrap=True)
+    return folder
 
 
 def _aws(run: StoredRun, folder: Path, out: Console) -> Path:

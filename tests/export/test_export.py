@@ -36,7 +36,7 @@ def test_what_the_console_would_refuse_of_a_reward_is_told(trained, call, tmp_pa
     ("arguments", "words"),
     [
         (["format=onnx"], "run: missing"),
-        (["run=nowhere"], "format: missing; write format=onnx or format=aws"),
+        (["run=nowhere"], "format: missing; write format=onnx, format=aws or format=aws-logs"),
         (["run=nowhere", "format=onnx"], "nowhere: no such run"),
         (["run=nowhere", "format=coreml"], 'format="coreml"'),
         (

@@ -1,0 +1,359 @@
+"""The logs of a run as the service would have written them, for the tools that racers have."""
+
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.hyperparameters import hyperparameters_text
+from deepracer_exp.formats.model_metadata import model_metadata_text
+from deepracer_exp.formats.recording import Recording
+
+from .aws_files import hyperparameters_of, metadata_of
+
+TRACE_HEADER = (
+    "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
+    "track_len,tstamp,episode_status,pause_duration"
+)
+"""Columns of the console's training traces of 2022; tools read a log line of 18 fields differently."""
+LABELS = {
+    "lap_complete": "Lap complete",
+    "off_track": "Off track",
+    "crashed": "Crashed",
+    "immobilized": "Immobilized",
+    "reversed": "Reversed",
+    "time_up": "Time Up",
+}
+"""Last statuses of episodes in the words of the metrics file (deepracer-simapp, metrics/constants.py)."""
+_PLACES = {
+    "console": {
+        "trace": "sim-trace/training/training-simtrace",
+        "metrics": "metrics/training/training-{job}.json",
+    },
+    "deepracer-for-cloud": {"trace": "training-simtrace", "metrics": "metrics/TrainingMetrics.json"},
+}
+
+
+@dataclass(frozen=True)
+class AwsLogs:
+    """What was written."""
+
+    rows: int
+    episodes: int
+    iterations: int
+    notes: tuple[str, ...]
+    """What is not as in the run; a line each."""
+
+
+def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, layout: str) -> AwsLogs:
+    """Write the training of a run of ours in the folders of the console or of deepracer-for-cloud.
+
+    An iteration of the service has whole episodes, and always as many: tools tell the iteration from the episode's
+    number. So an episode belongs to the iteration of its last row, and the numbers leave gaps: iteration k has those
+    from k * n on, where n is the largest count of episodes in an iteration, which hyperparameters.json names as
+    num_episodes_between_training; the last episode of the first iteration has number n - 1. Of the evaluations, whose
+    means are all a run keeps, the metrics file has one item each.
+
+    Args:
+        recording: the run, read by `read_own_recording`.
+        experiment: its configuration.
+        folder: new or empty.
+        layout: `console` or `deepracer-for-cloud`.
+
+    Raises:
+        BadInput: no episode was finished, or the folder is not empty or cannot be written.
+    """
+    numbered = _number(recording.steps)
+    job = _job(recording.name)
+    learning = replace(hyperparameters_of(experiment), num_episodes_between_training=numbered.per_iteration)
+    head = _Head(
+        world=next(iter(experiment.tracks)),
+        metadata=model_metadata_text(metadata_of(build_action_space(experiment.action_space))),
+        hyperparameters=hyperparameters_text(learning),
+    )
+    texts = {
+        "model/model_metadata.json": head.metadata,
+        "ip/hyperparameters.json": head.hyperparameters,
+        _PLACES[layout]["metrics"].format(job=job): _metrics_text(numbered, recording.evaluated),
+        f"logs/training/training-{job}-sagemaker.log": _trainer_log(head, numbered, recording.updates),
+    }
+    if recording.reward_source is not None:
+        texts["reward_function.py"] = recording.reward_source
+    if layout == "console":
+        texts["model_metadata.json"] = head.metadata
+        texts["hyperparameters.json"] = head.hyperparameters
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise BadInput(f"--output {folder}: is not empty; accepted: a new or an empty folder")
+        for name, text in texts.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text, encoding="utf-8")
+        _write_trace(
+            numbered,
+            folder / _PLACES[layout]["trace"],
+            folder / f"logs/training/training-{job}-robomaker.log",
+            head.text(),
+        )
+    except OSError as error:
+        raise BadInput(
+            f"{error.filename}: cannot be written: {error.strerror}; give another folder by -o"
+        ) from error
+    return AwsLogs(
+        len(numbered.rows), len(numbered.episodes), numbered.iterations, _notes(numbered, experiment)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Numbered:
+    """The finished episodes in the service's order."""
+
+    rows: pd.DataFrame
+    """Their rows, episode by episode; `number` and `trace_iteration` are the service's."""
+    episodes: pd.DataFrame
+    """One row each, in the same order: number, trial, iteration and what the metrics file tells."""
+    per_iteration: int
+    iterations: int
+    first_iteration: int
+    """The run's iteration that is the first here: the first one in which an episode ended."""
+    left_out: int
+    """Rows of episodes that the end of the training cut off."""
+
+
+def _number(steps: pd.DataFrame) -> _Numbered:
+    order = np.argsort(steps["episode"].to_numpy(), kind="stable")
+    rows = steps.iloc[order]
+    begin = np.flatnonzero(np.diff(rows["episode"].to_numpy(), prepend=-1) != 0)
+    counts = np.diff(np.r_[begin, len(rows)])
+    end = begin + counts - 1
+    finished = rows["done"].to_numpy()[end]
+    if not finished.any():
+        raise BadInput("the run has no finished episode; the service's logs are made of these")
+    iteration = rows["iteration"].to_numpy()[end]
+    first = int(iteration[finished].min())
+    iteration = iteration - first
+    by_iteration = np.argsort(iteration, kind="stable")
+    chosen = by_iteration[finished[by_iteration]]
+    trial = pd.Series(iteration[chosen]).groupby(iteration[chosen]).cumcount().to_numpy() + 1
+    per_iteration = int(trial.max())
+    # The tools take the largest number of iteration 0 for the length of all.
+    trial[np.flatnonzero(iteration[chosen] == 0)[-1]] = per_iteration
+    number = iteration[chosen].astype(np.int64) * per_iteration + trial - 1
+    at = _spans(begin[chosen], counts[chosen])
+    rows_of = np.repeat(np.arange(len(chosen)), counts[chosen])
+    first_row, last_row = rows.iloc[begin[chosen]], rows.iloc[end[chosen]]
+    episodes = pd.DataFrame(
+        {
+            "number": number,
+            "trial": trial,
+            "iteration": iteration[chosen],
+            "steps": counts[chosen],
+            "reward": np.add.reduceat(rows["reward"].to_numpy(), begin)[chosen],
+            "begin_s": first_row["tstamp"].to_numpy(),
+            "end_s": last_row["tstamp"].to_numpy(),
+            "progress": last_row["progress"].to_numpy(),
+            "status": last_row["episode_status"].astype(str).to_numpy(),
+        }
+    )
+    return _Numbered(
+        rows=rows.iloc[at].assign(number=number[rows_of], trace_iteration=iteration[chosen][rows_of]),
+        episodes=episodes,
+        per_iteration=per_iteration,
+        iterations=int(iteration[chosen].max()) + 1,
+        first_iteration=first,
+        left_out=int(counts[~finished].sum()),
+    )
+
+
+def _spans(begin: NDArray[np.intp], counts: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the places of spans of rows, one after the other."""
+    before = np.cumsum(counts) - counts
+    return np.repeat(begin - before, counts) + np.arange(int(counts.sum()))
+
+
+def _job(name: str) -> str:
+    """Return a run's name as the service names its jobs: the time in 14 digits, a hyphen, the rest."""
+    dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", name)
+    return f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{name}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Head:
+    """What every log of the service begins with."""
+
+    world: str
+    metadata: str
+    hyperparameters: str
+
+    def text(self) -> str:
+        model = json.loads(self.metadata)
+        return (
+            f" * /WORLD_NAME: {self.world}\n"
+            f"Sensor list {model['sensor']}, network {model['neural_network']}, simapp_version "
+            f"{float(model['version'])}, training_algorithm {model['training_algorithm']}, action_space_type "
+            f"{model['action_space_type']}\n"
+            f"Action space from file: {model['action_space']}\n"
+            f"Using the following hyper-parameters\n{self.hyperparameters}"
+        )
+
+
+def _trainer_log(head: _Head, numbered: _Numbered, updates: pd.DataFrame) -> str:
+    """Return what the trainer would have told: the end of each episode, and of each update the mean of its epochs."""
+    lines = [head.text().rstrip("\n")]
+    driven = 0
+    by_iteration = dict(iter(numbered.episodes.groupby("iteration", sort=False)))
+    told = {int(row["iteration"]) - numbered.first_iteration: row for row in updates.to_dict("records")}
+    for iteration in range(max([*by_iteration, *told]) + 1):
+        if iteration in by_iteration:
+            for episode in by_iteration[iteration].itertuples():
+                driven += int(episode.steps)
+                lines.append(_episode_line(episode, driven, 0))
+        row = told.get(iteration)
+        if row is not None:
+            lines.append(
+                f"Policy training> Surrogate loss={row['policy_loss']}, KL divergence={row['kl']}, "
+                f"Entropy={row['entropy']}, training epoch=0, learning_rate={row['lr']}"
+            )
+            lines.append(
+                f"Checkpoint> Saving in path=['./checkpoint/agent/{iteration + 1}_Step-{driven}.ckpt']"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _episode_line(episode: Any, driven: int, reward: float) -> str:
+    return (
+        f"Training> Name=main_level/agent, Worker=0, Episode={episode.number + 1}, Total reward={reward:g}, "
+        f"Steps={driven}, Training iteration={episode.iteration}"
+    )
+
+
+def _metrics_text(numbered: _Numbered, evaluated: pd.DataFrame) -> str:
+    """Return the metrics file: an item an episode, and one an evaluation."""
+    tried = {int(row["iteration"]) - numbered.first_iteration: row for row in evaluated.to_dict("records")}
+    items: list[dict[str, Any]] = []
+    for iteration, episodes in numbered.episodes.groupby("iteration", sort=False):
+        end_s = 0.0
+        for one in episodes.itertuples():
+            end_s = one.end_s
+            items.append(
+                _item(
+                    one.reward,
+                    one.begin_s,
+                    one.end_s,
+                    episode=int(one.number) + 1,
+                    trial=int(one.trial),
+                    phase="training",
+                    completion_percentage=int(one.progress),
+                    episode_status=LABELS.get(one.status, one.status),
+                )
+            )
+        row = tried.get(int(iteration))
+        if row is not None:
+            lap_s = 0.0 if np.isnan(row["lap_time_s"]) else row["lap_time_s"]
+            complete = row["completion"] >= 100.0
+            items.append(
+                _item(
+                    0.0,
+                    end_s,
+                    end_s + lap_s,
+                    episode=(int(iteration) + 1) * numbered.per_iteration,
+                    trial=numbered.per_iteration,
+                    phase="evaluation",
+                    completion_percentage=int(row["completion"]),
+                    episode_status=LABELS["lap_complete" if complete else "off_track"],
+                )
+            )
+    return json.dumps({"metrics": items, "version": 2.0, "best_model_metric": "progress"}) + "\n"
+
+
+def _item(reward: float, begin_s: float, end_s: float, **more: Any) -> dict[str, Any]:
+    begin_ms, end_ms = round(begin_s * 1000), round(end_s * 1000)
+    return {
+        "reward_score": round(reward),
+        "metric_time": end_ms,
+        "start_time": begin_ms,
+        "elapsed_time_in_milliseconds": end_ms - begin_ms,
+        **more,
+    }
+
+
+def _write_trace(numbered: _Numbered, folder: Path, log: Path, head: str) -> None:
+    """Write one CSV an iteration, in full precision, and the same rows into the log, rounded as there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    iteration_of = numbered.rows["trace_iteration"].to_numpy()
+    bounds = np.searchsorted(iteration_of, np.arange(numbered.iterations + 1))
+    episodes, driven = numbered.episodes.itertuples(), 0
+    with log.open("w", encoding="utf-8") as out:
+        out.write(head)
+        for iteration, (begin, end) in enumerate(itertools.pairwise(bounds)):
+            if begin == end:
+                continue  # no episode ended in it; a file without rows is nothing tools expect
+            with (folder / f"{iteration}-iteration.csv").open("w", encoding="utf-8") as trace:
+                driven = _write_rows(numbered.rows.iloc[begin:end], trace, out, episodes, driven)
+
+
+def _write_rows(rows: pd.DataFrame, trace: TextIO, log: TextIO, episodes: Iterator[Any], driven: int) -> int:
+    trace.write(TRACE_HEADER + "\n")
+    last = np.diff(rows["number"].to_numpy(), append=-1) != 0
+    for (number, step, x, y, yaw, steer, speed, action, reward, done, wheels, progress, near, length, time_s,
+         status, pause), ends in zip(_values(rows), last.tolist(), strict=True):  # fmt: skip
+        trace.write(
+            f"{number},{step}.0,{x!r},{y!r},{yaw!r},{steer!r},{speed!r},{action},{reward!r},{done},{wheels},"
+            f"{progress!r},{near},{length!r},{time_s!r},{status},{pause!r}\n"
+        )
+        log.write(
+            f"SIM_TRACE_LOG:{number},{step},{x:.4f},{y:.4f},{yaw:.4f},{steer:.2f},{speed:.2f},{action},{reward:.4f},"
+            f"{done},{wheels},{progress:.4f},{near},{length:.2f},{time_s!r},{status},{pause:.2f}\n"
+        )
+        driven += 1
+        if ends:
+            episode = next(episodes)
+            log.write(_episode_line(episode, driven, episode.reward) + "\n")
+    return driven
+
+
+def _values(rows: pd.DataFrame) -> Iterator[tuple[Any, ...]]:
+    """Return the rows as Python values, in the order of `TRACE_HEADER`."""
+    columns: list[list[Any]] = []
+    for name in TRACE_HEADER.split(","):
+        if name == "action":
+            columns.append(_actions(rows))
+        else:
+            columns.append(rows["number" if name == "episode" else name].tolist())
+    return zip(*columns, strict=True)
+
+
+def _actions(rows: pd.DataFrame) -> list[Any]:
+    """Return the number of each action, or what the service writes of a policy without numbers."""
+    action = rows["action"].to_numpy()
+    if np.isnan(action).any():
+        both = zip(rows["steer"].tolist(), rows["throttle"].tolist(), strict=True)
+        return [f"[{steer} {throttle}]" for steer, throttle in both]
+    return action.astype(np.int64).tolist()
+
+
+def _notes(numbered: _Numbered, experiment: Experiment) -> tuple[str, ...]:
+    notes = [
+        f"hyperparameters.json: num_episodes_between_training={numbered.per_iteration}, the most that ended in an "
+        "iteration; episode numbers leave gaps in the others"
+    ]
+    if numbered.left_out:
+        notes.append(f"{numbered.left_out:,} rows of episodes that had not ended are left out")
+    if numbered.first_iteration:
+        notes.append(
+            f"iteration 0 is the run's {numbered.first_iteration}, the first in which an episode ended"
+        )
+    if len(experiment.tracks) > 1:
+        names = ", ".join(experiment.tracks)
+        notes.append(f"{names}: the service's trace has no column for the track; track_len tells them apart")
+    return tuple(notes)

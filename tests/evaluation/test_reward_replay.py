@@ -1,0 +1,257 @@
+"""Another reward function on recorded steps."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.reward_replay import replay_reward
+from deepracer_exp.formats.own_recording import read_own_recording
+from deepracer_exp.formats.recording import STEP_COLUMNS, Recording
+from deepracer_exp.formats.recording_reader import read_recording
+from deepracer_exp.tracks.track import Track
+
+REFERENCE = Path(__file__).parents[2] / "../shared/reference"
+FOLLOW = """
+def reward_function(params):
+    share = params["distance_from_center"] / params["track_width"]
+    return 1.0 if share <= 0.1 else 0.5 if share <= 0.25 else 0.1 if share <= 0.5 else 1e-3
+"""
+
+
+@pytest.fixture(scope="module")
+def console() -> tuple[Recording, dict[str, Track]]:
+    """Return the training and the evaluations of the service, and its course."""
+    folder = REFERENCE / "console_training/sim-trace"
+    if not folder.is_dir() or not (REFERENCE / "routes").is_dir():
+        pytest.skip("the recordings of the real service are not on this machine")
+    recording = read_recording(folder.parent)
+    route = np.load(REFERENCE / "routes/reinvent_base.npy")
+    course = Track.from_route(route, "reinvent_base")
+    return recording, dict.fromkeys(map(str, recording.steps["track"].unique()), course)
+
+
+@pytest.fixture(scope="module")
+def own(trained) -> Recording:
+    return read_own_recording(trained("algorithm.frames_per_iteration=2048", "budget.env_steps=8192").folder)
+
+
+def made(steps: pd.DataFrame) -> Recording:
+    return Recording(
+        name="made up",
+        steps=steps,
+        updates=pd.DataFrame(),
+        told=pd.DataFrame(),
+        metadata=None,
+        hyperparameters=None,
+        reward_source=None,
+        track=None,
+        problems=(),
+        files=(),
+    )
+
+
+@pytest.fixture
+def reward(tmp_path):
+    """Write a reward function and return its file."""
+
+    def write(text: str) -> str:
+        file = tmp_path / "mine.py"
+        file.write_text(text)
+        return str(file)
+
+    return write
+
+
+def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_evaluations(console, reward):
+    recording, courses = console
+    replayed = replay_reward(recording, reward(FOLLOW), courses)
+    assert (recording.steps["stream"] == "training").sum() == 44_247
+    np.testing.assert_array_equal(replayed.steps["new_reward"], recording.steps["reward"])
+    assert replayed.problems == ()
+    assert len(replayed.laps) > 47
+    assert replayed.laps["rank"].tolist() == replayed.laps["new_rank"].tolist()
+
+
+@pytest.mark.parametrize(
+    "overrides", [(), ("track=Bowtie_track", "track.direction=alternate"), ("reward=progress_delta",)]
+)
+def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
+    run = trained(*overrides)
+    recording = read_own_recording(run.folder)
+    replayed = replay_reward(recording, str(run.folder / "reward_function.py"))
+    np.testing.assert_allclose(replayed.steps["new_reward"], recording.steps["reward"], rtol=0, atol=1e-9)
+    assert replayed.steps["X"].tolist() == recording.steps["X"].tolist()
+    both = {False, True} if "track.direction=alternate" in overrides else {False}
+    assert set(replayed.waypoints["reversed"]) == both
+
+
+def test_step_by_step_and_all_at_once_pay_the_same(own, reward):
+    from importlib.resources import files
+
+    name = "progress_gain"
+    text = (files("reward_zoo") / f"{name}.py").read_text().replace("def reward_batch", "def unused")
+    at_once, one_by_one = replay_reward(own, name), replay_reward(own, reward(text))
+    np.testing.assert_allclose(
+        at_once.steps["new_reward"], one_by_one.steps["new_reward"], rtol=0, atol=1e-12
+    )
+
+
+def test_a_reward_with_a_memory_sees_the_steps_of_an_episode_in_a_row(own, reward):
+    count = """
+calls = 0
+last = None
+def reward_function(params):
+    global calls, last
+    if last is not None and params["steps"] != last + 1:
+        calls += 1
+    last = params["steps"]
+    return calls
+"""
+    steps = replay_reward(own, reward(count)).steps
+    driven = steps[steps["steps"] > 1]
+    assert driven.groupby("episode")["new_reward"].nunique().max() == 1
+    # Episode after episode, though 16 cars drove side by side.
+    firsts = driven.groupby("episode")["new_reward"].first()
+    assert firsts.tolist() == list(range(len(firsts)))
+
+
+def test_the_prepare_step_is_not_paid(own, reward):
+    steps = replay_reward(own, reward("def reward_function(params):\n    return 1.0\n")).steps
+    assert set(steps["new_reward"][steps["steps"] == 1]) == {0.0}
+    assert set(steps["new_reward"][steps["steps"] > 1]) == {1.0}
+
+
+def test_an_off_track_step_is_told_to_the_function(own, reward):
+    text = "def reward_function(params):\n    return float(params['is_offtrack'])\n"
+    steps = replay_reward(own, reward(text)).steps
+    assert ((steps["new_reward"] == 1.0) == (steps["episode_status"] == "off_track")).all()
+
+
+def laps_of(times: dict[int, int], reward: float) -> Recording:
+    """Make laps of so many steps around a circle of 10 m radius."""
+    parts = []
+    for episode, count in times.items():
+        angle = np.linspace(0.0, 2 * np.pi, count + 1) + 1e-6
+        angle[-1] = 2 * np.pi - 1e-6
+        part = pd.DataFrame({"steps": np.arange(1, count + 2), "progress": 100 * angle / (2 * np.pi)})
+        part["X"], part["Y"], part["yaw"] = 10 * np.cos(angle), 10 * np.sin(angle), 0.0
+        part["tstamp"], part["reward"], part["episode"] = part["steps"] / 15, reward, episode
+        part["closest_waypoint"] = np.round(part["progress"]).astype(int)
+        part.loc[count, "progress"] = 100.0
+        part["episode_status"] = ["prepare", *["in_progress"] * (count - 1), "lap_complete"]
+        part["done"] = part["steps"] == count + 1
+        parts.append(part)
+    steps = pd.concat(parts, ignore_index=True).assign(
+        stream="training", track="circle", all_wheels_on_track=True
+    )
+    missing = {name: 0 for name in STEP_COLUMNS if name not in steps}
+    return made(
+        steps.assign(**missing)[list(STEP_COLUMNS)].astype(
+            {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
+        )
+    )
+
+
+@pytest.fixture
+def circle() -> dict[str, Track]:
+    angle = np.linspace(0.0, 2 * np.pi, 101)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    ring[-1] = ring[0]
+    return {"circle": Track.from_route(np.hstack([10 * ring, 9.5 * ring, 10.5 * ring]), "circle")}
+
+
+def test_laps_are_ranked_anew(circle, reward):
+    recording = laps_of({0: 100, 1: 80, 2: 120, 3: 90}, reward=1.0)
+    # Paid a lap, not a step: the fastest ranks first.
+    replayed = replay_reward(
+        recording,
+        reward(
+            "def reward_function(p):\n    return 10000 / p['steps'] ** 2 if p['progress'] == 100 else 0\n"
+        ),
+        circle,
+    )
+    assert replayed.laps["episode"].tolist() == [1, 3, 0, 2]
+    assert replayed.laps["new_rank"].tolist() == [1, 2, 3, 4]
+    assert replayed.laps["time_rank"].tolist() == [1, 2, 3, 4]
+    assert replayed.laps["rank"].tolist() == [4, 3, 2, 1]
+    (found,) = replayed.correlations.to_dict("records")
+    assert found == {"track": "circle", "laps": 4, "old_new": -1.0, "old_time": 1.0, "new_time": -1.0}
+    assert replayed.episodes["complete"].all()
+    np.testing.assert_allclose(replayed.episodes["time_s"], np.array([100, 80, 120, 90]) / 15)
+
+
+def test_places_are_compared_between_0_and_1(circle, reward):
+    replayed = replay_reward(
+        laps_of({0: 400}, 1.0),
+        reward("def reward_function(p):\n    return 3 * p['closest_waypoints'][0]\n"),
+        circle,
+    )
+    # The recorded reward is the same everywhere, and says nothing of places.
+    assert set(replayed.waypoints["share"]) == {0.5}
+    assert replayed.waypoints["new_share"].min() == 0.0
+    assert replayed.waypoints["new_share"].max() == 1.0
+
+
+def test_laps_driven_the_other_way_are_seen(circle, reward):
+    recording = laps_of({0: 100}, 1.0)
+    there = recording.steps
+    back = there.assign(Y=-there["Y"], episode=np.int32(1))
+    both = replace(recording, steps=pd.concat([there, back], ignore_index=True))
+    text = "def reward_function(p):\n    return 2.0 if p['is_reversed'] else 1.0\n"
+    replayed = replay_reward(both, reward(text), circle)
+    assert replayed.episodes["new_reward"].tolist() == [100.0, 200.0]
+
+
+def test_a_course_that_is_not_known_leaves_rows_without_a_reward_and_tells_so(circle, reward):
+    steps = laps_of({0: 50, 1: 60}, 1.0).steps
+    steps["track"] = pd.Categorical(np.where(steps["episode"] == 1, "elsewhere", "circle"))
+    replayed = replay_reward(made(steps), reward("def reward_function(p):\n    return 1\n"), circle)
+    assert replayed.steps["new_reward"].isna().tolist() == (steps["episode"] == 1).tolist()
+    assert [str(problem) for problem in replayed.problems] == [
+        "made up: 61 of 112 steps have no new reward: their course or place is not known"
+    ]
+    assert replayed.laps["episode"].tolist() == [0]
+    with pytest.raises(BadInput, match="no step is on a known course"):
+        replay_reward(made(steps), reward("def reward_function(p):\n    return 1\n"), {})
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "def reward_function(p):\n    return 1 / (p['steps'] - 7)\n",
+            r"raised ZeroDivisionError: .* in line 2 of .*mine.py \(training, episode 0, step 7\)",
+        ),
+        ("def reward_function(p):\n    return None\n", r"returned None; .*\(training, episode 0, step 2\)"),
+        (
+            "def reward_function(p):\n    return 0\ndef reward_batch(p):\n    return 1 / (p['steps'] - 7)\n",
+            r"reward_batch returned inf; .*\(training, episode 0, step 7\)",
+        ),
+        (
+            "def reward_function(p):\n    return 0\ndef reward_batch(p):\n    return p['missing']\n",
+            r"reward_batch raised KeyError: 'missing' in line 4 .*\(50 steps at once\)",
+        ),
+        (
+            "def reward_function(p):\n    while p['steps'] == 9:\n        pass\n    return 0\n",
+            r"took longer than the time limit of 0.5 s .*\(training, episode 0, step 9\)",
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_a_function_that_fails_is_told_with_episode_and_step(circle, reward, text, words):
+    with pytest.raises(BadInput, match=words) as error:
+        replay_reward(laps_of({0: 50}, 1.0), reward(text), circle, time_limit_s=0.5)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_reward_is_refused(own):
+    with pytest.raises(
+        BadInput, match=r"'progres_gain' is not in the reward zoo \(did you mean progress_gain\?\)"
+    ):
+        replay_reward(own, "progres_gain")
+    with pytest.raises(BadInput, match=r"'nowhere.py' cannot be read"):
+        replay_reward(own, "nowhere.py")

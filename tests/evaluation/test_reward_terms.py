@@ -1,0 +1,97 @@
+"""Terms of a reward function: they add up to what was paid, step by step."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.config.driving import RewardConfig
+from deepracer_exp.env.reward_source import RewardSource, load_reward_source, zoo_names
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.reward_replay import replay_reward
+from deepracer_exp.evaluation.reward_terms import recorded_source, reward_terms
+
+from ..analysis.made_up import Drive, made_up_recording  # noqa: TID252
+
+WITH_TERMS = (
+    *("center_speed_blend", "progress_delta", "progress_gain", "racing_line"),
+    *("self_motivator", "steps_to_finish"),
+)
+
+
+@pytest.fixture(scope="module")
+def view() -> LogView:
+    drives = [Drive(speed_mps=2.0 + 0.5 * k, offset_m=0.1 * k) for k in range(3)]
+    return prepare(made_up_recording([*drives, Drive(speed_mps=2.0, off_at=60)]))
+
+
+def source(name: str) -> RewardSource:
+    return load_reward_source(RewardConfig(name=name, file=None, constants={}, time_limit_s=30.0))
+
+
+def module(text: str) -> RewardSource:
+    return RewardSource("mine", "mine.py", text, "", {}, {})
+
+
+@pytest.mark.parametrize("name", zoo_names())
+def test_the_functions_of_the_zoo_that_are_sums_name_their_terms(name: str, view: LogView) -> None:
+    assert (reward_terms(view, source(name), most=50) is not None) == (name in WITH_TERMS)
+
+
+@pytest.mark.parametrize("name", WITH_TERMS)
+def test_terms_add_up_to_the_reward(name: str, view: LogView) -> None:
+    terms = reward_terms(view, source(name))
+    assert terms is not None
+    paid = replay_reward(replace(view.recording, steps=view.steps), name).steps["new_reward"]
+    np.testing.assert_allclose(terms.sum(axis=1), paid.loc[terms.index], rtol=1e-9, atol=1e-12)
+
+
+def test_every_driven_row_has_its_terms(view: LogView) -> None:
+    terms = reward_terms(view, source("center_speed_blend"))
+    assert terms is not None
+    driven = view.steps[view.steps["episode_status"] != "prepare"]
+    assert terms.index.equals(driven.index)
+
+
+def test_of_a_long_training_whole_episodes_are_asked_about(view: LogView) -> None:
+    most = len(view.steps) // 3
+    terms = reward_terms(view, source("center_speed_blend"), most=most)
+    assert terms is not None
+    asked = view.steps.loc[terms.index, "episode"]
+    assert 0 < len(terms) < 1.5 * most
+    whole = view.steps["episode"].isin(asked) & (view.steps["episode_status"] != "prepare")
+    assert len(terms) == whole.sum()
+
+
+def test_a_recording_brings_its_own_reward_function(view: LogView) -> None:
+    assert recorded_source(view.recording) is None
+    text = "def terms(params):\n    return {'one': 1.0, 'two': 2}\n\n\ndef reward_function(params):\n    return 3.0\n"
+    mine = recorded_source(replace(view.recording, reward_source=text))
+    assert mine is not None
+    terms = reward_terms(view, mine)
+    assert terms is not None
+    assert terms.mean().to_dict() == {"one": 1.0, "two": 2.0}
+
+
+def test_without_a_course_there_are_no_terms(view: LogView) -> None:
+    assert reward_terms(replace(view, course=None), source("progress_gain")) is None
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("return 3.0", "returned '3.0', no dict of numbers"),
+        ("return {}", "no dict of numbers"),
+        ("return {'a': 'b'}", "returned 'b' for 'a'"),
+        ("return {'a': float('nan')}", "returned 'nan' for 'a'"),
+        ("return {'a': 1 / 0}", "raised ZeroDivisionError"),
+        ("while True: pass", "took longer than the time limit of 0.2 s"),
+    ],
+)
+def test_terms_that_fail_are_told_in_one_line(body: str, words: str, view: LogView) -> None:
+    text = f"def terms(params):\n    {body}\n\n\ndef reward_function(params):\n    return 1.0\n"
+    with pytest.raises(BadInput, match=r"mine\.py: terms ") as caught:
+        reward_terms(view, module(text), time_limit_s=0.2)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
