@@ -8,7 +8,7 @@ from deepracer_exp.config import stored
 from deepracer_exp.formats.run_files import RunRecord
 
 NOTHING = stored.ABSENT
-_NO_MATTER = ("runs_dir", "debug", "tracking")  # whatever they are, the car drives the same
+_NO_MATTER = ("runs_dir", "debug", "report", "tracking")  # whatever they are, the car drives the same
 LAST = 10
 """Iterations at the end of a run over which its figures are averaged: single ones wobble."""
 

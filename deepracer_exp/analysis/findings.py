@@ -1,0 +1,352 @@
+"""What a log says in words: rules over its tables, each with its figure (docs/findings.md)."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+
+from . import candidates as chosen
+from . import learning, off_track
+from .candidates import candidates, lap_chance
+from .learning import convergence, overfitting
+from .log_view import LogView
+from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
+from .sectors import Sectors, sector_times, sectors_of, theoretical_best_s
+
+LATE_SHARE = 1 / 3
+"""Share of the iterations, the last ones, that say how the car drives now."""
+LEAST_LAPS = 5
+"""Complete laps in them below which all laps of the log are looked at."""
+MOST_LOST = 3
+WORTH_S = 0.02
+"""Time lost in a sector that is worth a word."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing a log says."""
+
+    rule: str
+    sentence: str
+    """In plain words, one to three sentences."""
+    figure: str
+    """Name of the chart that shows it."""
+    values: Mapping[str, float | int | str] = field(default_factory=dict)
+    """What was compared."""
+    thresholds: Mapping[str, float | int] = field(default_factory=dict)
+
+
+def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
+    """Return what the rules find in a log, the most important first.
+
+    Args:
+        view: the log.
+        target_s: lap time wanted; None: the fastest lap driven.
+    """
+    found: list[Finding | None] = []
+    if len(view.episodes):
+        found += [_converged(view), _submit(view)]
+    laps = _Laps.of(view)
+    found += [_chance(laps, target_s), _time_lost(view, laps), *_runs_off(view), _overfits(view)]
+    return [one for one in found if one is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Laps:
+    """The steps of the car as it drives now; where there is no training, of the evaluations."""
+
+    steps: pd.DataFrame
+    lap_times_s: np.ndarray
+    whose: str
+
+    @classmethod
+    def of(cls, view: LogView) -> "_Laps":
+        if not len(view.episodes):
+            return cls(
+                view.evaluations, view.evaluation_episodes["lap_time_s"].to_numpy(), "of the evaluations"
+            )
+        late = _late(view)
+        times = late["lap_time_s"].to_numpy()
+        if np.isfinite(times).sum() >= LEAST_LAPS:
+            steps = view.steps[view.steps["episode"].isin(late["episode"])]
+            return cls(steps, times, f"since iteration {late['iteration'].min()}")
+        return cls(view.steps, view.episodes["lap_time_s"].to_numpy(), "of the training")
+
+
+def _late(view: LogView) -> pd.DataFrame:
+    """Return the episodes of the last iterations."""
+    iterations = np.unique(view.episodes["iteration"])
+    begin = iterations[-math.ceil(LATE_SHARE * len(iterations))]
+    return view.episodes[view.episodes["iteration"] >= begin]
+
+
+def _converged(view: LogView) -> Finding:
+    actions = view.recording.metadata.actions if view.recording.metadata is not None else ()
+    numbered = view.steps["action"].notna().any()
+    count = (len(actions) or int(view.steps["action"].max()) + 1) if numbered else None
+    found = convergence(view.iterations, count)
+    thresholds = {
+        "completion_gain": learning.COMPLETION_GAIN,
+        "reward_gain": learning.REWARD_GAIN,
+        "laps_gain": learning.LAPS_GAIN,
+        "completion_near": learning.COMPLETION_NEAR,
+        "entropy_change": learning.ENTROPY_CHANGE,
+    }
+    if found is None:
+        driven = int((view.iterations["episodes"] > 0).sum())
+        sentence = (
+            f"Too short to say whether the training has converged: {_count(driven, 'iteration')}, and at least "
+            f"{learning.PATIENCE + 1} are needed."
+        )
+        return Finding(
+            rule="converged", sentence=sentence, figure="training_progress", values={"iterations": driven}
+        )
+    values: dict[str, float | int | str] = {
+        "completion": found.completion,
+        "completion_before": found.completion_before,
+        "completion_best": found.completion_best,
+        "patience": found.patience,
+    }
+    if math.isfinite(found.entropy_change):
+        values["entropy_change"] = found.entropy_change
+    if found.iteration is not None:
+        values["iteration"] = found.iteration
+        sentence = (
+            f"Converged at iteration {found.iteration}: since then completion ({found.completion:.0f} %), reward and "
+            "complete laps have not grown."
+        )
+        if found.completion < learning.POOR:
+            sentence += (
+                " That is far from a lap: change reward, action space or learning rate, do not train longer."
+            )
+    elif found.completion < found.completion_best - learning.COMPLETION_NEAR:
+        sentence = (
+            f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f} %. "
+            "A lower learning rate or an earlier checkpoint may hold it."
+        )
+    elif found.completion > found.completion_before + learning.COMPLETION_GAIN:
+        sentence = (
+            f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f} % in "
+            f"the last {found.patience} iterations. Train on."
+        )
+    else:
+        what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still moves"
+        sentence = f"Not converged yet: completion stands at {found.completion:.0f} %, but {what}. Train on."
+    return Finding(
+        rule="converged", sentence=sentence, figure="training_progress", values=values, thresholds=thresholds
+    )
+
+
+def _submit(view: LogView) -> Finding:
+    best = candidates(view.iterations)
+    thresholds = {"least_laps": chosen.LEAST_LAPS, "dense": chosen.DENSE}
+    if not len(best):
+        farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
+        laps = int(view.episodes["complete"].sum())
+        sentence = (
+            f"Nothing to submit yet: no iteration has {chosen.LEAST_LAPS} complete laps ({_count(laps, 'lap')} in "
+            f"all); the farthest episode came to {farthest['progress']:.0f} % of the lap in iteration "
+            f"{farthest['iteration']}."
+        )
+        values = {"laps": laps, "progress": float(farthest["progress"])}
+        return Finding(
+            rule="submit",
+            sentence=sentence,
+            figure="lap_time_percentile",
+            values=values,
+            thresholds=thresholds,
+        )
+    first = best.iloc[0]
+    sentence = (
+        f"Submit the checkpoint that drove iteration {first['iteration']:.0f}: a quarter of its laps are below "
+        f"{first['lap_time_p25_s']:.2f} s, and {first['lap_share']:.0%} of its episodes are complete laps "
+        f"({first['complete']:.0f} of {first['episodes']:.0f})."
+    )
+    others = [
+        f"{row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
+        for row in best.iloc[1:].itertuples()
+    ]
+    if others:
+        sentence += f" After it: {' and '.join(others)}."
+    values = {"iteration": int(first["iteration"]), "p25_s": float(first["lap_time_p25_s"])}
+    values |= {"lap_share": float(first["lap_share"]), "laps": int(first["complete"])}
+    return Finding(
+        rule="submit", sentence=sentence, figure="lap_time_percentile", values=values, thresholds=thresholds
+    )
+
+
+def _chance(laps: _Laps, target_s: float | None) -> Finding | None:
+    known = laps.lap_times_s[np.isfinite(laps.lap_times_s)]
+    if not len(known):
+        return None
+    target = float(known.min()) if target_s is None else target_s
+    found = lap_chance(known, target)
+    assert found is not None
+    complete = len(known) / len(laps.lap_times_s)
+    what = f"took at most {target:.2f} s" + (", the fastest of them" if target_s is None else "")
+    sentence = (
+        f"{found.faster} of {_count(found.laps, 'complete lap')} {laps.whose} {what}: the chance of such a lap is "
+        f"{_share(found.low)} to {_share(found.high)}"
+    )
+    values: dict[str, float | int | str] = {"target_s": target, "laps": found.laps, "faster": found.faster}
+    values |= {"low": found.low, "high": found.high, "mean_s": found.mean_s, "complete": complete}
+    if math.isfinite(found.normal):
+        fit = f"mean {found.mean_s:.2f} s, deviation {found.sd_s:.2f} s"
+        sentence += f"; a normal fit ({fit}) says {_share(found.normal)}"
+        values |= {"sd_s": found.sd_s, "normal": found.normal}
+    sentence += f". {complete:.0%} of the episodes were complete laps."
+    return Finding(rule="chance", sentence=sentence, figure="lap_time_histogram", values=values)
+
+
+def _time_lost(view: LogView, laps: _Laps) -> Finding | None:
+    if view.course is None:
+        return None
+    sectors = sectors_of(view.course)
+    times = sector_times(laps.steps, sectors)
+    if len(times) < 2 or len(sectors.parts) < 2:
+        return None
+    lost = (times.median() - times.min()).sort_values(ascending=False, kind="stable").head(MOST_LOST)
+    lost = lost[lost >= WORTH_S]
+    best_s, possible_s = float(times.sum(axis=1).min()), theoretical_best_s(times)
+    places = [f"{_place(sectors, name)}: {seconds:.2f} s" for name, seconds in lost.items()]
+    sentence = f"The best sectors of {_count(len(times), 'lap')} {laps.whose} add up to {possible_s:.2f} s; "
+    sentence += f"the fastest lap took {best_s:.2f} s. "
+    sentence += (
+        f"An ordinary lap loses most in {'; '.join(places)}."
+        if places
+        else "No sector loses time to its best."
+    )
+    return Finding(
+        rule="time_lost",
+        sentence=sentence,
+        figure="sector_times",
+        values={"best_lap_s": best_s, "theoretical_best_s": possible_s}
+        | {f"lost_s, {name}": float(seconds) for name, seconds in lost.items()},
+        thresholds={"worth_s": WORTH_S},
+    )
+
+
+def _place(sectors: Sectors, name: str) -> str:
+    part = sectors.parts[sectors.names.index(name)]
+    return f"{name} (waypoints {part.first_waypoint} to {part.last_waypoint})"
+
+
+def _runs_off(view: LogView) -> list[Finding]:
+    if len(view.episodes):
+        late = _late(view)
+        steps = view.steps[view.steps["episode"].isin(late["episode"])]
+        when = f"since iteration {late['iteration'].min()}"
+    else:
+        steps, when = view.evaluations, "in the evaluations"
+    thresholds = {"least": off_track.LEAST, "place_m": off_track.PLACE_M}
+    places = off_track_places(steps)
+    if not places:
+        times = len(off_track.off_track_rows(steps))
+        often = (
+            "does not run off the road"
+            if not times
+            else f"runs off the road {_times(times)}, in no place often"
+        )
+        sentence = f"The car {often} {when}."
+        return [
+            Finding(
+                rule="runs_off",
+                sentence=sentence,
+                figure="off_track_risk",
+                values={"times": times},
+                thresholds=thresholds,
+            )
+        ]
+    sectors = sectors_of(view.course) if view.course is not None else None
+    where = [
+        f"at waypoint {one.waypoint}{_in(sectors, one)} to the {one.side} "
+        f"({one.count} of {one.passes} passes, {_share(one.risk)})"
+        for one in places
+    ]
+    found = Finding(
+        rule="runs_off",
+        sentence=f"The car runs off most often {', then '.join(where)}, counted {when}.",
+        figure="off_track_risk",
+        values={f"risk, waypoint {one.waypoint}": one.risk for one in places}
+        | {f"times, waypoint {one.waypoint}": one.count for one in places},
+        thresholds=thresholds,
+    )
+    return [found, _steering(places)]
+
+
+def _steering(places: list[OffTrackPlace]) -> Finding:
+    words = [
+        f"at waypoint {one.waypoint} {JUDGEMENTS[one.judgement] if one.judgement else 'now this, now that'}"
+        for one in places
+    ]
+    return Finding(
+        rule="steering",
+        sentence=f"Before it runs off, {'; '.join(words)}.",
+        figure="slide_map",
+        values={
+            f"{name}, waypoint {one.waypoint}": times
+            for one in places
+            for name, times in one.judgements.items()
+        },
+        thresholds={
+            "unusual": off_track.UNUSUAL,
+            "slide_deg": off_track.SLIDE_DEG,
+            "steers_deg": off_track.STEERS_DEG,
+        },
+    )
+
+
+def _in(sectors: Sectors | None, place: OffTrackPlace) -> str:
+    if sectors is None:
+        return ""
+    return f" ({sectors.names[int(sectors.of(np.array([place.lap_position]))[0])]})"
+
+
+def _overfits(view: LogView) -> Finding | None:
+    found = overfitting(view.iterations)
+    if found is None:
+        return None
+    if found.overfits:
+        sentence = (
+            f"It overfits: completion in the {found.evaluated} fell from {found.best:.0f} % around iteration "
+            f"{found.best_iteration} to {found.now:.0f} % while that of the training holds at "
+            f"{found.training_now:.0f} %. Take a checkpoint from about iteration {found.best_iteration}."
+        )
+    else:
+        sentence = (
+            f"No sign of overfitting: completion in the {found.evaluated} stands at {found.now:.0f} % "
+            f"(best {found.best:.0f} %), in the training at {found.training_now:.0f} %."
+        )
+    return Finding(
+        rule="overfits",
+        sentence=sentence,
+        figure="evaluations",
+        values={
+            "best": found.best,
+            "best_iteration": found.best_iteration,
+            "now": found.now,
+            "training_best": found.training_best,
+            "training_now": found.training_now,
+        },
+        thresholds={
+            "evaluation_drop": learning.EVALUATION_DROP,
+            "training_near": learning.COMPLETION_NEAR,
+        },
+    )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _share(share: float) -> str:
+    """Return it in per cent, with a digit more where it is small."""
+    return (
+        f"{share:.0%}" if share >= 0.1 or share == 0 else f"{share:.1%}" if share >= 0.001 else "below 0.1%"
+    )
+
+
+def _times(number: int) -> str:
+    return {1: "once", 2: "twice"}.get(number, f"{number} times")

@@ -1,0 +1,161 @@
+"""The tables of a log's page: iterations, best laps, what was trained with, what could not be read."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from .candidates import candidates
+from .log_view import LogView
+
+NONE = "\N{EN DASH}"
+MOST_ITERATIONS = 300
+MOST_LAPS = 10
+MOST_PROBLEMS = 200
+MOST_FILES = 400
+
+
+@dataclass(frozen=True)
+class Table:
+    """Texts in rows."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    words: int = 0
+    """How many columns, from the first on, are words; the others are numbers."""
+    left_out: int = 0
+    """Rows that the page would be too long with."""
+
+
+def iteration_rows(view: LogView) -> Table:
+    """Return how each iteration drove and learned; of very many, every second, third, ... and the last."""
+    table = view.iterations
+    told = {name: column for name, column in _ITERATION_COLUMNS.items() if table[name].notna().any()}
+    every = math.ceil(len(table) / MOST_ITERATIONS) or 1
+    shown = table.iloc[::-1].iloc[::every].iloc[::-1]
+    return _table(shown, told, len(table) - len(shown))
+
+
+def candidate_rows(view: LogView) -> Table:
+    """Return the iterations whose policy is worth submitting, the best first."""
+    return _table(candidates(view.iterations), _CANDIDATE_COLUMNS)
+
+
+def best_laps(view: LogView) -> Table:
+    """Return the fastest complete laps of the training, the fastest first."""
+    laps = view.episodes.dropna(subset="lap_time_s").sort_values("lap_time_s", kind="stable")
+    return _table(laps.head(MOST_LAPS), _LAP_COLUMNS, max(0, len(laps) - MOST_LAPS))
+
+
+def problem_rows(view: LogView) -> Table:
+    """Return what could not be read, where and why."""
+    rows = [
+        (problem.file, NONE if problem.line is None else f"{problem.line:,}", problem.reason)
+        for problem in view.problems[:MOST_PROBLEMS]
+    ]
+    return Table(("File", "Line", "Why"), tuple(rows), 3, max(0, len(view.problems) - MOST_PROBLEMS))
+
+
+def facts(view: LogView) -> list[tuple[str, str]]:
+    """Return what was driven, with names and values."""
+    recording, course = view.recording, view.course
+    found: list[tuple[str, str]] = []
+    if course is not None:
+        way = ", reversed" if course.reversed else ""
+        found.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
+    others = [name for name in recording.steps["track"].unique() if str(name) not in ("", view.track_name)]
+    if others:
+        found.append(("Other courses in it", ", ".join(map(str, others))))
+    if recording.metadata is not None:
+        actions = recording.metadata.actions
+        space = "continuous" if not actions else f"{len(actions)} actions"
+        found.append(("Action space", f"{space}; sensors {', '.join(recording.metadata.sensor) or NONE}"))
+    if len(view.evaluation_episodes):
+        streams = view.evaluation_episodes["stream"].nunique()
+        found.append(
+            ("Evaluations", f"{len(view.evaluation_episodes):,} episodes in {count(streams, 'evaluation')}")
+        )
+    return found
+
+
+def settings(values: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Return hyperparameters as texts."""
+    return [
+        (str(key), value if isinstance(value, str) else json.dumps(value))
+        for key, value in sorted((values or {}).items())
+    ]
+
+
+def headline(view: LogView) -> str:
+    """Return in one sentence how much was driven, and how well."""
+    laps = view.episodes["lap_time_s"].dropna()
+    parts = [count(len(view.steps), "control step"), count(len(view.episodes), "episode")]
+    parts.append(count(len(view.iterations), "iteration"))
+    sentence = f"{parts[0]} in {parts[1]} and {parts[2]}"
+    if not len(view.steps):
+        sentence = f"No training steps; {count(len(view.evaluations), 'control step')} of evaluations"
+    if not int(view.episodes["complete"].sum()):
+        return f"{sentence}; no complete lap."
+    best = f", the best in {laps.min():.2f} s" if len(laps) else ""
+    return f"{sentence}; {count(int(view.episodes['complete'].sum()), 'complete lap')}{best}."
+
+
+def count(number: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{number:,} {what}{'s' * (number != 1)}"
+
+
+def number(value: Any, form: str) -> str:
+    """Return a value as text, a dash where it is not known."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return NONE
+    return format(value, form)
+
+
+def _table(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]], left_out: int = 0) -> Table:
+    """Return columns with their heads and formats."""
+    rows = [
+        tuple(number(value, columns[name][1]) for name, value in row.items())
+        for row in table[list(columns)].to_dict("records")
+    ]
+    return Table(tuple(head for head, _ in columns.values()), tuple(rows), left_out=left_out)
+
+
+_ITERATION_COLUMNS = {
+    "iteration": ("Iteration", "d"),
+    "episodes": ("Episodes", ",d"),
+    "steps": ("Steps", ",d"),
+    "complete": ("Laps", ",d"),
+    "completion_mean": ("Driven, %", ".1f"),
+    "reward_mean": ("Reward", ".4g"),
+    "lap_time_best_s": ("Best lap, s", ".2f"),
+    "lap_time_p25_s": ("25th percentile, s", ".2f"),
+    "speed_mps": ("Speed, m/s", ".2f"),
+    "entropy": ("Entropy, nats", ".3f"),
+    "kl": ("KL, nats", ".2g"),
+    "lr": ("Learning rate", ".2g"),
+    "eval_completion": ("Evaluated, %", ".1f"),
+    "held_out_completion": ("Held out, %", ".1f"),
+}
+_CANDIDATE_COLUMNS = {
+    "iteration": ("Iteration", "d"),
+    "lap_time_p25_s": ("25th percentile, s", ".2f"),
+    "lap_time_best_s": ("Best lap, s", ".2f"),
+    "lap_time_mean_s": ("Mean lap, s", ".2f"),
+    "lap_share": ("Complete", ".0%"),
+    "complete": ("Laps", ",d"),
+    "episodes": ("Episodes", ",d"),
+}
+_LAP_COLUMNS = {
+    "lap_time_s": ("Lap time, s", ".2f"),
+    "iteration": ("Iteration", "d"),
+    "episode": ("Episode", "d"),
+    "first_waypoint": ("From waypoint", "d"),
+    "steps": ("Steps", ",d"),
+    "dist_m": ("Driven, m", ".2f"),
+    "speed_mps": ("Speed commanded, m/s", ".2f"),
+    "reward": ("Reward", ".4g"),
+}

@@ -1,0 +1,194 @@
+"""Where the car runs off the road, and what it did before."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from .candidates import wilson
+from .episode_table import first_rows
+from .racing_line import WHEELBASE_M
+
+Values = NDArray[np.float64]
+Rows = NDArray[np.intp]
+PLACE_M = 1.5
+"""Length of road that counts as one place."""
+PLACES = 3
+LEAST = 3
+"""Times the car must run off somewhere to make it a place."""
+BEFORE = 8
+"""Control steps looked at before it leaves the road: half a second of the service's time."""
+STEERS_DEG = 5.0
+"""Mean steering below which the car counts as going straight on."""
+UNUSUAL = 2.0
+"""Turning so many standard deviations less than predicted is understeer; more, on the side it steers to, oversteer."""
+SLIDE_DEG = 15.0
+"""Slide of the rear axle from which on the tail comes round."""
+
+UNDERSTEER, OVERSTEER, LATE, AWAY = "understeer", "oversteer", "late", "away"
+JUDGEMENTS: Mapping[str, str] = {
+    UNDERSTEER: "it understeers: it turns less than the same steering usually does",
+    OVERSTEER: "it oversteers: the tail comes round or it turns more than the same steering usually does",
+    LATE: "it steers back and turns as usual, but too late for its speed",
+    AWAY: "it does not steer back",
+}
+"""What the car did before it left the road, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffTrackPlace:
+    """A place where the car runs off."""
+
+    lap_position: float
+    """0 to 1, median of the times."""
+    waypoint: int
+    """Nearest one there."""
+    side: str
+    """`left` or `right` of the centre line."""
+    count: int
+    """Times it ran off here."""
+    passes: int
+    """Episodes that came here."""
+    low: float
+    """Of the 95 per cent interval of the risk."""
+    high: float
+    judgement: str | None
+    """Key of `JUDGEMENTS` for at least half of the times, None where there is none."""
+    judgements: Mapping[str, int]
+
+    @property
+    def risk(self) -> float:
+        """Share of the episodes that ran off here of those that came here."""
+        return self.count / self.passes
+
+
+def off_track_rows(steps: pd.DataFrame) -> Rows:
+    """Return the rows at which the car is off the road for the first time.
+
+    Those are rows of status off_track, and where the generation has no status the last rows of episodes that ended
+    with a wheel off the road before the lap was complete.
+    """
+    if not len(steps):
+        return np.zeros(0, np.intp)
+    status = steps["episode_status"].astype(str).to_numpy()
+    first = first_rows(steps)
+    off = status == "off_track"
+    off[1:] &= first[1:] | (status[:-1] != "off_track")
+    ended = (status == "") & steps["done"].to_numpy(bool) & ~steps["all_wheels_on_track"].to_numpy(bool)
+    return np.flatnonzero(off | (ended & (steps["progress"].to_numpy() < 100.0)))
+
+
+def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
+    """Return the places where the car runs off most often, at most `PLACES`.
+
+    Args:
+        steps: of a `LogView`, or a part of them made of whole episodes.
+    """
+    rows = off_track_rows(steps)
+    position = steps["lap_position"].to_numpy(np.float64)
+    rows = rows[np.isfinite(position[rows])]
+    if len(rows) < LEAST:
+        return []
+    half = PLACE_M / 2 / float(steps["track_len"].median())
+    judged = judge(steps, rows)
+    episode = np.cumsum(first_rows(steps))
+    offset = steps["offset_m"].to_numpy(np.float64)
+    left = np.ones(len(rows), bool)
+    found: list[OffTrackPlace] = []
+    while len(found) < PLACES and left.any():
+        at = position[rows]
+        near = _apart(at[:, None], at[left][None, :]) <= half
+        busiest = int(near.sum(axis=1).argmax())
+        here = left & (_apart(at, at[busiest]) <= half)
+        if here.sum() < LEAST:
+            break
+        left &= ~(_apart(at, at[busiest]) <= 2 * half)
+        counts = Counter(judged[here].tolist())
+        most, times = counts.most_common(1)[0]
+        passes = len(np.unique(episode[_apart(position, at[busiest]) <= half]))
+        low, high = wilson(int(here.sum()), max(passes, int(here.sum())))
+        ahead = (at[here] - at[busiest] + 0.5) % 1.0
+        middle = rows[here][np.argsort(ahead, kind="stable")[len(ahead) // 2]]
+        found.append(
+            OffTrackPlace(
+                lap_position=float(position[middle]),
+                waypoint=int(steps["closest_waypoint"].to_numpy()[middle]),
+                side="left" if np.nanmedian(np.r_[offset[rows[here]], 0.0]) > 0 else "right",
+                count=int(here.sum()),
+                passes=passes,
+                low=low,
+                high=high,
+                judgement=most if 2 * times >= here.sum() else None,
+                judgements=dict(counts),
+            )
+        )
+    return found
+
+
+def judge(steps: pd.DataFrame, rows: Rows) -> NDArray[np.str_]:
+    """Say for each time the car left the road what it did before: keys of `JUDGEMENTS`.
+
+    Looked at are the `BEFORE` control steps up to the row. A simulated car turns less and later than a bicycle, so
+    that its turning is compared with what the same steering usually does in the same recording. The yaw rate follows
+    the commanded one, u = speed * tan(steering) / wheelbase, with a lag: r' = a r + b u + c, fitted to all steps by
+    least squares. It is predicted from the yaw rate `BEFORE` steps ago and the steering since; unusual is what
+    differs by more than `UNUSUAL` standard deviations (1.4826 times the median deviation) of all such predictions
+    that do not end off the road.
+    """
+    steer, turned_more, slide = _stretches(steps)
+    near_end = np.zeros(len(steps), bool)
+    for back in range(2 * BEFORE):
+        near_end[np.maximum(rows - back, 0)] = True
+    usual = turned_more[np.isfinite(turned_more) & ~near_end]
+    unusual = UNUSUAL * 1.4826 * float(np.median(np.abs(usual))) if len(usual) else np.inf
+    side = np.sign(steps["offset_m"].to_numpy(np.float64)[rows])
+    steers = np.where(np.abs(steer[rows]) >= STEERS_DEG, np.sign(steer[rows]), 0.0)
+    back = (steers != 0) & (steers == -side)
+    more = turned_more[rows] * steers
+    over = (slide[rows] >= SLIDE_DEG) | ((steers == side) & (more >= unusual))
+    return np.select([over, back & (more <= -unusual), back], [OVERSTEER, UNDERSTEER, LATE], AWAY)
+
+
+def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
+    """Return for the `BEFORE` steps up to each row what the car did; NaN in the first rows of an episode.
+
+    Returns:
+        Mean steering in degrees, mean yaw rate minus the predicted one in degrees a second (positive to the left), and
+        the largest slide in degrees, of which no row is NaN.
+    """
+    first = first_rows(steps)
+    row = np.arange(len(steps))
+    since = row - np.maximum.accumulate(np.where(first, row, 0))
+    steer, rate, speed = (
+        np.nan_to_num(steps[name].to_numpy(np.float64))
+        for name in ("steer", "yaw_rate_dps", "track_speed_mps")
+    )
+    # What is commanded in a row acts until the next one.
+    asked = np.degrees(_before(speed, 1) * np.tan(np.radians(_before(steer, 1))) / WHEELBASE_M)
+    inside = since >= 2
+    columns = np.column_stack([_before(rate, 1), asked, np.ones(len(rate))])
+    lag, gain, trim = np.linalg.lstsq(columns[inside], rate[inside], rcond=None)[0]
+    predicted, more, mean_steer = _before(rate, BEFORE), np.zeros(len(rate)), np.zeros(len(rate))
+    slide = np.abs(np.nan_to_num(steps["slide_deg"].to_numpy(np.float64)))
+    largest = slide.copy()
+    for back in range(BEFORE - 1, -1, -1):
+        predicted = lag * predicted + gain * _before(asked, back) + trim
+        more += (_before(rate, back) - predicted) / BEFORE
+        mean_steer += _before(steer, back + 1) / BEFORE
+        largest = np.where(since >= back, np.maximum(largest, _before(slide, back)), largest)
+    whole = since > BEFORE
+    return np.where(whole, mean_steer, np.nan), np.where(whole, more, np.nan), largest
+
+
+def _before(values: Values, rows: int) -> Values:
+    """Return the values of so many rows before, 0 where there is none."""
+    return values if not rows else np.concatenate([np.zeros(min(rows, len(values))), values[:-rows]])
+
+
+def _apart(a: Values | float, b: Values | float) -> Values:
+    """Return the distance of lap positions on the shorter way round."""
+    difference = np.abs(np.asarray(a) - np.asarray(b))
+    return np.minimum(difference, 1.0 - difference)

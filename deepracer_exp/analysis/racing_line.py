@@ -1,0 +1,129 @@
+"""The racing line of a course: the line of least curvature between its borders, and what it asks of a car."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from deepracer_exp.tracks.track import Track
+
+Values = NDArray[np.float64]
+MARGIN_M = 0.1
+"""Room between the line and a border: half a car's width, so that all wheels stay on the road."""
+SAMPLE_M = 0.15
+"""Distance of the line's points along the centre line, where the course is not longer than `MOST` of them."""
+MOST = 200
+"""Points of a line; the work grows with their cube."""
+ROUNDS = 5
+"""Half of the way to each round's answer is gone, which keeps the line from swinging; after these 97 per cent."""
+WHEELBASE_M = 0.164
+"""Of every car of the service (deepracer-simapp urdf/deepracer)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Line:
+    """A way along a course, at evenly spaced places of the centre line."""
+
+    lap_position: Values
+    """Places (n,), 0 to 1; a closed course ends where it began."""
+    offset_m: Values
+    """From the centre line, positive to the left of the driving direction."""
+    xy: Values
+    """(n, 2), m."""
+    curvature_pm: Values
+    """1/m, positive where the line turns left."""
+
+    @property
+    def steering_deg(self) -> Values:
+        """Return the steering angle of a car that rolls along without slip (kinematic bicycle), left positive."""
+        return np.degrees(np.arctan(WHEELBASE_M * self.curvature_pm))
+
+    def speed_mps(self, lateral_mps2: float, top_mps: float) -> Values:
+        """Return the speed at which cornering takes `lateral_mps2`, at most `top_mps`; braking takes no room."""
+        return np.minimum(top_mps, np.sqrt(lateral_mps2 / np.maximum(np.abs(self.curvature_pm), 1e-9)))
+
+    def at(self, lap_position: Values, values: Values) -> Values:
+        """Return `values` of the line's points, interpolated at other places."""
+        return np.interp(lap_position, self.lap_position, values)
+
+
+def center_line(course: Track) -> Line:
+    """Return the centre line as a way to drive."""
+    center, _, _, lap_position = _sampled(course)
+    return _line(course, center, np.zeros(len(center)), center, lap_position)
+
+
+@lru_cache(maxsize=8)
+def racing_line(course: Track) -> Line:
+    """Return the line of least curvature, squared and summed along it, that keeps `MARGIN_M` from both borders.
+
+    Moving point i sideways changes the second differences linearly; with direction and pace of the line found
+    before, their part across it is the curvature. So each round is a bounded linear least squares problem.
+    """
+    center, left_m, right_m, lap_position = _sampled(course)
+    along = _tangents(course, center)
+    sideways = np.column_stack([-along[:, 1], along[:, 0]])
+    low, high = np.minimum(MARGIN_M - right_m, -1e-6), np.maximum(left_m - MARGIN_M, 1e-6)
+    first, second = _first_differences(course, len(center)), _second_differences(course, len(center))
+    inner = slice(None) if course.closed else slice(1, -1)
+    offset_m = np.zeros(len(center))
+    for _ in range(ROUNDS):
+        velocity = (first @ (center + offset_m[:, None] * sideways))[inner]
+        pace = np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
+        # n / pace**2 turns a second difference into curvature; sqrt(pace) makes the sum one over the way.
+        weight = np.column_stack([-velocity[:, 1], velocity[:, 0]]) / pace[:, None] ** 2.5
+        matrix = weight[:, :1] * second * sideways[:, 0] + weight[:, 1:] * second * sideways[:, 1]
+        wanted_m = lsq_linear(matrix, -(weight * (second @ center)).sum(axis=1), (low, high), tol=1e-4).x
+        offset_m = 0.5 * (offset_m + wanted_m)
+    return _line(course, center, offset_m, center + offset_m[:, None] * sideways, lap_position)
+
+
+def _sampled(course: Track) -> tuple[Values, Values, Values, Values]:
+    """Return centre points, the room to their left and right in m, and their places on the lap."""
+    count = int(np.clip(course.length_m / SAMPLE_M, 20, MOST))
+    lap_position = np.linspace(0.0, 1.0, count, endpoint=not course.closed)
+    center = course.points_at(lap_position)
+    pose = course.start_pose(lap_position)
+    sideways = np.column_stack([-np.sin(pose.yaw_rad), np.cos(pose.yaw_rad)])
+    steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
+    rows = np.r_[0.0, np.cumsum(steps_m)] / course.length_m
+    rooms = []
+    for border in (course.inner, course.outer):
+        points = np.column_stack([np.interp(lap_position, rows, border[:, k]) for k in (0, 1)])
+        rooms.append(((points - center) * sideways).sum(axis=1))
+    return center, np.maximum(*rooms), -np.minimum(*rooms), lap_position
+
+
+def _first_differences(course: Track, n: int) -> Values:
+    ahead = np.roll(np.eye(n), 1, axis=1)
+    first = 0.5 * (ahead - ahead.T)
+    if not course.closed:
+        first[0], first[-1] = ahead[0] - np.eye(n)[0], np.eye(n)[-1] - ahead.T[-1]
+    return first
+
+
+def _second_differences(course: Track, n: int) -> Values:
+    ahead = np.roll(np.eye(n), 1, axis=1)
+    second = ahead - 2.0 * np.eye(n) + ahead.T
+    return second if course.closed else second[1:-1]
+
+
+def _tangents(course: Track, points: Values) -> Values:
+    along = _first_differences(course, len(points)) @ points
+    return along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+
+
+def _line(course: Track, center: Values, offset_m: Values, points: Values, lap_position: Values) -> Line:
+    n = len(points)
+    velocity = _first_differences(course, n) @ points
+    bend = np.zeros((n, 2))
+    bend[slice(None) if course.closed else slice(1, -1)] = _second_differences(course, n) @ points
+    pace = np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
+    curvature_pm = (velocity[:, 0] * bend[:, 1] - velocity[:, 1] * bend[:, 0]) / pace**3
+    if course.closed:  # back to where it began, so that places behind the last point find their values
+        lap_position = np.r_[lap_position, 1.0]
+        offset_m, curvature_pm = np.r_[offset_m, offset_m[0]], np.r_[curvature_pm, curvature_pm[0]]
+        points = np.vstack([points, points[:1]])
+    return Line(lap_position=lap_position, offset_m=offset_m, xy=points, curvature_pm=curvature_pm)

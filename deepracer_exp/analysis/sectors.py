@@ -1,0 +1,201 @@
+"""Sectors of a course by its bends, the time each lap spends in them, and two laps side by side."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from deepracer_exp.tracks.track import Track
+
+from .episode_table import first_rows, whole_from_start
+
+Values = NDArray[np.float64]
+BEND_PM = 0.3
+"""Curvature from which on the centre line counts as a bend, 1/m: radii below 3.3 m."""
+SMOOTH_M = 0.6
+"""Length over which curvature is averaged: half the length of a short corner."""
+SHORTEST_M = 0.8
+"""A sector is not shorter; shorter ones go to the neighbour they are more like."""
+_SAMPLE_M = 0.05
+_APART = 4.0
+"""Between the places of two laps in one row of interpolation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sector:
+    """A part of the course between two places."""
+
+    name: str
+    """Kind and number, e.g. `left 2`; counted over all sectors from the start line on."""
+    kind: str
+    """`left`, `right` or `straight`."""
+    begin: float
+    """Lap position, 0 to 1."""
+    end: float
+    first_waypoint: int
+    last_waypoint: int
+    radius_m: float
+    """Of the mean curvature; infinite where it is none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sectors:
+    """All sectors of a course, from waypoint 0 on."""
+
+    parts: tuple[Sector, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sectors."""
+        return tuple(part.name for part in self.parts)
+
+    @property
+    def bounds(self) -> Values:
+        """Lap positions between the sectors, from 0 to 1."""
+        return np.array([0.0, *(part.end for part in self.parts)])
+
+    def of(self, lap_position: Values) -> NDArray[np.intp]:
+        """Return in which sector places lie, -1 where they are not known."""
+        found = np.searchsorted(self.bounds[1:-1], lap_position, side="right")
+        return np.where(np.isfinite(lap_position), found, -1)
+
+
+def sectors_of(course: Track) -> Sectors:
+    """Divide a course into bends and straights by the curvature of its centre line."""
+    count = max(20, round(course.length_m / _SAMPLE_M))
+    edges = np.linspace(0.0, 1.0, count + 1)
+    curvature = _curvature(course, (edges[1:] + edges[:-1]) / 2)
+    kinds = np.where(np.abs(curvature) < BEND_PM, 0, np.sign(curvature)).astype(int)
+    cuts = [0, *(np.flatnonzero(np.diff(kinds)) + 1), count]
+    shortest = SHORTEST_M / course.length_m * count
+    while len(cuts) > 2:
+        lengths = np.diff(cuts)
+        at = int(lengths.argmin())
+        if lengths[at] >= shortest:
+            break
+        means = [float(curvature[a:b].mean()) for a, b in pairwise(cuts)]
+        neighbours = [k for k in (at - 1, at + 1) if 0 <= k < len(means)]
+        like = min(neighbours, key=lambda k: abs(means[k] - means[at]))
+        del cuts[max(at, like)]
+    return Sectors(parts=tuple(_named(course, curvature, edges, _joined(cuts, curvature))))
+
+
+def _joined(cuts: Sequence[int], curvature: Values) -> list[int]:
+    """Drop the cuts between neighbours that became of one kind."""
+    kept = [cuts[0]]
+    for before, cut, after in zip(cuts[:-2], cuts[1:-1], cuts[2:], strict=True):
+        if _kind(float(curvature[before:cut].mean())) != _kind(float(curvature[cut:after].mean())):
+            kept.append(cut)
+    return [*kept, cuts[-1]]
+
+
+def _named(course: Track, curvature: Values, edges: Values, cuts: Sequence[int]) -> list[Sector]:
+    steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
+    waypoint_at = np.r_[0.0, np.cumsum(steps_m)] / course.length_m
+    last = len(waypoint_at) - 1 - course.closed
+    found = []
+    for number, (a, b) in enumerate(pairwise(cuts), start=1):
+        mean = float(curvature[a:b].mean())
+        inside = np.flatnonzero((waypoint_at >= edges[a]) & (waypoint_at < edges[b]))
+        found.append(
+            Sector(
+                name=f"{_kind(mean)} {number}",
+                kind=_kind(mean),
+                begin=float(edges[a]),
+                end=float(edges[b]),
+                first_waypoint=int(inside[0]) if len(inside) else 0,
+                last_waypoint=min(int(inside[-1]), last) if len(inside) else 0,
+                radius_m=1.0 / abs(mean) if mean else float("inf"),
+            )
+        )
+    return found
+
+
+def _kind(curvature_pm: float) -> str:
+    return "straight" if abs(curvature_pm) < BEND_PM else "left" if curvature_pm > 0 else "right"
+
+
+def _curvature(course: Track, place: Values) -> Values:
+    """Return the centre line's turn over `SMOOTH_M` around places, 1/m, positive to the left."""
+    half = SMOOTH_M / 2 / course.length_m
+    low, high = place - half, place + half
+    if not course.closed:
+        low, high = np.maximum(low, 0.0), np.minimum(high, 1.0)
+    before, after = (course.start_pose(at).yaw_rad for at in (low, high))
+    return ((after - before + np.pi) % (2 * np.pi) - np.pi) / ((high - low) * course.length_m)
+
+
+def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
+    """Return the seconds each complete lap spends between places, interpolated along the lap position.
+
+    An interval in which the lap begins is driven in two parts, at its beginning and at its end: the times of a lap
+    always sum up to its lap time.
+
+    Args:
+        steps: of a `LogView`, training or evaluations.
+        bounds: lap positions (n + 1,), growing from 0 to 1.
+
+    Returns:
+        A row a complete lap whose beginning is recorded, a column an interval; the index is the lap's place among
+        the episodes, that of `LogView.episodes`.
+    """
+    first = first_rows(steps)
+    begin = np.flatnonzero(first)
+    end = np.append(begin[1:], len(steps))[: len(begin)] - 1
+    columns = {name: steps[name].to_numpy(np.float64) for name in ("progress", "lap_position", "tstamp")}
+    complete = np.maximum.reduceat(columns["progress"], begin) >= 100.0 if len(begin) else np.zeros(0, bool)
+    laps = np.flatnonzero(complete & whole_from_start(steps, first))
+    begin, end = begin[laps], end[laps]
+    rows = end - begin + 1
+    lap = np.repeat(np.arange(len(laps)), rows)
+    row = np.arange(rows.sum()) + np.repeat(begin - np.cumsum(rows) + rows, rows)
+    # A flying lap begins with the last row of the lap before.
+    begin_s = columns["tstamp"][begin] - steps["delta_time_s"].to_numpy(np.float64)[begin]
+    lap_time_s = columns["tstamp"][end] - begin_s
+    gone = np.clip(columns["progress"][row] / 100.0, 0.0, 1.0)
+    # Every lap begins with a point of its own, so that no place is looked for between two laps.
+    starts = np.cumsum(rows) - rows
+    at = np.insert(np.maximum.accumulate(_APART * lap + gone), starts, _APART * np.arange(len(laps)))
+    time_s = np.insert(columns["tstamp"][row] - np.repeat(begin_s, rows), starts, 0.0)
+    start = (columns["lap_position"][begin] - columns["progress"][begin] / 100.0) % 1.0
+    relative = (bounds[None, :-1] - start[:, None]) % 1.0  # bound 1 is bound 0 again
+    query = _APART * np.arange(len(laps))[:, None] + relative
+    passed_s = np.interp(query.ravel(), at, time_s).reshape(relative.shape) if len(laps) else relative
+    next_s, next_at = np.roll(passed_s, -1, axis=1), np.roll(relative, -1, axis=1)
+    spent_s = next_s - passed_s + np.where(next_at <= relative, lap_time_s[:, None], 0.0)
+    return pd.DataFrame(spent_s, index=laps)
+
+
+def sector_times(steps: pd.DataFrame, sectors: Sectors) -> pd.DataFrame:
+    """Return `interval_times` of the sectors, columns by their names."""
+    return interval_times(steps, sectors.bounds).set_axis(list(sectors.names), axis=1)
+
+
+def theoretical_best_s(times: pd.DataFrame) -> float:
+    """Return the lap time put together of the best time of each sector, NaN without a lap."""
+    return float(times.min().sum()) if len(times) else float("nan")
+
+
+def lap_delta(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> pd.DataFrame:
+    """Return by how much one lap is behind another along the course.
+
+    Args:
+        steps: of a `LogView`.
+        lap: its place among the episodes, as in the index of `interval_times`.
+        other: what it is compared with.
+        places: number of intervals.
+
+    Returns:
+        `lap_position` and `delta_s`: what the lap has lost since lap position 0, negative where it has won time; at 1
+        it is the difference of the lap times.
+
+    Raises:
+        KeyError: one of them is no complete lap.
+    """
+    bounds = np.linspace(0.0, 1.0, places + 1)
+    times = interval_times(steps, bounds)
+    lost_s = times.loc[lap].to_numpy() - times.loc[other].to_numpy()
+    return pd.DataFrame({"lap_position": bounds, "delta_s": np.r_[0.0, np.cumsum(lost_s)]})

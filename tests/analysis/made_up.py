@@ -1,0 +1,247 @@
+"""Recordings of drives that never were: their lap times, mistakes and curves are known by construction."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pandas as pd
+
+from deepracer_exp.analysis.log_course import catalogue_track
+from deepracer_exp.analysis.step_columns import FRONT_TO_REAR_AXLE_M
+from deepracer_exp.formats.model_metadata import Action, LidarConfig, ModelMetadata
+from deepracer_exp.formats.recording import STEP_COLUMNS, TOLD_COLUMNS, UPDATE_COLUMNS, Recording
+from deepracer_exp.tracks.track import Track
+
+COURSE = "reinvent_base"
+STEERING_DEG = (-20.0, 0.0, 20.0)
+HZ = 15.0
+OFF_ROWS = 6
+"""Rows in which a car that runs off leaves the centre line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """One episode: along the centre line at a known speed, to the end of the lap or off the road."""
+
+    speed_mps: float = 1.5
+    iteration: int = 0
+    start: float = 0.0
+    """Share of the course at which it starts."""
+    sections: tuple[tuple[float, float, float], ...] = ()
+    """Where on the course (from, to) another speed is driven, m/s."""
+    until: float = 1.0
+    """Share of the lap after which the recording of the episode stops; 1: the lap is complete."""
+    off_at: int | None = None
+    """Waypoint at which it runs off to the outside, towards less steering than commanded unless `spins`."""
+    spins: bool = False
+    """Whether it runs off because its tail comes round."""
+    offset_m: float = 0.0
+    """Beside the centre line, positive to the left."""
+    wanders: tuple[tuple[float, float], ...] = ()
+    """Where on the course (from, to) its steering is drawn by chance."""
+    worker: int = 0
+
+    def lap_time_s(self, course: Track | None = None) -> float:
+        """Return the time of the complete lap."""
+        place = np.linspace(0.0, 1.0, 20001)
+        speed = self._speed((self.start + (place[1:] + place[:-1]) / 2) % 1.0)
+        length_m = (course or made_up_course()).length_m
+        return float(np.sum(np.diff(place) * length_m / speed))
+
+    def _speed(self, place: np.ndarray) -> np.ndarray:
+        speed = np.full(len(place), self.speed_mps)
+        for begin, end, other in self.sections:
+            speed[(place >= begin) & (place < end)] = other
+        return speed
+
+
+@cache
+def made_up_course(name: str = COURSE) -> Track:
+    return catalogue_track(name)
+
+
+def made_up_recording(
+    drives: Sequence[Drive],
+    *,
+    course: str = COURSE,
+    entropy: Sequence[float] = (),
+    evaluated: Sequence[float] = (),
+    evaluations: Mapping[str, Sequence[Drive]] | None = None,
+    name: str = "made_up",
+    seed: int = 0,
+) -> Recording:
+    """Make the recording of a training.
+
+    Args:
+        drives: its episodes, in their order.
+        course: of the catalogue.
+        entropy: nats, of the policy update of each iteration.
+        evaluated: completion in per cent that the five evaluation episodes after each iteration are told to have.
+        evaluations: drives of other streams.
+        name: of the recording.
+        seed: of what is drawn by chance.
+    """
+    track, dice = made_up_course(course), np.random.default_rng(seed)
+    everything = [("training", drives), *(evaluations or {}).items()]
+    speeds = sorted({speed for _, some in everything for one in some for speed in _speeds(one)})
+    tables = []
+    for stream, some in everything:
+        clock_s = 20.0
+        for episode, drive in enumerate(some):
+            rows = _rows(track, drive, speeds, dice)
+            rows["tstamp"] += clock_s
+            clock_s = rows["tstamp"].iloc[-1] + 0.05
+            tables.append(rows.assign(stream=stream, episode=episode, track=course))
+    steps = pd.concat(tables, ignore_index=True)
+    for column in ("obstacle_crash_counter", "wall_clock", "speed_mps"):
+        steps[column] = np.nan
+    updates = pd.DataFrame(
+        {"iteration": range(len(entropy)), "epoch": 0, "policy_loss": -0.02, "value_loss": np.nan}
+        | {"kl": 0.01, "entropy": list(entropy), "lr": 3e-4}
+    )
+    return Recording(
+        name=name,
+        steps=_typed(steps, STEP_COLUMNS),
+        updates=_typed(updates, UPDATE_COLUMNS),
+        told=_told(drives, evaluated),
+        metadata=_metadata(speeds),
+        hyperparameters={"discount_factor": 0.99},
+        reward_source=None,
+        track=course,
+        problems=(),
+        files=(),
+    )
+
+
+def _metadata(speeds: Sequence[float]) -> ModelMetadata:
+    return ModelMetadata(
+        action_space_type="discrete",
+        actions=tuple(Action(angle, speed) for speed in speeds for angle in STEERING_DEG),
+        low=None,
+        high=None,
+        sensor=("FRONT_FACING_CAMERA",),
+        neural_network="DEEP_CONVOLUTIONAL_NETWORK_SHALLOW",
+        version=5,
+        training_algorithm="clipped_ppo",
+        lidar_config=LidarConfig(),
+        given=("action_space",),
+        renumbered=False,
+    )
+
+
+def _speeds(drive: Drive) -> list[float]:
+    return [drive.speed_mps, *(speed for _, _, speed in drive.sections)]
+
+
+def _rows(track: Track, drive: Drive, speeds: Sequence[float], dice: np.random.Generator) -> pd.DataFrame:
+    fine = np.linspace(0.0, 1.0, 20001)
+    speed = drive._speed((drive.start + (fine[1:] + fine[:-1]) / 2) % 1.0)
+    passed_s = np.r_[0.0, np.cumsum(np.diff(fine) * track.length_m / speed)]
+    until = drive.until
+    if drive.off_at is not None:
+        steps_m = np.linalg.norm(np.diff(track.waypoints, axis=0), axis=1)
+        until = (np.r_[0.0, np.cumsum(steps_m)][drive.off_at] / track.length_m - drive.start) % 1.0
+    end_s = float(np.interp(until, fine, passed_s))
+    time_s = np.r_[np.arange(0.0, end_s - 0.5 / HZ, 1.0 / HZ), end_s]
+    gone = np.interp(time_s, passed_s, fine)
+    gone[-1] = until
+    place = (drive.start + gone) % 1.0
+    turns = _turns(track, place)
+    steering = np.where(np.abs(turns) < 0.15, 0.0, 20.0 * np.sign(turns))
+    for begin, end in drive.wanders:
+        here = (place >= begin) & (place < end)
+        steering[here] = dice.choice(STEERING_DEG, here.sum())
+    offset_m, yaw_rad = np.full(len(gone), drive.offset_m), _heading(track, place)
+    complete, off = until >= 1.0 and drive.off_at is None, drive.off_at is not None
+    if off:
+        leaving = np.clip((np.arange(len(gone)) - len(gone) + 1) / OFF_ROWS + 1.0, 0.0, 1.0)
+        side = 1.0 if turns[-1] >= 0 else -1.0
+        offset_m -= side * (track.width_max_m / 2 + 0.15) * leaving**2
+        steering = np.where(leaving > 0, 0.0 if drive.spins else 20.0 * side, steering)
+    xy = track.points_at(place) + offset_m[:, None] * np.column_stack([-np.sin(yaw_rad), np.cos(yaw_rad)])
+    yaw_rad = _towed(xy, yaw_rad[0])
+    if off and drive.spins:
+        yaw_rad = yaw_rad + side * 1.5 * leaving**2
+    found = track.project(xy)
+    near = [np.linalg.norm(xy - track.waypoints[k], axis=1) for k in (found.previous, found.next)]
+    throttle = drive._speed(place)
+    status = np.array(["in_progress"] * len(gone), dtype=object)
+    status[0] = "prepare"
+    if complete or off:
+        status[-1] = "lap_complete" if complete else "off_track"
+    return pd.DataFrame(
+        {
+            "worker": drive.worker,
+            "iteration": drive.iteration,
+            "steps": np.arange(1, len(gone) + 1),
+            "X": xy[:, 0],
+            "Y": xy[:, 1],
+            "yaw": np.degrees((yaw_rad + np.pi) % (2 * np.pi) - np.pi),
+            "steer": steering,
+            "throttle": throttle,
+            "action": len(STEERING_DEG) * np.searchsorted(speeds, throttle)
+            + np.searchsorted(STEERING_DEG, steering),
+            "reward": np.diff(100.0 * gone, prepend=0.0),
+            "done": (np.arange(len(gone)) == len(gone) - 1) & (complete or off),
+            "all_wheels_on_track": np.abs(offset_m) < track.width_min_m / 2 - 0.1,
+            "progress": 100.0 * gone,
+            "closest_waypoint": np.where(near[0] <= near[1], found.previous, found.next),
+            "track_len": track.length_m,
+            "tstamp": time_s,
+            "episode_status": status,
+            "pause_duration": 0.0,
+        }
+    )
+
+
+def _towed(xy: np.ndarray, yaw_rad: float) -> np.ndarray:
+    """Return the yaw of a car whose front moves through places while its rear wheels roll without slip."""
+    yaws, rear = [yaw_rad], xy[0] - FRONT_TO_REAR_AXLE_M * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
+    for front in xy[1:]:
+        ahead = (front - rear) / np.linalg.norm(front - rear)
+        rear = front - FRONT_TO_REAR_AXLE_M * ahead
+        yaws.append(float(np.arctan2(ahead[1], ahead[0])))
+    return np.unwrap(yaws)
+
+
+def _heading(track: Track, place: np.ndarray) -> np.ndarray:
+    """Return the direction of the road at places, without the jumps of its centre line's corners."""
+    around = [_beside(track, place, d) for d in np.linspace(-0.012, 0.012, 9)]
+    heading = np.unwrap(np.stack([track.start_pose(at).yaw_rad for at in around]), axis=0).mean(axis=0)
+    return np.unwrap(heading)
+
+
+def _beside(track: Track, place: np.ndarray, distance: float) -> np.ndarray:
+    return place + distance if track.closed else np.clip(place + distance, 0, 1)
+
+
+def _turns(track: Track, place: np.ndarray) -> np.ndarray:
+    """Return the centre line's curvature around places, 1/m, positive to the left."""
+    yaw = [track.start_pose(_beside(track, place, d)).yaw_rad for d in (-0.01, 0.01)]
+    return ((yaw[1] - yaw[0] + np.pi) % (2 * np.pi) - np.pi) / (0.02 * track.length_m)
+
+
+def _told(drives: Sequence[Drive], evaluated: Sequence[float]) -> pd.DataFrame:
+    last = {drive.iteration: episode for episode, drive in enumerate(drives)}
+    rows = [
+        (
+            "training",
+            0,
+            last[iteration],
+            trial + 1,
+            "evaluation",
+            completion,
+            completion,
+            10.0,
+            "Off track",
+            np.nan,
+        )
+        for iteration, completion in enumerate(evaluated)
+        for trial in range(5)
+    ]
+    return _typed(pd.DataFrame(rows, columns=list(TOLD_COLUMNS)), TOLD_COLUMNS)
+
+
+def _typed(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
+    return table[list(columns)].astype({name: kind for name, (kind, _) in columns.items()})

@@ -1,0 +1,109 @@
+"""The analysis of a training of the AWS console: the figures that deepracer-utils and the service tell."""
+
+import contextlib
+import io
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from deepracer.logs import AnalysisUtils, DeepRacerLog
+
+from deepracer_exp.analysis.findings import findings
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.formats.recording_reader import read_recording
+
+CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
+pytestmark = pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")
+
+SAME = {
+    "iteration": "iteration",
+    "unique_episode": "episode",
+    "steps": "steps",
+    "start_at": "start_at",
+    "progress": "progress",
+    "time": "time_s",
+    "dist": "dist_m",
+    "speed": "speed_mps",
+    "reward": "reward",
+    "time_if_complete": "time_if_complete_s",
+    "reward_if_complete": "reward_if_complete",
+    "complete": "complete",
+}
+"""Columns of deepracer-utils' `simulation_agg` and of `EPISODE_COLUMNS`."""
+
+
+@pytest.fixture(scope="module")
+def view() -> LogView:
+    return prepare(read_recording(CONSOLE))
+
+
+@pytest.fixture(scope="module")
+def theirs() -> pd.DataFrame:
+    log = DeepRacerLog(model_folder=str(CONSOLE))
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints what it does
+        log.load_training_trace()
+        return AnalysisUtils.simulation_agg(log.dataframe(), secondgroup="unique_episode")
+
+
+@pytest.mark.parametrize("column", SAME)
+def test_episodes_equal_those_of_deepracer_utils(view: LogView, theirs: pd.DataFrame, column: str) -> None:
+    ours = view.episodes[SAME[column]].to_numpy(np.float64)
+    np.testing.assert_allclose(ours, theirs[column].to_numpy(np.float64), rtol=1e-12)
+
+
+def test_quintiles_equal_those_of_deepracer_utils(view: LogView, theirs: pd.DataFrame) -> None:
+    assert view.episodes["quintile"].tolist() == [int(word[0]) for word in theirs["quintile"]]
+
+
+def test_iterations_equal_the_means_of_deepracer_utils_episodes(view: LogView, theirs: pd.DataFrame) -> None:
+    groups = theirs.groupby("iteration")
+    laps = theirs[theirs["complete"].astype(bool)].groupby("iteration")["time"]
+    expected = pd.DataFrame(
+        {
+            "completion_mean": groups["progress"].mean(),
+            "lap_share": groups["complete"].mean(),
+            "reward_mean": groups["reward"].mean(),
+            "lap_time_mean_s": laps.mean(),
+            "lap_time_best_s": laps.min(),
+            "lap_time_p25_s": laps.quantile(0.25),
+        }
+    )
+    ours = view.iterations.set_index("iteration")[list(expected)]
+    np.testing.assert_allclose(ours.to_numpy(np.float64), expected.to_numpy(np.float64), rtol=1e-12)
+
+
+def test_forty_seven_laps_were_completed_and_the_best_took_14_13_seconds(view: LogView) -> None:
+    assert len(view.steps) == 44_247
+    assert view.episodes["complete"].sum() == view.episodes["lap_time_s"].notna().sum() == 47
+    assert round(view.episodes["lap_time_s"].min(), 2) == 14.13
+
+
+def test_the_course_is_found_and_the_cars_rear_wheels_hardly_slide_on_it(view: LogView) -> None:
+    assert view.course is not None
+    assert (view.course.name, view.course.reversed) == ("reinvent_base", False)
+    # Where the rear axle really is, it moves where it looks.
+    assert view.steps["slide_deg"].abs().median() < 0.2
+
+
+def test_evaluations_between_the_iterations_are_those_that_the_metrics_tell(view: LogView) -> None:
+    told = view.iterations["eval_completion"]
+    assert told.notna().all()
+    assert told.iloc[0] == pytest.approx(3.4)
+    assert told.iloc[-6:].tolist() == [100.0] * 6
+
+
+def test_laps_of_a_race_that_follow_one_another_have_lap_times(view: LogView) -> None:
+    races = view.evaluation_episodes[view.evaluation_episodes["stream"].str.startswith("leaderboard")]
+    assert len(races) == 6
+    assert races["lap_time_s"].between(15.0, 17.5).all()
+
+
+def test_findings_name_the_iteration_and_the_places_that_the_tables_show(view: LogView) -> None:
+    found = {one.rule: one for one in findings(view)}
+    assert set(found) == {"converged", "submit", "chance", "time_lost", "runs_off", "steering", "overfits"}
+    assert found["converged"].sentence.startswith("Not converged yet")
+    assert found["submit"].values["iteration"] == 25
+    assert found["chance"].values["laps"] == 47
+    assert found["time_lost"].values["theoretical_best_s"] < found["time_lost"].values["best_lap_s"]
+    assert found["overfits"].sentence.startswith("No sign of overfitting")

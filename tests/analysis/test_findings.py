@@ -1,0 +1,245 @@
+"""Rules of the findings on made-up logs whose answers are known."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepracer_exp.analysis.candidates import candidates, lap_chance, wilson
+from deepracer_exp.analysis.findings import Finding, findings
+from deepracer_exp.analysis.learning import PATIENCE, convergence
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.sectors import sectors_of
+
+from .made_up import Drive, made_up_course, made_up_recording
+
+COURSE = made_up_course()
+SECTORS = sectors_of(COURSE)
+
+
+def of(view: LogView, rule: str, target_s: float | None = None) -> Finding:
+    (found,) = (one for one in findings(view, target_s) if one.rule == rule)
+    return found
+
+
+def training(completions: list[float], **told: list[float]) -> LogView:
+    """Prepare a training with one short episode an iteration; 1.0 completes the lap."""
+    drives = [
+        Drive(speed_mps=3.0, iteration=k, until=c)
+        if c >= 1
+        else Drive(speed_mps=3.0, iteration=k, off_at=int(118 * c))
+        for k, c in enumerate(completions)
+    ]
+    return prepare(made_up_recording(drives, **told))
+
+
+RISING = [0.1 + 0.06 * k for k in range(15)]
+LEARNED = [*RISING, *[1.0] * (PATIENCE + 4)]
+
+
+def test_a_training_that_stands_at_full_laps_has_converged_when_it_reached_them() -> None:
+    found = of(training(LEARNED), "converged")
+    # The moving average of three reaches the last laps two iterations after the first of them.
+    assert found.values["iteration"] in range(15, 18)
+    assert found.sentence.startswith(f"Converged at iteration {found.values['iteration']}: ")
+    assert found.figure == "training_progress"
+
+
+def test_a_training_that_still_grows_has_not_converged() -> None:
+    found = of(training([*RISING, 1.0]), "converged")
+    assert found.sentence.startswith("Not converged yet: completion grew")
+    assert "iteration" not in found.values
+
+
+def test_entropy_that_still_falls_keeps_a_training_from_being_converged() -> None:
+    falling = list(np.linspace(1.7, 0.2, len(LEARNED)))
+    flat = [1.0] * len(LEARNED)
+    assert "the entropy still moves" in of(training(LEARNED, entropy=falling), "converged").sentence
+    assert of(training(LEARNED, entropy=flat), "converged").sentence.startswith("Converged")
+
+
+def test_a_training_that_fell_back_has_not_converged() -> None:
+    found = of(training([*LEARNED, 0.4, 0.4, 0.4]), "converged")
+    assert found.sentence.startswith("Not converged: completion fell back from 100 to 4")
+
+
+def test_a_flat_training_that_never_drove_far_is_told_to_change_something() -> None:
+    sentence = of(training([0.2] * 30), "converged").sentence
+    assert sentence.startswith("Converged at iteration 0")
+    assert "do not train longer" in sentence
+
+
+def test_a_short_training_is_not_judged() -> None:
+    view = training([0.2] * PATIENCE)
+    assert convergence(view.iterations, 9) is None
+    assert of(view, "converged").sentence.startswith("Too short")
+
+
+def test_episodes_under_way_when_the_run_ended_do_not_count() -> None:
+    drives = [Drive(speed_mps=3.0, iteration=k) for k in range(15)] + [
+        Drive(speed_mps=3.0, iteration=14, until=0.05)
+    ]
+    view = prepare(made_up_recording(drives))
+    assert view.iterations["completion_mean"].tolist() == [100.0] * 15
+    assert not view.episodes["ended"].iloc[-1]
+
+
+def laps_of(*iterations: tuple[int, int, float]) -> LogView:
+    """Prepare a training of iterations with complete laps, episodes that run off, and the laps' speed."""
+    drives = [
+        drive
+        for k, (laps, offs, speed) in enumerate(iterations)
+        for drive in [Drive(speed_mps=speed, iteration=k)] * laps
+        + [Drive(speed_mps=2.0, iteration=k, off_at=9)] * offs
+    ]
+    return prepare(made_up_recording(drives))
+
+
+def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
+    # Fast but rare, dense but slow, and both; the fourth has too few laps to have a percentile.
+    view = laps_of((3, 7, 3.0), (10, 0, 2.0), (8, 2, 2.5), (2, 0, 3.0))
+    assert candidates(view.iterations)["iteration"].tolist() == [2, 1]
+    found = of(view, "submit")
+    assert found.sentence.startswith("Submit the checkpoint that drove iteration 2:")
+    assert "80% of its episodes" in found.sentence
+    assert found.values["p25_s"] == pytest.approx(COURSE.length_m / 2.5)
+
+
+def test_without_enough_laps_nothing_is_to_be_submitted() -> None:
+    found = of(laps_of((0, 5, 2.0), (2, 5, 2.0)), "submit")
+    assert found.sentence.startswith(
+        "Nothing to submit yet: no iteration has 3 complete laps (2 laps in all)"
+    )
+
+
+def test_the_chance_of_a_lap_is_measured_and_fitted() -> None:
+    found = lap_chance(np.array([10.0, 11.0, 12.0, 13.0, math.nan]), 11.5)
+    assert found is not None
+    assert (found.laps, found.faster, found.share) == (4, 2, 0.5)
+    assert found.normal == pytest.approx(0.5)
+    assert (found.low, found.high) == pytest.approx((0.1500, 0.8500), abs=1e-3)
+
+
+def test_wilson_intervals_are_those_of_the_tables() -> None:
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert wilson(10, 10) == pytest.approx((0.7225, 1.0), abs=1e-4)
+
+
+def test_without_a_lap_there_is_no_chance() -> None:
+    view = laps_of((0, 5, 2.0))
+    assert [one.rule for one in findings(view)] == ["converged", "submit", "runs_off", "steering"]
+    assert lap_chance(np.array([math.nan]), 9.0) is None
+
+
+def test_the_target_is_compared_with_the_laps_of_the_last_third() -> None:
+    view = laps_of((6, 0, 1.0), (6, 0, 1.0), (4, 0, 2.0), (2, 0, 3.0))
+    found = of(view, "chance", target_s=COURSE.length_m / 2.5)
+    assert (found.values["laps"], found.values["faster"]) == (6, 2)
+    assert "2 of 6 complete laps since iteration 2 took at most 7.08 s" in found.sentence
+
+
+def test_time_is_lost_in_the_sectors_that_were_driven_slowly() -> None:
+    slow = [SECTORS.parts[k] for k in (1, 5, 9)]
+    sections = tuple((part.begin, part.end, speed) for part, speed in zip(slow, (0.8, 1.0, 1.2), strict=True))
+    drives = [Drive(speed_mps=2.0)] + [Drive(speed_mps=2.0, sections=sections)] * 6
+    found = of(prepare(made_up_recording(drives)), "time_lost")
+    lost = {
+        f"lost_s, {part.name}": (part.end - part.begin) * COURSE.length_m * (1 / speed - 1 / 2.0)
+        for part, speed in zip(slow, (0.8, 1.0, 1.2), strict=True)
+    }
+    names = [name for name in found.values if name.startswith("lost_s")]
+    assert names == sorted(lost, key=lambda name: -lost[name])
+    for name, seconds in lost.items():
+        assert found.values[name] == pytest.approx(seconds, abs=0.05)
+    assert found.values["theoretical_best_s"] == pytest.approx(COURSE.length_m / 2.0, abs=0.05)
+    assert f"waypoints {slow[0].first_waypoint} to {slow[0].last_waypoint}" in found.sentence
+
+
+def off_at(*places: tuple[int, int, bool]) -> LogView:
+    """Prepare drives that run off at waypoints, so and so often, spinning or not, among complete laps."""
+    drives = [Drive()] * 6
+    for waypoint, times, spins in places:
+        drives += [Drive(off_at=waypoint + k % 3 - 1, spins=spins) for k in range(times)]
+    return prepare(made_up_recording(drives))
+
+
+def test_the_car_runs_off_where_it_was_made_to() -> None:
+    found = of(off_at((35, 6, False), (85, 4, False)), "runs_off")
+    assert [name for name in found.values if name.startswith("times")] == [
+        "times, waypoint 35",
+        "times, waypoint 85",
+    ]
+    assert found.values["times, waypoint 35"] == 6
+    # All sixteen come to waypoint 35, and six do not come to 85.
+    assert found.values["risk, waypoint 35"] == pytest.approx(6 / 16)
+    assert found.values["risk, waypoint 85"] == pytest.approx(4 / 10)
+    assert "waypoint 35 (left 2) to the right" in found.sentence
+
+
+def test_a_car_that_goes_straight_on_with_the_wheel_turned_understeers_and_a_spinning_one_oversteers() -> (
+    None
+):
+    found = of(off_at((35, 6, False), (85, 4, True)), "steering")
+    assert found.sentence.startswith("Before it runs off, at waypoint 35 it understeers")
+    assert "at waypoint 85 it oversteers" in found.sentence
+    assert (found.values["understeer, waypoint 35"], found.values["oversteer, waypoint 85"]) == (6, 4)
+    assert found.figure == "slide_map"
+
+
+def test_a_car_that_does_not_steer_back_is_told_so() -> None:
+    view = off_at((35, 6, False))
+    last = view.steps.groupby("episode").cumcount(ascending=False) < 12
+    ends = view.episodes["status"].to_numpy()[view.steps["episode"]] == "off_track"
+    steps = view.recording.steps.copy()
+    steps.loc[last & ends, "steer"] = 0.0
+    assert "it does not steer back" in of(prepare(replace(view.recording, steps=steps)), "steering").sentence
+
+
+def test_logs_without_episode_status_tell_where_the_car_runs_off() -> None:
+    recording = off_at((35, 6, False)).recording
+    steps = recording.steps.assign(
+        episode_status=recording.steps["episode_status"].astype(str).where(lambda s: s == "", "")
+    )
+    view = prepare(replace(recording, steps=steps))
+    assert view.episodes["status"].tolist() == ["lap_complete"] * 6 + ["off_track"] * 6
+    assert of(view, "runs_off").values["times, waypoint 35"] == 6
+
+
+def test_a_car_that_stays_on_the_road_does_not_run_off() -> None:
+    found = of(off_at(), "runs_off")
+    assert found.sentence == "The car does not run off the road since iteration 0."
+
+
+def test_evaluations_that_fall_while_the_training_holds_are_overfitting() -> None:
+    falling = [10.0 * k for k in range(10)] + [90.0] * 9 + [40.0] * 10
+    found = of(training(LEARNED, evaluated=falling), "overfits")
+    assert found.sentence.startswith("It overfits: completion in the evaluation fell from 90 %")
+    assert found.values["best_iteration"] in range(10, 19)
+
+
+def test_evaluations_that_fall_with_the_training_or_hold_are_no_overfitting() -> None:
+    falling = [10.0 * k for k in range(10)] + [90.0] * 9 + [40.0] * 10
+    both = training([*RISING, *[1.0] * 4, *[0.3] * 10], evaluated=falling)
+    holding = training(LEARNED, evaluated=[min(90.0, 10.0 * k) for k in range(29)])
+    for view in (both, holding):
+        assert of(view, "overfits").sentence.startswith("No sign of overfitting")
+
+
+def test_a_race_without_training_is_judged_by_its_laps() -> None:
+    recording = made_up_recording(
+        [Drive()], evaluations={"race": [Drive(speed_mps=v) for v in (1.5, 2.0, 1.8)]}
+    )
+    race = recording.steps[recording.steps["stream"] == "race"].reset_index(drop=True)
+    view = prepare(replace(recording, steps=race))
+    assert [one.rule for one in findings(view)] == ["chance", "time_lost", "runs_off"]
+    assert "3 complete laps of the evaluations" in of(view, "chance").sentence
+
+
+def test_without_a_course_only_what_needs_its_shape_is_left_out() -> None:
+    recording = laps_of((3, 4, 2.0)).recording
+    steps = recording.steps.assign(X=recording.steps["X"] + 50.0, track="nowhere")
+    view = prepare(replace(recording, steps=steps))
+    assert view.course is None
+    assert "nowhere" in str(view.problems[0])
+    assert [one.rule for one in findings(view)] == ["converged", "submit", "chance", "runs_off", "steering"]

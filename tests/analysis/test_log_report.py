@@ -1,0 +1,269 @@
+import dataclasses
+import re
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from deepracer_exp.analysis.charts import SECTIONS
+from deepracer_exp.analysis.findings import findings
+from deepracer_exp.analysis.log_report import LogPage, write_report
+from deepracer_exp.analysis.log_report import html as page_html
+from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, headline, iteration_rows
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.reward_comparison import compare_rewards
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.recording import LogProblem, Recording
+from tests.browser import browser, needs_chromium
+from tests.html import Html
+
+from .made_up import Drive, made_up_recording
+
+NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&'\"{{7*7}}"
+
+
+def season(iterations: int = 12, **changes: object) -> Recording:
+    """A training that learns: it runs off in its first iterations, and gets faster."""
+    drives = []
+    for at in range(iterations):
+        drives += [
+            Drive(iteration=at, speed_mps=1.2 + 0.05 * at + 0.02 * k, offset_m=0.05 * k) for k in range(3)
+        ]
+        drives += [Drive(iteration=at, speed_mps=2.0, off_at=40 + at % 3, wanders=((0.1, 0.3),))]
+    entropy = np.linspace(2.4, 0.6, iterations).tolist()
+    evaluations = {"race": [Drive(speed_mps=2.0, offset_m=0.1 * k) for k in range(3)]}
+    recording = made_up_recording(drives, entropy=entropy, evaluations=evaluations)
+    return dataclasses.replace(recording, **changes)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return season()
+
+
+@pytest.fixture(scope="module")
+def view(recording) -> LogView:
+    return prepare(recording)
+
+
+@pytest.fixture(scope="module")
+def path(recording, tmp_path_factory) -> Path:
+    return write_report(recording, tmp_path_factory.mktemp("page") / "report.html")
+
+
+@pytest.fixture(scope="module")
+def html(path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def test_the_page_begins_with_the_findings_and_each_leads_to_a_figure_that_is_there(html, view):
+    read = Html(html)
+    found = findings(view)
+    order = [read.text.index(" ".join(one.sentence.split())) for one in found]
+    assert order == sorted(order)
+    assert read.ids[0] == "findings"
+    assert read.text.index(found[-1].sentence) < read.text.index("All figures")
+    assert set(read.links) <= set(read.ids)
+    assert {f"figure-{one.figure}" for one in found} <= set(read.ids)
+
+
+def test_the_page_is_small_and_loads_nothing(path, html):
+    read = Html(html)
+    assert path.stat().st_size < 5_000_000
+    assert read.loads == []
+    assert "Content-Security-Policy" in html
+    assert "default-src 'none'" in unescape(html)
+    own = re.sub(r'(?s)<script type="text/plain".*?</script>', "", html)
+    assert not re.search(r"https?://|url\(|@import", own)
+    assert [file.name for file in path.parent.iterdir()] == ["report.html"]
+
+
+def test_words_and_tables_are_there_without_scripts(html, view):
+    text = Html(html).text
+    assert headline(view) in text
+    for title in (
+        "The best laps",
+        "Candidates for submission",
+        "Iterations",
+        "What was trained",
+        "What was read",
+    ):
+        assert title in text
+    for head in ("Lap time, s", "25th percentile, s", "Entropy, nats"):
+        assert head in text
+    assert text.count("Figures need JavaScript") == html.count("data-plot=")
+
+
+def test_a_recording_gives_the_same_page_again(recording, html, tmp_path):
+    assert write_report(recording, tmp_path / "again.html").read_text(encoding="utf-8") == html
+
+
+def nasty(recording: Recording, word: str) -> Recording:
+    steps = recording.steps.copy()
+    steps["stream"] = steps["stream"].cat.rename_categories({"race": f"race {word}"})
+    steps["episode_status"] = steps["episode_status"].cat.rename_categories(
+        {"off_track": f"off_track {word}"}
+    )
+    steps["track"] = steps["track"].cat.rename_categories({"reinvent_base": f"course {word}"})
+    return dataclasses.replace(
+        recording,
+        name=f"name {word}",
+        steps=steps,
+        track=f"course {word}",
+        hyperparameters={f"key {word}": word, "discount_factor": 0.99},
+        reward_source=f"# {word}",
+        problems=(LogProblem(f"file {word}", 3, f"reason {word}"),),
+        files=(Path(f"file {word}".replace("/", "|")),),
+    )
+
+
+def test_nothing_that_a_log_holds_becomes_part_of_the_page(recording):
+    pages = []
+    for word in ("word", NASTY):
+        view = prepare(nasty(recording, word))
+        pages.append(Html(page_html(LogPage(view, findings(view)))))
+    clean, dirty = pages
+    assert dirty.tags == clean.tags
+    assert dirty.ids == clean.ids
+    assert dirty.loads == []
+    for what in ("name", "key", "#", "reason", "file"):
+        assert f"{what} {NASTY}" in dirty.text
+
+
+@needs_chromium
+def test_a_browser_draws_every_figure_without_a_complaint_and_asks_for_nothing(path, recording, tmp_path):
+    dirty = write_report(nasty(recording, NASTY), tmp_path / "dirty.html")
+    with browser(tmp_path / "profile") as tab:
+        for file in (path, dirty):
+            tab.open(file)
+            tab.draw_all()
+            assert tab.tell("document.querySelectorAll('[data-state=failed]').length") == 0
+            assert tab.tell("document.querySelectorAll('[data-state=drawn]').length") > 10
+            assert tab.tell("document.documentElement.scrollWidth <= innerWidth")
+        assert tab.complaints == []
+        assert tab.asked_for <= {"file", "data", "blob"}
+        assert not [event for event in tab.events if event["method"] == "Page.javascriptDialogOpening"]
+        assert not tab.tell(
+            "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
+        )
+
+
+@needs_chromium
+def test_the_policy_of_the_page_refuses_scripts_and_addresses(path, tmp_path):
+    with browser(tmp_path / "profile") as tab:
+        tab.open(path)
+        added = "const s = document.createElement('script'); s.textContent = 'window.got = 1'; document.body.append(s)"
+        tab.tell(added)
+        assert tab.tell("window.got === undefined")
+        assert tab.tell("fetch('data:,x').then(() => 'sent', () => 'refused')") == "refused"
+
+
+@needs_chromium
+def test_figures_are_drawn_when_they_come_into_sight(path, tmp_path):
+    with browser(tmp_path / "profile") as tab:
+        tab.open(path, height=500)
+        assert tab.tell("document.querySelector('[data-plot=waypoint_map]').dataset.state === undefined")
+        tab.tell("document.querySelector('[data-plot=waypoint_map]').scrollIntoView()")
+        tab.wait_for("document.querySelector('[data-plot=waypoint_map]').dataset.state === 'drawn'")
+
+
+@pytest.mark.parametrize(
+    "drives",
+    [
+        [Drive(until=0.2)],
+        [Drive(until=0.004)],
+        [Drive()],
+        [Drive(off_at=30), Drive(off_at=31)],
+    ],
+    ids=["a piece of a lap", "two rows", "one lap", "never a lap"],
+)
+def test_a_log_with_little_in_it_has_a_page(drives, tmp_path):
+    recording = made_up_recording(drives)
+    assert "What was found" in Html(write_report(recording, tmp_path / "page.html").read_text()).text
+
+
+def test_evaluations_alone_have_a_page(tmp_path):
+    recording = made_up_recording([], evaluations={"race": [Drive(speed_mps=1.5), Drive(speed_mps=1.6)]})
+    text = Html(write_report(recording, tmp_path / "page.html").read_text()).text
+    assert "No training steps" in text
+
+
+def test_a_course_that_nobody_knows_has_a_page_without_maps(tmp_path):
+    steps = season(3).steps
+    steps = steps.assign(X=steps["X"] * 7 + 100, track_len=steps["track_len"] * 3)
+    steps["track"] = steps["track"].cat.rename_categories({"reinvent_base": "my own"})
+    text = Html(write_report(season(3, steps=steps, track="my own"), tmp_path / "page.html").read_text()).text
+    assert "What could not be read" in text
+    assert "my own" in text
+
+
+def test_a_recording_without_a_step_has_no_page_and_the_old_one_stays(tmp_path):
+    old = tmp_path / "page.html"
+    old.write_text("old")
+    with pytest.raises(BadInput, match="no control steps"):
+        write_report(season(1, steps=season(1).steps.iloc[:0]), old)
+    assert old.read_text() == "old"
+
+
+def test_of_very_many_iterations_the_table_has_every_second_or_third_and_the_last():
+    drives = [Drive(iteration=at, until=0.01) for at in range(2 * MOST_ITERATIONS + 5)]
+    view = prepare(made_up_recording(drives))
+    table = iteration_rows(view)
+    assert len(table.rows) <= MOST_ITERATIONS
+    assert table.left_out == len(drives) - len(table.rows)
+    assert table.rows[-1][0] == str(len(drives) - 1)
+
+
+class Replayed:
+    """Laps and places whose ranks are known: the new reward turns the order of the laps round."""
+
+    reward = "mine"
+    laps = pd.DataFrame(
+        {
+            "stream": "training",
+            "track": "reinvent_base",
+            "iteration": [0, 1, 2],
+            "episode": [0, 4, 8],
+            "time_s": [10.0, 11.0, 12.0],
+            "reward": [1.0, 2.0, 3.0],
+            "new_reward": [30.0, 20.0, 10.0],
+            "rank": [3, 2, 1],
+            "new_rank": [1, 2, 3],
+            "time_rank": [1, 2, 3],
+        }
+    )
+    correlations = pd.DataFrame(
+        {"track": ["reinvent_base"], "laps": [3], "old_new": [-1.0], "old_time": [1.0], "new_time": [-1.0]}
+    )
+    waypoints = pd.DataFrame(
+        {
+            "track": "reinvent_base",
+            "reversed": False,
+            "closest_waypoint": [0, 10, 20],
+            "visits": [9, 9, 9],
+            "reward": [0.0, 1.0, 2.0],
+            "new_reward": [2.0, 1.0, 0.0],
+            "share": [0.0, 0.5, 1.0],
+            "new_share": [1.0, 0.5, 0.0],
+        }
+    )
+
+
+def test_another_reward_is_told_with_the_ranks_of_laps_and_places(view):
+    told = compare_rewards(view, Replayed())
+    assert told.sentences[0] == (
+        "Of 3 complete laps mine would have paid best the one of episode 0 (10.00 s, 1st by time, 3rd by the recorded "
+        "reward); the fastest lap (10.00 s) is 1st instead of 3rd."
+    )
+    assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in told.sentences[1]
+    assert "waypoint 0 gains most and waypoint 20 loses most" in told.sentences[2]
+    assert [chart.name for chart in told.charts] == ["replayed_laps", "replayed_places"]
+    text = Html(page_html(LogPage(view, findings(view), replay=told))).text
+    assert text.index(told.sentences[0]) < text.index("The best laps")
+
+
+def test_every_finding_names_a_chart_of_the_page(view):
+    names = {chart.__name__ for some in SECTIONS.values() for chart in some}
+    assert {one.figure for one in findings(view)} <= names

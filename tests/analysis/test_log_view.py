@@ -1,0 +1,146 @@
+"""A recording prepared for figures: known drives come out as they were made up."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from deepracer_exp.analysis.episode_table import EPISODE_COLUMNS
+from deepracer_exp.analysis.iteration_table import ITERATION_COLUMNS
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.step_columns import DERIVED_COLUMNS
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.recording import STEP_COLUMNS
+
+from .made_up import Drive, made_up_course, made_up_recording
+
+LENGTH_M = made_up_course().length_m
+
+
+@pytest.fixture(scope="module")
+def view() -> LogView:
+    drives = [
+        Drive(speed_mps=1.0, iteration=0),
+        Drive(speed_mps=2.0, iteration=0, start=0.25),
+        Drive(speed_mps=1.5, iteration=1, off_at=40),
+        Drive(speed_mps=1.5, iteration=1, until=0.5),
+    ]
+    return prepare(
+        made_up_recording(
+            drives,
+            entropy=[1.5, 1.2],
+            evaluated=[30.0, 60.0],
+            evaluations={"race": [Drive(speed_mps=2.0)]},
+        )
+    )
+
+
+def test_lap_times_are_length_over_speed(view: LogView) -> None:
+    expected = [LENGTH_M / 1.0, LENGTH_M / 2.0, math.nan, math.nan]
+    np.testing.assert_allclose(view.episodes["lap_time_s"], expected, rtol=1e-9)
+    assert view.episodes["complete"].tolist() == [True, True, False, False]
+
+
+def test_statuses_progress_and_waypoints_are_those_of_the_last_rows(view: LogView) -> None:
+    assert view.episodes["status"].tolist() == ["lap_complete", "lap_complete", "off_track", "in_progress"]
+    assert view.episodes["progress"].iloc[3] == pytest.approx(50.0)
+    assert view.episodes["last_waypoint"].iloc[2] == 40
+
+
+def test_iterations_sum_up_their_episodes_and_take_what_the_update_told(view: LogView) -> None:
+    first, second = view.iterations.to_dict("records")
+    assert (first["episodes"], first["complete"], first["lap_share"]) == (2, 2, 1.0)
+    assert first["lap_time_best_s"] == pytest.approx(LENGTH_M / 2)
+    assert first["lap_time_p25_s"] == pytest.approx(0.25 * LENGTH_M + 0.75 * LENGTH_M / 2)
+    assert math.isnan(second["lap_time_best_s"])
+    assert (first["entropy"], second["entropy"]) == (1.5, 1.2)
+    assert (first["eval_completion"], second["eval_completion"]) == (30.0, 60.0)
+    assert math.isnan(second["held_out_completion"])
+    assert first["steps"] + second["steps"] == len(view.steps)
+
+
+def test_evaluations_stand_beside_the_training(view: LogView) -> None:
+    assert view.evaluation_episodes["stream"].tolist() == ["race"]
+    assert view.evaluation_episodes["lap_time_s"].tolist() == pytest.approx([LENGTH_M / 2])
+    assert set(view.steps["stream"]) == {"training"}
+
+
+def test_every_documented_column_is_there_and_no_other(view: LogView) -> None:
+    assert list(view.steps) == [*STEP_COLUMNS, *DERIVED_COLUMNS]
+    assert list(view.episodes) == list(EPISODE_COLUMNS)
+    assert list(view.iterations) == list(ITERATION_COLUMNS)
+
+
+def test_on_the_centre_line_at_constant_speed_nothing_accelerates_or_slides_away(view: LogView) -> None:
+    rows = view.steps[view.steps["episode"] == 0].iloc[3:-3]
+    np.testing.assert_allclose(rows["track_speed_mps"], 1.0, atol=0.02)
+    np.testing.assert_allclose(rows["progress_speed_pps"], 100.0 / LENGTH_M, rtol=1e-6)
+    assert rows["acceleration_mps2"].max() < 0.2
+    assert rows["braking_mps2"].max() < 0.2
+    assert rows["offset_m"].abs().max() < 1e-9
+    assert rows["skew_deg"].abs().max() < 10.0
+
+
+def test_a_car_that_starts_elsewhere_has_the_lap_position_of_the_course(view: LogView) -> None:
+    rows = view.steps[view.steps["episode"] == 1]
+    np.testing.assert_allclose(rows["lap_position"], (0.25 + rows["progress"] / 100) % 1.0, atol=1e-6)
+
+
+def test_speeding_up_is_acceleration_and_slowing_down_is_braking() -> None:
+    drive = Drive(speed_mps=1.0, sections=((0.4, 0.6, 3.0),))
+    steps = prepare(made_up_recording([drive])).steps
+    place = steps["lap_position"]
+    assert steps.loc[place.between(0.39, 0.42), "acceleration_mps2"].max() > 5.0
+    assert steps.loc[place.between(0.59, 0.63), "braking_mps2"].max() > 5.0
+    assert steps.loc[place.between(0.39, 0.42), "braking_mps2"].max() < 0.5
+
+
+def test_left_of_the_centre_line_is_a_positive_offset() -> None:
+    steps = prepare(made_up_recording([Drive(offset_m=0.2)])).steps
+    assert steps["offset_m"].median() == pytest.approx(0.2, abs=0.01)
+
+
+def test_a_tail_that_comes_round_slides_to_its_side_and_rolling_wheels_do_not() -> None:
+    rolling, spinning = (
+        prepare(made_up_recording([Drive(off_at=60, spins=spins)])).steps["slide_deg"].iloc[-4:]
+        for spins in (False, True)
+    )
+    assert rolling.abs().max() < 10.0
+    assert spinning.abs().max() > 30.0
+
+
+def test_future_reward_sums_the_discounted_rest_of_the_episode(view: LogView) -> None:
+    rows = view.steps[view.steps["episode"] == 2]
+    reward = rows["reward"].to_numpy()
+    expected = [float(np.sum(reward[k:] * 0.99 ** np.arange(len(reward) - k))) for k in range(len(reward))]
+    np.testing.assert_allclose(rows["discounted_future_reward"], expected)
+
+
+def test_rows_of_an_episode_that_stand_apart_are_put_together(view: LogView) -> None:
+    steps = view.recording.steps
+    mixed = steps.sort_values(["tstamp", "stream"], kind="stable").sort_values("steps", kind="stable")
+    again = prepare(replace(view.recording, steps=mixed.reset_index(drop=True)))
+    pd.testing.assert_frame_equal(again.steps, view.steps)
+    pd.testing.assert_frame_equal(again.episodes, view.episodes)
+
+
+def test_a_lap_whose_beginning_is_not_recorded_has_no_lap_time() -> None:
+    recording = made_up_recording([Drive(), Drive()])
+    view = prepare(replace(recording, steps=recording.steps.iloc[30:].reset_index(drop=True)))
+    assert view.episodes["complete"].tolist() == [True, True]
+    assert view.episodes["lap_time_s"].isna().tolist() == [True, False]
+
+
+def test_without_steps_there_is_nothing_to_prepare() -> None:
+    recording = made_up_recording([Drive()])
+    with pytest.raises(BadInput, match="no control steps"):
+        prepare(replace(recording, steps=recording.steps.iloc[:0]))
+
+
+def test_a_training_without_evaluations_has_empty_tables_with_all_columns() -> None:
+    view = prepare(made_up_recording([Drive()]))
+    assert len(view.evaluations) == len(view.evaluation_episodes) == 0
+    assert list(view.evaluations) == list(view.steps)
+    assert list(view.evaluation_episodes) == [*EPISODE_COLUMNS, "stream"]
