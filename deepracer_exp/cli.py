@@ -9,6 +9,7 @@ from pathlib import Path
 
 from deepracer_exp import __version__
 from deepracer_exp.commands import (
+    analyze,
     checkpoints,
     clean,
     clone,
@@ -183,6 +184,7 @@ def _parser() -> argparse.ArgumentParser:
     ui.add_argument("--uri", help="another MLflow store, as given to tracking.uri")
     ui.set_defaults(command=_ui)
 
+    analyze.register(commands)
     sweep.register(commands)
     resume.register(commands)
     clone.register(commands)
@@ -213,7 +215,7 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     # The imports to come take seconds, and the first start after an installation compiles for longer.
     print("starting", file=sys.stderr, flush=True)
-    start_workers_early(any(experiment.collector.mode != "in_process" for experiment, _ in composed))
+    start_workers_early(any(experiment.collector.forks for experiment, _ in composed))
 
     from rich.console import Console
 
@@ -252,7 +254,7 @@ def _validate(args: argparse.Namespace) -> int:
     _tell_notes(composition.notes)
     trial = None if seconds is None else compose_experiment([*overrides, *trial_overrides(seconds)])
     if trial is not None:
-        start_workers_early(experiment.collector.mode != "in_process")
+        start_workers_early(experiment.collector.forks)
 
     from rich.console import Console
 

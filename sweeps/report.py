@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import optuna
-import plotly.io
-from markupsafe import Markup
 from optuna.trial import FrozenTrial, TrialState
-from plotly.offline import get_plotlyjs
 
+from deepracer_exp.analysis.page import plot, render
 from deepracer_exp.formats.whole_file import write_whole
 
 from .best import best_line, best_trial, best_values, complete_trials, reranked
@@ -65,30 +62,22 @@ def report(study: optuna.Study) -> str:
     Raises:
         BadInput: the study was not made by a sweep.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sweeps", "."),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
     objectives = objectives_of(study)
     trials = study.get_trials(deepcopy=False)
-    drawn = [
-        # Plotly escapes what could end its script.
-        {"note": _NOTES[name], "html": Markup(_embedded(figure, name))}
-        for name, figure in figures(study).items()
-    ]
+    plots = [plot(figure, name) for name, figure in figures(study).items()]
     won = any(trial.state == TrialState.COMPLETE for trial in trials)
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
-    return environment.get_template("report.html.j2").render(
+    return render(
+        "sweeps",
+        "report.html.j2",
+        plots,
         study=study.study_name,
         headline=headline(study),
         fates=fates(trials),
         line=best_line(study) if won else None,
         best=best_trial(study).number if won else None,
         winners=_winners(study, objectives, keys),
-        figures=drawn,
+        notes=_NOTES,
         too_few=None
         if sum(t.state == TrialState.COMPLETE for t in trials) >= FEWEST_COMPLETE
         else FEWEST_COMPLETE,
@@ -97,7 +86,6 @@ def report(study: optuna.Study) -> str:
         space=study.user_attrs.get("space") or {},
         base=study.user_attrs.get("base") or [],
         facts=_facts(study, objectives),
-        plotly=Markup(get_plotlyjs()),
     )
 
 
@@ -145,15 +133,6 @@ def fates(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
 
 def _spent(trials: Sequence[FrozenTrial]) -> int:
     return sum(trial.user_attrs.get("env_steps") or 0 for trial in trials)
-
-
-def _embedded(figure: Any, name: str) -> str:
-    config = {
-        "displaylogo": False,
-        "responsive": True,
-        "toImageButtonOptions": {"filename": name, "scale": 2},
-    }
-    return plotly.io.to_html(figure, config, include_plotlyjs=False, full_html=False, div_id=f"figure-{name}")
 
 
 def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[dict[str, Any]]:

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
 
 LEAST_LAPS = 3
 """Complete laps of an iteration below which its 25th percentile says nothing."""
 DENSE = 0.5
 """Share of complete laps an iteration must have, of the highest share that any iteration has."""
 MOST = 3
-_Z = 1.959964  # 95 per cent
 
 
 def candidates(iterations: pd.DataFrame) -> pd.DataFrame:
@@ -64,7 +63,7 @@ def lap_chance(lap_times_s: NDArray[np.float64], target_s: float) -> LapChance |
     if not len(laps):
         return None
     faster = int((laps <= target_s).sum())
-    low, high = wilson(faster, len(laps))
+    low, high = binomtest(faster, len(laps)).proportion_ci(method="wilson")
     sd_s = float(laps.std(ddof=1)) if len(laps) > 1 else math.nan
     return LapChance(
         target_s=target_s,
@@ -76,11 +75,3 @@ def lap_chance(lap_times_s: NDArray[np.float64], target_s: float) -> LapChance |
         sd_s=sd_s,
         normal=float(norm.cdf(target_s, laps.mean(), sd_s)) if sd_s > 0 else math.nan,
     )
-
-
-def wilson(hits: int, tries: int) -> tuple[float, float]:
-    """Return the 95 per cent interval of a share (Wilson 1927)."""
-    share, z2 = hits / tries, _Z**2 / tries
-    middle = (share + z2 / 2) / (1 + z2)
-    half = _Z * math.sqrt(share * (1 - share) / tries + z2 / (4 * tries)) / (1 + z2)
-    return max(0.0, middle - half), min(1.0, middle + half)

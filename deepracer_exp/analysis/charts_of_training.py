@@ -35,7 +35,7 @@ def training_progress(view: LogView) -> Chart | None:
     table = view.iterations
     if not len(table):
         return None
-    found = convergence(table, _action_count(view))
+    found = convergence(table, view.action_count)
     at = None if found is None else found.iteration
     mark = [] if at is None else [Mark(at=float(at), label="converged", color=FAINT)]
     progress: list[Layer] = curve(table, "completion_mean", BLUE, "mean of the episodes")
@@ -68,14 +68,6 @@ def training_progress(view: LogView) -> Chart | None:
         share_x=True,
         table=table,
     )
-
-
-def _action_count(view: LogView) -> int | None:
-    """Return how many actions a discrete policy has, None of a continuous one."""
-    if not view.steps["action"].notna().any():
-        return None
-    metadata = view.recording.metadata
-    return len(metadata.actions if metadata is not None else ()) or int(view.steps["action"].max()) + 1
 
 
 def learning_vs_lap_time(view: LogView) -> Chart | None:

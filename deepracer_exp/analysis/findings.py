@@ -83,10 +83,7 @@ def _late(view: LogView) -> pd.DataFrame:
 
 
 def _converged(view: LogView) -> Finding:
-    actions = view.recording.metadata.actions if view.recording.metadata is not None else ()
-    numbered = view.steps["action"].notna().any()
-    count = (len(actions) or int(view.steps["action"].max()) + 1) if numbered else None
-    found = convergence(view.iterations, count)
+    found = convergence(view.iterations, view.action_count)
     thresholds = {
         "completion_gain": learning.COMPLETION_GAIN,
         "reward_gain": learning.REWARD_GAIN,
@@ -322,7 +319,7 @@ def _overfits(view: LogView) -> Finding | None:
     return Finding(
         rule="overfits",
         sentence=sentence,
-        figure="evaluations",
+        figure="training_progress",
         values={
             "best": found.best,
             "best_iteration": found.best_iteration,

@@ -46,6 +46,14 @@ class LogView:
     discount: float
     """Factor on the reward of the next step, in `discounted_future_reward`."""
 
+    @property
+    def action_count(self) -> int | None:
+        """Return how many actions a discrete policy has, None of a continuous one."""
+        if not self.steps["action"].notna().any():
+            return None
+        metadata = self.recording.metadata
+        return len(metadata.actions if metadata is not None else ()) or int(self.steps["action"].max()) + 1
+
 
 def prepare(recording: Recording, track: str | None = None) -> LogView:
     """Prepare one course of a recording.

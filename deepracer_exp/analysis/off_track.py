@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.stats import binomtest
 
-from .candidates import wilson
 from .episode_table import first_rows
 from .racing_line import WHEELBASE_M
 
@@ -109,7 +109,8 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
         counts = Counter(judged[here].tolist())
         most, times = counts.most_common(1)[0]
         passes = len(np.unique(episode[_apart(position, at[busiest]) <= half]))
-        low, high = wilson(int(here.sum()), max(passes, int(here.sum())))
+        offs = int(here.sum())
+        low, high = binomtest(offs, max(passes, offs)).proportion_ci(method="wilson")
         ahead = (at[here] - at[busiest] + 0.5) % 1.0
         middle = rows[here][np.argsort(ahead, kind="stable")[len(ahead) // 2]]
         found.append(

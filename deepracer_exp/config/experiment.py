@@ -44,6 +44,8 @@ class Experiment:
     runs_dir: Annotated[str, Field(min_length=1)]
     debug: bool
     """Show a traceback for errors."""
+    report: bool
+    """Write the page of the training at its end."""
     track: Tracks
     """One, or several by name."""
     car: CarConfig

@@ -17,3 +17,5 @@ class Outcome:
     summary: dict[str, Any]
     error: BaseException | None = None
     """What a failed run failed of."""
+    note: str | None = None
+    """A line on what is missing from its results."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepracer_exp.analysis.candidates import candidates, lap_chance, wilson
+from deepracer_exp.analysis.candidates import candidates, lap_chance
 from deepracer_exp.analysis.findings import Finding, findings
 from deepracer_exp.analysis.learning import PATIENCE, convergence
 from deepracer_exp.analysis.log_view import LogView, prepare
@@ -119,11 +119,6 @@ def test_the_chance_of_a_lap_is_measured_and_fitted() -> None:
     assert (found.laps, found.faster, found.share) == (4, 2, 0.5)
     assert found.normal == pytest.approx(0.5)
     assert (found.low, found.high) == pytest.approx((0.1500, 0.8500), abs=1e-3)
-
-
-def test_wilson_intervals_are_those_of_the_tables() -> None:
-    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
-    assert wilson(10, 10) == pytest.approx((0.7225, 1.0), abs=1e-4)
 
 
 def test_without_a_lap_there_is_no_chance() -> None:

@@ -1,43 +1,14 @@
 import re
-from html.parser import HTMLParser
 
 import pytest
 from optuna.distributions import FloatDistribution
 
 from deepracer_exp.errors import BadInput
 from sweeps.report import fates, headline, report, write_report
+from tests.browser import browser, needs_chromium
+from tests.html import Html
 
 from .studies import add, new_study, season, write_metrics
-
-
-class Page(HTMLParser):
-    """What a browser would make of a page: its tags, its text outside scripts, what it would load."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.loads: list[str] = []
-        self.words: list[str] = []
-        self._script = False
-        self.feed(html)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self.loads += [
-            value for key, value in attrs if key in ("src", "href") and not value.startswith("data:")
-        ]
-        self._script = tag in ("script", "style")
-
-    def handle_endtag(self, tag):
-        self._script = self._script and tag not in ("script", "style")
-
-    def handle_data(self, data):
-        if not self._script:
-            self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture(scope="module")
@@ -48,20 +19,35 @@ def study(tmp_path_factory):
 def test_the_page_holds_everything_and_loads_nothing(study, tmp_path):
     path = write_report(study, tmp_path / "report.html")
     html = path.read_text(encoding="utf-8")
-    page = Page(html)
+    page = Html(html)
     assert page.loads == []
     assert "link" not in page.tags[page.tags.index("body") :]
-    assert path.stat().st_size < 6_000_000
-    assert html.count("plotly.js v") == 1
+    assert path.stat().st_size < 2_500_000
+    assert html.count('id="plotly"') == 1
     for name in ("history", "importance", "slice", "parallel", "entropy"):
-        assert f'id="figure-{name}"' in html
+        assert f'data-plot="{name}"' in html
     assert f"Trial {study.best_trial.number} is the best" in page.text
     assert "deepracer-exp train algorithm.lr=" in page.text
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
+@needs_chromium
+def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, tmp_path):
+    path = write_report(study, tmp_path / "report.html")
+    with browser(tmp_path / "profile") as tab:
+        tab.open(path)
+        tab.draw_all()
+        assert tab.tell("document.querySelectorAll('[data-state=drawn]').length") == 5
+        assert not tab.tell("document.body.innerText.includes('WebGL')")
+        assert not tab.tell(
+            "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
+        )
+        assert tab.complaints == []
+        assert tab.asked_for <= {"file", "data", "blob"}
+
+
 @pytest.mark.slow
-def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_six_megabytes(tmp_path):
+def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_three_megabytes(tmp_path):
     study = new_study(tmp_path, objectives=["lap_time", "completion"])
     wide = {f"reward.constants.LONG_NAME_{at}": FloatDistribution(0.0, 1.0) for at in range(16)}
     for number in range(1000):
@@ -72,8 +58,8 @@ def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_six_megabyte
     for trial in study.get_trials(deepcopy=False):  # all of them learn alike, which saves a thousand files
         trial.user_attrs["runs"] = [{"run_dir": str(tmp_path / "lr_entropy" / "run-0")}]
     html = report(study)
-    assert len(html.encode()) < 6_000_000
-    assert "The last 700 in this order are left out" in Page(html).text
+    assert len(html.encode()) < 3_000_000
+    assert "The last 700 in this order are left out" in Html(html).text
 
 
 NASTY = "<script>alert(1)</script>&'\"</script>"
@@ -90,8 +76,8 @@ def test_nothing_that_a_study_holds_becomes_part_of_the_page(tmp_path):
             add(study, [score], reason=word, overrides=[word], metrics=3)
         add(study, None, "failed", reason=word, traceback=word)
         study.set_user_attr("reranked", [{"trial": 0, "values": [9.5], "interval": [9.0, 10.0]}])
-    assert Page(report(nasty)).tags == Page(report(clean)).tags
-    assert Page(report(nasty)).text.count(NASTY) >= 6
+    assert Html(report(nasty)).tags == Html(report(clean)).tags
+    assert Html(report(nasty)).text.count(NASTY) >= 6
 
 
 def test_the_fates_add_up_to_all_trials_and_all_steps(study):
@@ -121,9 +107,9 @@ def test_a_best_trial_without_a_lap_says_so(tmp_path):
 
 def test_a_study_without_a_complete_trial_has_a_page(tmp_path):
     study = new_study(tmp_path)
-    assert "No trial is complete" in Page(report(study)).text
+    assert "No trial is complete" in Html(report(study)).text
     add(study, None, "not_learning", seen=80.0)
-    page = Page(report(study))
+    page = Html(report(study))
     assert "No trial is complete" in page.text
     assert "to paste" not in page.text
 
@@ -132,7 +118,7 @@ def test_failures_of_one_reason_are_told_once_the_most_frequent_first(tmp_path):
     study = new_study(tmp_path)
     for reason in ("rare", "often", "often"):
         add(study, None, "failed", reason=f"{reason} error", traceback=f"Traceback of {reason}")
-    text = Page(report(study)).text
+    text = Html(report(study)).text
     found = re.findall(r"(\d) × (\w+) error", text)  # noqa: RUF001
     assert found == [("2", "often"), ("1", "rare")]
     assert text.count("Traceback of often") == 1
@@ -144,7 +130,7 @@ def test_the_table_begins_with_the_best_and_ends_with_the_failed(tmp_path):
     add(study, [10.0], reason="tenth")
     add(study, None, "median", seen=20.0, reason="pruned one")
     add(study, [9.0], reason="ninth")
-    text = Page(report(study)).text
+    text = Html(report(study)).text
     order = [text.rindex(word) for word in ("ninth", "tenth", "pruned one", "failed: for a reason")]
     assert order == sorted(order)
 
@@ -155,7 +141,7 @@ def test_the_winners_on_fresh_laps_stand_with_interval_and_old_value(tmp_path):
     add(study, [9.1])
     again = [{"trial": 0, "values": [9.87], "interval": [9.61, 10.23]}, {"trial": 1, "values": [9.3]}]
     study.set_user_attr("reranked", again)
-    text = Page(report(study)).text
+    text = Html(report(study)).text
     assert "Trial 1 is the best: race score 9.30 s on fresh laps." in text
     assert "9.61 s to 10.23 s" in text
 

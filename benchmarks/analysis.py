@@ -1,0 +1,157 @@
+"""What a report of a training costs, and how fast logs are read.
+
+    python -m benchmarks.analysis [--path DIR] [--turns 7] [--json FILE]
+
+- `report_s`, `peak_gb`: seconds and peak memory of `deepracer-exp analyze DIR`, from the start of the process to its
+  end; the median and the largest of three runs;
+- `read_ratio`: seconds that deepracer-utils takes to read the same folder, over ours; above 1 ours is faster. Both are
+  loaded once before and read in turns within one process; the median of the turns' ratios.
+
+Ours reads everything in the folder: training, evaluations and races from CSVs and text logs, policy updates, metrics
+and settings. deepracer-utils reads the training with the one call that its documentation names for a folder,
+`DeepRacerLog(...).load()`: of a console archive from the text log, of others from the CSVs. `read_ratio_csv` is the
+harder comparison, with its quickest way to all drives: training and evaluations from the CSVs, races from the logs.
+
+Wanted: at most 20 s and 1.5 GB on two cores for the 44,247 steps of the console training, `read_ratio` at least 1.
+"""
+
+import argparse
+import logging
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.recording_reader import read_recording
+
+from .command import command_line
+from .report import number, table, write_json
+
+CONSOLE_TRAINING = Path(__file__).parents[2] / "shared/reference/console_training"
+WANTED = {"report_s": 20.0, "peak_gb": 1.5, "read_ratio": 1.0}
+"""At most, at most, at least."""
+REPORTS = 3
+
+
+def report(path: Path, page: Path) -> tuple[float, float]:
+    """Return seconds and peak memory in GB of one report.
+
+    Raises:
+        SystemExit: the command did not end with exit code 0.
+    """
+    line = command_line("analyze", str(path), "--out", str(page))
+    began = time.perf_counter()
+    child = os.posix_spawn(
+        line[0], line, os.environ, file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+    )
+    _, status, usage = os.wait4(child, 0)
+    seconds = time.perf_counter() - began
+    if status != 0:
+        raise SystemExit(f"{' '.join(line)}: exit code {os.waitstatus_to_exitcode(status)}")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return seconds, usage.ru_maxrss * unit / 1e9
+
+
+def peer(path: Path, all_drives: bool) -> None:
+    """Read the folder with deepracer-utils."""
+    from deepracer.logs import DeepRacerLog
+    from deepracer.logs.misc import LogFolderType, LogType
+
+    log = DeepRacerLog(model_folder=str(path))
+    if not all_drives:
+        log.load()
+        return
+    log.load_training_trace()
+    log.load_evaluation_trace(force=True)
+    if log.fh.type == LogFolderType.CONSOLE_MODEL_WITH_LOGS:
+        log.load_robomaker_logs(LogType.LEADERBOARD, force=True)
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Return how long a call takes."""
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
+
+
+def measure_reading(path: Path, turns: int) -> dict[str, float]:
+    """Read in turns."""
+    calls: dict[str, Callable[[], object]] = {
+        "read_s": lambda: read_recording(path),
+        "peer_s": lambda: peer(path, all_drives=False),
+        "peer_csv_s": lambda: peer(path, all_drives=True),
+    }
+    logging.getLogger("deepracer").setLevel(logging.ERROR)
+    for call in calls.values():
+        call()
+    taken = [{name: seconds(call) for name, call in calls.items()} for _ in range(turns)]
+
+    def ratio(name: str) -> float:
+        return statistics.median(turn[name] / turn["read_s"] for turn in taken)
+
+    figures = {name: statistics.median(turn[name] for turn in taken) for name in calls}
+    return {**figures, "read_ratio": ratio("peer_s"), "read_ratio_csv": ratio("peer_csv_s")}
+
+
+def measure(path: Path, turns: int) -> dict[str, Any]:
+    """Return all figures."""
+    reading = measure_reading(path, turns)
+    steps = len(read_recording(path).steps)
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / "report.html"
+        reports = [report(path, page) for _ in range(REPORTS)]
+        size_mb = page.stat().st_size / 1e6
+    figures = {
+        "report_s": statistics.median(taken for taken, _ in reports),
+        "peak_gb": max(peak for _, peak in reports),
+        "page_mb": size_mb,
+        **reading,
+    }
+    return {"steps": steps, **{name: round(value, 3) for name, value in figures.items()}}
+
+
+def show(figures: dict[str, Any]) -> str:
+    """Return the figures as a table."""
+    rows = [
+        ("report, s", number(figures["report_s"], 1), f"at most {WANTED['report_s']:.0f}"),
+        ("peak memory, GB", number(figures["peak_gb"], 2), f"at most {WANTED['peak_gb']}"),
+        ("page, MB", number(figures["page_mb"], 1), "under 5"),
+        ("reading, s", number(figures["read_s"], 3), ""),
+        ("deepracer-utils, load(), s", number(figures["peer_s"], 3), ""),
+        ("deepracer-utils, all drives, s", number(figures["peer_csv_s"], 3), ""),
+        (
+            "how much faster than load()",
+            number(figures["read_ratio"], 2),
+            f"at least {WANTED['read_ratio']:.0f}",
+        ),
+        ("how much faster than all drives", number(figures["read_ratio_csv"], 2), ""),
+    ]
+    return table((f"{figures['steps']:,} steps", "measured", "wanted"), rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.analysis"
+    )
+    parser.add_argument("--path", type=Path, default=CONSOLE_TRAINING, help="logs in a layout that both know")
+    parser.add_argument("--turns", type=int, default=7, help="readings of each")
+    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    options = parser.parse_args(arguments)
+    try:
+        figures = measure(options.path, options.turns)
+    except BadInput as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    print(show(figures))
+    write_json(options.json, figures)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

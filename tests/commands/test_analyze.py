@@ -1,0 +1,171 @@
+"""`deepracer-exp analyze`, and the page at the end of a training."""
+
+import re
+import shutil
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.analysis import log_report
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats import recording_reader
+from tests.html import Html
+
+LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
+
+
+@pytest.fixture
+def run_dir(trained, tmp_path) -> Path:
+    """A copy of a trained run of one's own, under `runs/tiny/`."""
+    original = trained(*LAPS).folder
+    return Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
+
+
+def findings_told(page: Path) -> str:
+    return Html(page.read_text(encoding="utf-8")).text
+
+
+def test_a_run_is_analysed_into_its_folder_and_the_terminal_tells_what_stands_on_the_page(run_dir, call):
+    ended = call("analyze", str(run_dir))
+    assert ended.code == 0, ended.stderr
+    assert f"page  {run_dir / 'report.html'}" in ended.stdout
+    text = findings_told(run_dir / "report.html")
+    assert "16,384 control steps" in text
+    told = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]
+    assert len(told) >= 3
+    assert all(" ".join(line.split()) in text for line in told)
+
+
+@pytest.mark.parametrize("what", ["{name}", "tiny/{name}", "{begin}", "best:tiny"])
+def test_runs_are_found_as_by_other_commands(run_dir, call, monkeypatch, what):
+    found: list[Path] = []
+
+    def stop(place: Path) -> None:
+        found.append(place)
+        raise BadInput("found")
+
+    monkeypatch.setattr(recording_reader, "read_recording", stop)
+    ended = call("analyze", what.format(name=run_dir.name, begin=run_dir.name[:11]))
+    assert [(ended.cwd / place).resolve() for place in found] == [run_dir.resolve()]
+
+
+def test_logs_from_elsewhere_have_their_page_in_the_current_folder(run_dir, call, tmp_path):
+    exported = call("export", f"run={run_dir}", "format=aws-logs", "-o", str(tmp_path / "from aws"))
+    assert exported.code == 0, exported.stderr
+    ended = call("analyze", "from aws")
+    assert ended.code == 0, ended.stderr
+    assert "from-aws-analysis.html" in ended.stdout
+    assert "control steps" in findings_told(tmp_path / "from-aws-analysis.html")
+
+
+def test_a_target_has_its_chance_and_others_stand_beside_it(run_dir, call):
+    ended = call("analyze", str(run_dir), "--target", "1000", "--compare", str(run_dir), "--out", "page.html")
+    assert ended.code == 0, ended.stderr
+    assert "1000.00 s" in ended.stdout
+    assert 'id="figure-runs_compared"' in (ended.cwd / "page.html").read_text()
+
+
+def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, tmp_path, monkeypatch):
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
+    (tmp_path / "mine.py").write_text("def reward_function(params):\n    return float(params['speed'])\n")
+    ended = call("analyze", str(run_dir), "--reward", "mine.py", "--open", "--out", "page.html")
+    assert ended.code == 0, ended.stderr
+    assert "mine" in ended.stdout
+    assert "Paid by another reward function" in findings_told(tmp_path / "page.html")
+    assert opened == [(tmp_path / "page.html").resolve().as_uri()]
+
+
+def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
+    ended = call("analyze", str(run_dir))
+    assert ended.code == 0, ended.stderr
+    assert 'id="figure-reward_terms"' in (run_dir / "report.html").read_text()
+    call("export", f"run={run_dir}", "format=aws-logs", "-o", str(tmp_path / "theirs"))
+    trap = f"open({str(tmp_path / 'trapped')!r}, 'w')\ndef terms(params): return {{}}\n"
+    for file in (tmp_path / "theirs").rglob("reward_function.py"):
+        file.write_text(trap)
+    (tmp_path / "theirs" / "reward_function.py").write_text(trap)
+    assert call("analyze", "theirs").code == 0
+    assert not (tmp_path / "trapped").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere"], ["nowhere", "no such file or folder", "accepted"]),
+        (["empty"], ["empty"]),
+        (["text.txt"], ["text.txt"]),
+        (["RUN", "--target", "fast"], ["--target fast", "accepted"]),
+        (["RUN", "--target", "-3"], ["--target -3", "accepted"]),
+        (["RUN", "--target", "nan"], ["--target nan", "accepted"]),
+        (
+            ["RUN", "--out", "no/such/folder/page.html"],
+            ["--out no/such/folder/page.html", "cannot be written"],
+        ),
+        (["RUN", "--reward", "racing_lime"], ["racing_lime"]),
+        (["RUN", "--reward", "missing.py"], ["missing.py"]),
+        (["RUN", "--track", "Atlantis"], ["Atlantis"]),
+        (["RUN", "--compare", "nowhere"], ["nowhere"]),
+    ],
+)
+def test_bad_input_is_told_in_one_line(run_dir, call, tmp_path, arguments, words):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.txt").write_text("hello\n")
+    ended = call("analyze", *(str(run_dir) if word == "RUN" else word for word in arguments))
+    assert ended.code == 2, ended.stderr
+    for word in words:
+        assert word in ended.complaint
+    assert ended.stdout == ""
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_a_training_ends_with_its_page(trained):
+    ended = trained(*LAPS, "report=true")
+    assert ended.code == 0, ended.stderr
+    assert "report.html" in ended.stdout
+    assert "16,384 control steps" in findings_told(ended.folder / "report.html")
+
+
+def test_the_page_of_a_training_stands_in_its_mlflow_run(call):
+    from mlflow import MlflowClient
+
+    from deepracer_exp.formats.run_files import read_run_id
+
+    tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.iterations=1")
+    ended = call("train", *tiny, "report=true")
+    assert ended.code == 0, ended.stderr
+    client = MlflowClient(tracking_uri=f"sqlite:///{ended.cwd / 'runs' / 'mlflow.db'}")
+    found = {file.path for file in client.list_artifacts(read_run_id(ended.folder) or "")}
+    assert {"report.html", "learning.png"} <= found
+
+
+def test_a_fault_of_the_page_is_told_and_leaves_the_training_finished(train_here, monkeypatch):
+    def fault(*_):
+        raise ZeroDivisionError("a bug\nof two lines")
+
+    monkeypatch.setattr(log_report, "write_page", fault)
+    ended = train_here("report=true")
+    assert ended.code == 0
+    assert ended.summary["status"] == "finished"
+    (line,) = [line for line in ended.stderr.splitlines() if line.startswith("warning: ")]
+    assert "report.html could not be written: ZeroDivisionError: a bug of two lines" in line
+    assert "Traceback" not in ended.stderr
+    log = (ended.folder / "log.txt").read_text()
+    assert "Traceback" in log
+    assert "ZeroDivisionError: a bug" in log
+    assert not (ended.folder / "report.html").exists()
+
+
+def test_a_second_signal_during_the_page_leaves_it_off_and_the_training_finished(train_here, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(log_report, "write_page", interrupted)
+    ended = train_here("report=true")
+    assert (ended.code, ended.summary["status"]) == (0, "finished")
+    assert "report.html was left off; `deepracer-exp analyze " in ended.stderr
+
+
+def test_without_report_there_is_none(trained):
+    assert not (trained(*LAPS).folder / "report.html").exists()
