@@ -2,17 +2,15 @@
 
 import collections
 import contextlib
-import multiprocessing
-import sys
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from multiprocessing.process import BaseProcess
 
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.training.signals import Interruption
 
 from . import process
+from .launch import Launched, Launcher
 from .ledger import Ledger, Slot
 from .plan import Plan
 from .storage import Storage, patiently
@@ -27,27 +25,30 @@ _FEW = 3
 
 
 class Driver:
-    """Runs the workers of a sweep on this machine."""
+    """Runs the workers of a sweep."""
 
-    def __init__(self, plan: Plan, storage: Storage, workers: int, view: SweepView, on_ended: OnEnded):
+    def __init__(
+        self,
+        plan: Plan,
+        storage: Storage,
+        launcher: Launcher,
+        view: SweepView,
+        on_ended: OnEnded,
+    ):
         """Start nothing yet.
 
         Args:
             plan: of the sweep.
             storage: of the study, which is there.
-            workers: processes.
+            launcher: starts them.
             view: has been entered.
             on_ended: called whenever trials have ended.
         """
-        self._plan, self._workers, self._view, self._on_ended = plan, workers, view, on_ended
+        self._plan, self._launcher, self._view, self._on_ended = plan, launcher, view, on_ended
         self._ledger = Ledger(storage.engine, plan.study)
-        # From a server that has imported what workers need, once; see `start_workers_early`.
-        forks = sys.platform.startswith("linux")
-        self._context = (
-            multiprocessing.get_context("forkserver") if forks else multiprocessing.get_context("spawn")
-        )
-        self._running: dict[str, BaseProcess] = {}
-        self._log = plan.folder / "workers.log"
+        self._running: list[Launched] = []
+        self._all_made = False
+        """A worker has found nothing left to do."""
         self._losses = 0
         """Workers that died since a trial was last ended."""
         self._ended = -1
@@ -65,7 +66,7 @@ class Driver:
         }:
             self._free(owner)
         try:
-            for _ in range(self._workers):
+            for _ in range(self._launcher.workers):
                 self._start()
             while True:
                 slots = self._slots()
@@ -86,28 +87,32 @@ class Driver:
             raise
 
     def _start(self) -> None:
-        token = uuid.uuid4().hex[:8]
-        started = self._context.Process(target=process.main, args=(self._plan, token, str(self._log)))
-        started.start()
-        assert started.pid is not None
-        self._running[process.owner_name(started.pid, token)] = started
+        self._running.append(self._launcher.start(self._plan, uuid.uuid4().hex[:8]))
 
     def _reap(self) -> None:
         """Look after workers that are gone: their trials are free, and others take their place."""
-        for owner, one in list(self._running.items()):
-            if one.is_alive():
-                continue
-            one.join()
-            del self._running[owner]
+        for one in [one for one in self._running if one.exitcode is not None]:
+            self._running.remove(one)
             if one.exitcode == 0:
+                self._all_made = True
                 continue
-            self._free(owner)
+            if one.owner is not None and one.is_seen:
+                self._free(one.owner)
             if one.exitcode == RunFailed.exit_code:
                 raise RunFailed(f"the study's database does not answer; {self._goes_on()}")
+            if self._all_made:
+                continue
             self._losses += 1
-            if self._losses > 2 * self._workers + _FEW:
-                raise RunFailed(f"workers die again and again; {self._log} tells why; {self._goes_on()}")
+            if self._losses > 2 * self._launcher.workers + _FEW:
+                raise RunFailed(
+                    f"workers die again and again; {self._plan.folder}/workers*.log tell why; {self._goes_on()}"
+                )
             self._start()
+        if self._all_made:
+            # Whoever still waits for its place on a cluster is not needed.
+            for one in [one for one in self._running if one.owner is None]:
+                self._running.remove(one)
+                one.kill()
 
     def _free(self, owner: str) -> None:
         patiently(lambda: self._ledger.release(owner), self._plan.config.patience_s)
@@ -131,20 +136,21 @@ class Driver:
 
     def _end(self) -> None:
         """Tell the workers to end, and wait for them."""
-        for one in self._running.values():
+        for one in self._running:
             one.terminate()
         until = time.monotonic() + _LEAVE_S
-        for one in self._running.values():
+        for one in self._running:
             one.join(max(until - time.monotonic(), 0.1))
         self._kill()
 
     def _kill(self) -> None:
-        for owner, one in self._running.items():
+        for one in self._running:
             one.kill()
-            one.join()
+            if one.owner is None or not one.is_seen:
+                continue
             # A database that is away frees the trial by itself, once its lease is over.
             with contextlib.suppress(RunFailed):
-                patiently(lambda owner=owner: self._ledger.release(owner), 1.0)  # type: ignore[misc]
+                patiently(lambda owner=one.owner: self._ledger.release(owner), 1.0)  # type: ignore[misc]
         self._running.clear()
 
     def _goes_on(self) -> str:

@@ -82,7 +82,7 @@ def parallel(
     pruned = any(trial.state != TrialState.COMPLETE for trial in known)
     title = "Every trial a line: drag along an axis to choose" + " (pruned ones with what they had)" * pruned
     figure = styled(go.Figure(lines), title, 480, legend=False)
-    figure.update_layout(margin={"l": 90, "r": 40, "t": 120 if len(axes) > 7 else 95, "b": 30})
+    figure.update_layout(margin={"l": 90, "r": 40, "t": 130 if len(axes) > 7 else 110, "b": 30})
     return figure
 
 

@@ -1,9 +1,11 @@
 """Studies begun and found again."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import optuna
+from optuna.exceptions import ExperimentalWarning
 from optuna.study import Study, StudyDirection
 
 from deepracer_exp.config.sweep import SweepRequest
@@ -106,6 +108,10 @@ def open_study(
                 f"`deepracer-exp sweep study={name}` alone to go on with it"
             )
     study.set_user_attr("trials", sweep.trials)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        # Optuna Dashboard calls them "Objective 0" otherwise.
+        study.set_metric_names([MEASURES[objective].label for objective in sweep.objectives])
     return study
 
 

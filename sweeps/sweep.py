@@ -1,7 +1,7 @@
 """A sweep from its overrides to its winner."""
 
 import collections
-import os
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -16,7 +16,7 @@ from rich.console import Console
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import TrackingConfig, TrackingOff
-from deepracer_exp.config.sweep import SweepRequest, compose_sweep
+from deepracer_exp.config.sweep import SweepConfig, SweepRequest, compose_sweep
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.tracking.store import Store, resolve_store
@@ -24,16 +24,18 @@ from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
-from .best import best_line, best_trial, best_values, complete_trials, write_best
+from .best import best_line, best_trial, best_values, complete_trials, reranked, write_best
 from .database import resolve_database
 from .driver import Driver
+from .labels import shown_values
+from .launch import Launcher, LocalLauncher
 from .ledger import Ledger, Slot
 from .plan import Plan
 from .pruners import build_pruner
 from .samplers import build_sampler
 from .space import SearchSpace
 from .storage import Storage, open_storage, patiently
-from .study import completed, find_study, open_study
+from .study import completed, find_study, load_study, open_study
 from .table import SweepView
 from .telling import tell_settled, tell_strays
 
@@ -70,32 +72,33 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     build_sampler(config, space)
     build_pruner(config)
     experiment = _experiment(request, space, runs_dir)
-    storage = open_storage(config.storage, runs_dir)
-    study = open_study(request, overrides, space, storage, runs_dir)
-    workers = config.workers or _cores()
-    study_run, study_run_id = begin_study_run(request, space, experiment.tracking, storage, runs_dir)
-    plan = Plan(
-        study=request.study,
-        runs_dir=runs_dir,
-        config=config,
-        protocol=protocol,
-        space=space,
-        parent=request.entry.parent,
-        store=_store(experiment, runs_dir),
-        study_run_id=study_run_id,
-        evaluations=_evaluations(experiment),
-        cores=max(1, _cores() // workers),
-    )
-    if plan.study_run_id is not None:
-        study.set_user_attr("mlflow_run_id", plan.study_run_id)
-    status: Status = "FAILED"
-    try:
-        code = _driven(plan, storage, study, workers, console, study_run)
-        status = "KILLED" if code else "FINISHED"
-    finally:
-        if study_run is not None:
-            study_run.finish(status)
-    return study, plan.folder, code
+    store = _store(experiment, runs_dir)
+    with contextlib.closing(_launcher(config, runs_dir, store)) as launcher:
+        storage = open_storage(config.storage, runs_dir)
+        study = open_study(request, overrides, space, storage, runs_dir)
+        study_run, study_run_id = begin_study_run(request, space, experiment.tracking, storage, runs_dir)
+        plan = Plan(
+            study=request.study,
+            runs_dir=launcher.folder(runs_dir),
+            config=config,
+            protocol=protocol,
+            space=space,
+            parent=request.entry.parent,
+            store=store,
+            study_run_id=study_run_id,
+            evaluations=_evaluations(experiment),
+            cores=launcher.cores,
+        )
+        if plan.study_run_id is not None:
+            study.set_user_attr("mlflow_run_id", plan.study_run_id)
+        status: Status = "FAILED"
+        try:
+            code = _driven(plan, storage, study, launcher, console, study_run)
+            status = "KILLED" if code else "FINISHED"
+        finally:
+            if study_run is not None:
+                study_run.finish(status)
+        return study, plan.folder, code
 
 
 def begin_study_run(
@@ -115,12 +118,18 @@ def begin_study_run(
     """
     # MLflow cannot be told to make a run only where there is none: one driver at a time looks and makes it.
     with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
-        run = open_study_run(tracking, runs_dir, request.study, space.as_text(), request.base)
+        objectives = request.entry.sweep.objectives
+        run = open_study_run(tracking, runs_dir, request.study, objectives, space.as_text(), request.base)
         return run, None if run is None else run.wait_for_id()
 
 
 def _driven(
-    plan: Plan, storage: Storage, study: Study, workers: int, console: Console, study_run: StudyRun | None
+    plan: Plan,
+    storage: Storage,
+    study: Study,
+    launcher: Launcher,
+    console: Console,
+    study_run: StudyRun | None,
 ) -> int:
     ledger, patience_s = Ledger(storage.engine, plan.study), plan.config.patience_s
 
@@ -128,11 +137,11 @@ def _driven(
         if study_run is not None:
             study_run.update(_progress(slots, plan, study))
 
-    with Interruption() as interruption, SweepView(plan, workers, console) as view:
+    with Interruption() as interruption, SweepView(plan, launcher.workers, console) as view:
         slots = patiently(ledger.slots, patience_s)
         view.show(slots)
         if not ledger.is_done(plan.config.trials):
-            code = Driver(plan, storage, workers, view, record).run(interruption)
+            code = Driver(plan, storage, launcher, view, record).run(interruption)
             if code is not None:
                 return code
         for call in (tell_settled, tell_strays):
@@ -158,10 +167,12 @@ def _progress(slots: Sequence[Slot], plan: Plan, study: Study) -> Progress:
     if not complete_trials(study):
         return Progress(**told)
     best = best_trial(study)
+    fresh = any(one["trial"] == best.number for one in reranked(study))
     return Progress(
         **told,
         best_trial=best.number,
         best_values=dict(zip(plan.config.objectives, best_values(study), strict=True)),
+        best_shown=shown_values(plan.config.objectives, best_values(study)) + " on fresh laps" * fresh,
         best_line=best_line(study),
         lap_time_s=best.user_attrs.get("lap_time_s"),
         completion=best.user_attrs.get("completion"),
@@ -204,7 +215,9 @@ def _known(request: SweepRequest, runs_dir: Path) -> Study | None:
         return None
     if request.entry.sweep.storage is None and not (runs_dir / "sweeps.db").exists():
         return None
-    return find_study(request.study, open_storage(request.entry.sweep.storage, runs_dir))
+    # A name without anything to search is that of a study to go on with.
+    find = find_study if request.space else load_study
+    return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))
 
 
 def _without_rules(request: SweepRequest) -> SweepRequest:
@@ -259,6 +272,9 @@ def _evaluations(experiment: Experiment) -> int | None:
     return min(limits) // every if limits else None
 
 
-def _cores() -> int:
-    """Return the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _launcher(config: SweepConfig, runs_dir: Path, store: Store | None) -> Launcher:
+    if config.executor.kind == "local":
+        return LocalLauncher(config.workers)
+    from .ray_launch import RayLauncher
+
+    return RayLauncher(config, config.executor, runs_dir, store)

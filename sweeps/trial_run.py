@@ -22,7 +22,8 @@ from deepracer_exp.evaluation.result import HELD_OUT, USUAL
 from deepracer_exp.evaluation.run import read_run
 from deepracer_exp.formats.lineage_file import Lineage
 from deepracer_exp.formats.run_files import read_metrics, read_object, read_run_id
-from deepracer_exp.tracking.study_run import PARENT, STUDY, TRIAL, end_trial_run, open_trial_run
+from deepracer_exp.tracking.names import PARENT, trial_metrics
+from deepracer_exp.tracking.study_run import STUDY, TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.clone import prepare_clone
 from deepracer_exp.training.outcome import Outcome
@@ -234,6 +235,8 @@ class TrialRun:
         own = [*overrides, f"name={self._plan.study}", f"runs_dir={self._plan.runs_dir}"]
         if not any(override.startswith("collector.threads=") for override in overrides):
             own.append(f"collector.threads={self._plan.cores}")
+        if not any(override.startswith("report=") for override in overrides):
+            own.append("report=false")
         experiment, composition, start = self._composed(own)
         if index:
             experiment, composition, start = self._composed([*own, f"seed={experiment.seed + index}"])
@@ -292,12 +295,15 @@ class TrialRun:
         above = self._above if self._plan.config.seeds > 1 else self._runs[0].get("mlflow_run_id")
         if above is None or above == self._plan.study_run_id:
             return
-        values: dict[str, float | None] = dict(
-            zip(self._plan.config.objectives, result.values or (), strict=False)
-        )
+        values: dict[str, float | None] = {
+            "lap_time": result.attrs["lap_time_s"],
+            "completion": result.attrs["completion"],
+            **dict(zip(self._plan.config.objectives, result.values or (), strict=False)),
+        }
+        metrics = trial_metrics(values)
         status: Status = "FAILED" if result.outcome == "FAIL" else "FINISHED"
         told = f"{result.outcome.lower()}: {result.attrs['reason']}"
-        end_trial_run(self._plan.store, self._plan.study, above, status, told, values)
+        end_trial_run(self._plan.store, self._plan.study, above, status, told, metrics)
 
     def _patiently(self, call: Callable[[], Value]) -> Value:
         return patiently(call, self._plan.config.patience_s)

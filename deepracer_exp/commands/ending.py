@@ -9,6 +9,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from deepracer_exp.training.outcome import Outcome
 
+_RESULTS = {
+    "report.html": "what was found, and all figures",
+    "best_lap.png": "the fastest lap",
+    "learning.png": "the learning curves",
+}
+
 
 def tell(outcome: "Outcome", tracked_in: str | None) -> None:
     """Print how a run ended, and where its results are.
@@ -28,9 +34,11 @@ def tell(outcome: "Outcome", tracked_in: str | None) -> None:
         f"{summary['wall_clock_s']:.0f} s, {_laps(summary)}"
     )
     print(f"\n  results       {outcome.folder}")
-    for name, what in (("best_lap.png", "the fastest lap"), ("learning.png", "the learning curves")):
+    for name, what in _RESULTS.items():
         if (outcome.folder / name).exists():
-            print(f"    {name}  {what}")
+            print(f"    {name:12}  {what}")
+    if outcome.note is not None:
+        print(f"warning: {outcome.note}", file=sys.stderr)
     if tracked_in is not None:
         # `make race` calls us by a path that a newcomer's shell does not know.
         command = "deepracer-exp" if shutil.which("deepracer-exp") else sys.argv[0]

@@ -37,6 +37,6 @@ def start_workers_early(wanted: bool, module: str = "deepracer_exp.training.fork
 
 
 def has_workers(run_dir: Path) -> bool:
-    """Return whether the cars of a run are driven in processes of their own."""
+    """Return whether the cars of a run are driven in processes that this machine starts for it."""
     collector = read_config(run_dir).get("collector")
-    return isinstance(collector, dict) and collector.get("mode") != "in_process"
+    return isinstance(collector, dict) and collector.get("mode") in ("sync", "async")

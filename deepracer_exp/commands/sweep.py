@@ -20,6 +20,7 @@ how
   sweep.pruners=[entropy,median]                            also percentile, hyperband, wilcoxon; [] prunes nothing
   sweep.objectives=[lap_time,completion]                    a Pareto front instead of one best trial
   sweep.storage=postgresql+psycopg://USER@HOST/NAME         instead of runs/sweeps.db
+  sweep/executor=ray                                        workers on a Ray cluster (docs/scaling.md)
   parent=RUN                                                trials are clones of RUN
 
   deepracer-exp sweep study=NAME                            goes on with a study that was interrupted or killed
@@ -71,7 +72,7 @@ def _sweep(args: argparse.Namespace) -> int:
         print(redact(request.composition.yaml()), end="")
         return 0
     print("starting", file=sys.stderr, flush=True)
-    start_workers_early(True, PRELOADED)
+    start_workers_early(request.entry.sweep.executor.kind == "local", PRELOADED)
 
     from rich.console import Console
 

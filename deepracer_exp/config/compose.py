@@ -92,7 +92,7 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     composition = compose_entry("export", overrides)
     _require_run(composition)
     if composition.mapping["format"] is None:
-        raise BadInput("format: missing; write format=onnx or format=aws")
+        raise BadInput("format: missing; write format=onnx, format=aws or format=aws-logs")
     return typed(composition.mapping, ExportConfig), composition
 
 
@@ -339,6 +339,10 @@ def _check_together(experiment: Experiment) -> None:
         raise BadInput(
             f"collector.processes={collector.processes} with collector.mode=in_process: "
             "choose collector=sync or collector=async for several processes"
+        )
+    if collector.mode == "ray" and collector.processes is None:
+        raise BadInput(
+            "collector.processes=null with collector=ray: a cluster grows and shrinks; give the number of processes"
         )
     limit_s, hang_s = experiment.reward.time_limit_s, collector.hang_timeout_s
     if collector.mode != "in_process" and limit_s >= hang_s:

@@ -12,16 +12,21 @@ from .bounds import Count, Natural
 class CollectorConfig:
     """Where the cars are driven."""
 
-    mode: Literal["in_process", "sync", "async"]
-    """Cars in this process; in several, all waited for; in several, whichever is ready."""
+    mode: Literal["in_process", "sync", "async", "ray"]
+    """Cars in this process; in several, all waited for; in several, whichever is ready; as sync, on a Ray cluster."""
     processes: Count | None
-    """Worker processes of `sync` and `async`; null: one per core."""
+    """Worker processes; null: one per core, which `ray` does not know."""
     cars: Count
     """Cars per process, stepped together."""
     threads: Natural
     """Physics threads per process (0: in_process one per core, else one)."""
     hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
     """Seconds without a control step after which a worker process counts as hanging."""
+
+    @property
+    def forks(self) -> bool:
+        """Whether cars are driven in processes that the training starts on its own machine."""
+        return self.mode in ("sync", "async")
 
 
 @dataclass(frozen=True, kw_only=True)

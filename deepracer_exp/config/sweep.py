@@ -36,13 +36,29 @@ class LocalExecutor:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RayExecutor:
+    """Worker processes on the nodes of a Ray cluster."""
+
+    kind: Literal["ray"]
+    address: Annotated[str, Field(min_length=1)]
+    """HOST:PORT of its head; auto: the cluster that this machine is a node of."""
+    cpus_per_worker: Count
+    """Cores that a worker takes, and uses for physics."""
+    gpus_per_worker: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """GPUs that a worker takes, or the share of one."""
+
+
+ExecutorConfig = Annotated[LocalExecutor | RayExecutor, Field(discriminator="kind")]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SweepConfig:
     """What is searched, by what, and how far."""
 
     trials: Count
     """In total, over all starts of the study."""
     workers: Count | None
-    """Processes; null: one a core."""
+    """Processes; null: one a core, on a cluster as many as it has room for."""
     seeds: Count
     """With how many seeds a trial is trained; its value is their mean."""
     protocol: str
@@ -71,7 +87,7 @@ class SweepConfig:
     """Seconds for which a database that does not answer is waited for."""
     storage: Annotated[str, Field(min_length=1)] | None
     """Address of the database; null: a file in `runs_dir`."""
-    executor: LocalExecutor
+    executor: ExecutorConfig
     train: tuple[str, ...]
     """Overrides of every trial."""
     space: dict[str, str]

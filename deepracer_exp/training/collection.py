@@ -21,6 +21,7 @@ from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput, RunFailed
 
+from .batches import Batches
 from .faults import read_fault
 from .watchdog import Watchdog
 from .worker import EnvFactory
@@ -77,14 +78,8 @@ class Collection:
         self._run_dir = run_dir
         self._batches = 0
         self._begun_from = state or {}
-        names = (
-            set() if config.mode == "async" else {_name(worker) for worker in range(max(1, self._workers))}
-        )
-        if self._begun_from and set(self._begun_from) != names:
-            raise BadInput(
-                f"the checkpoint does not fit: it has the cars of {len(self._begun_from)} processes that wait for one "
-                f"another; accepted by this collector: {len(names)}"
-            )
+        names = {worker_name(worker) for worker in range(max(1, self._workers))}
+        refuse_other_cars(self._begun_from, set() if config.mode == "async" else names)
         self._watchdog: Watchdog | None = None
         parts = self._workers if config.mode == "sync" else 1
         steps_per_batch = -(-frames_per_batch // (parts * config.cars))
@@ -164,12 +159,12 @@ class Collection:
             return dict(self._begun_from)
         if self._watchdog is None:
             with self._own_stream():
-                return {_name(0): self._collector.env.take_state()}
+                return {worker_name(0): self._collector.env.take_state()}
         states = self._ask(
             lambda: self._collector.map_fn("env.take_state"),
             lambda: "a collector worker did not tell where its cars are",
         )
-        return {_name(worker): state for worker, state in enumerate(states)}
+        return {worker_name(worker): state for worker, state in enumerate(states)}
 
     def close(self) -> None:
         """End every worker."""
@@ -227,7 +222,7 @@ class Collection:
 
         TorchRL tries the policy once while it starts, which draws a number: the state is put back after that.
         """
-        states = [self._begun_from[_name(worker)] for worker in range(max(1, self._workers))]
+        states = [self._begun_from[worker_name(worker)] for worker in range(max(1, self._workers))]
         if self._watchdog is None:
             with self._own_stream():
                 self._collector.env.put_state(states[0])
@@ -349,6 +344,35 @@ def _tell_deliveries(queue: Any, watchdog: Watchdog) -> None:
     queue.get = get_and_tell
 
 
-def _name(worker: int) -> str:
+def worker_name(worker: int) -> str:
     """Return what a worker's cars are called in a checkpoint."""
     return f"worker-{worker}"
+
+
+def refuse_other_cars(state: Mapping[str, Any], names: set[str]) -> None:
+    """Refuse to go on from a state of other workers than those of these names; an empty one fits all.
+
+    Raises:
+        BadInput: it is of others.
+    """
+    if state and set(state) != names:
+        raise BadInput(
+            f"the checkpoint does not fit: it has the cars of {len(state)} processes that wait for one another; "
+            f"accepted by this collector: {len(names)}"
+        )
+
+
+def open_collection(
+    config: CollectorConfig,
+    setup: RaceSetup,
+    policy: torch.nn.Module,
+    frames_per_batch: int,
+    run_dir: Path,
+    state: Mapping[str, Any] | None = None,
+) -> Batches:
+    """Start the cars where the configuration wants them; arguments and errors as in `Collection`."""
+    if config.mode == "ray":
+        from .ray_collection import RayCollection
+
+        return RayCollection(config, setup, policy, frames_per_batch, run_dir, state)
+    return Collection(config, setup, policy, frames_per_batch, run_dir, state)

@@ -9,13 +9,14 @@ from tensordict import TensorDictBase
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import AlgorithmConfig
 
-from .collection import Collection, worker_count
+from .batches import Batches
+from .collection import worker_count
 
 _CHUNK_STEPS = 32  # steps a car drives between two looks at how many episodes have ended
 
 
 def iterations(
-    collection: Collection, algorithm: AlgorithmConfig, separate: bool
+    collection: Batches, algorithm: AlgorithmConfig, separate: bool
 ) -> Iterator[tuple[TensorDictBase, float]]:
     """Yield what an update learns from, and the seconds it took to collect.
 

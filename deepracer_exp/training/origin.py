@@ -20,6 +20,7 @@ HARMLESS = (
     "reward.time_limit_s",
     "tracking",
     "debug",
+    "report",
 )
 """Keys, or their first parts, that change nothing of what a run learns. `runs_dir` is where the run is found."""
 

@@ -31,6 +31,7 @@ from .checkpoints import read_training
 from .header import track_names
 from .origin import refuse_changes
 from .outcome import Outcome
+from .ray_cluster import check_collector
 from .run_folder import RunFolder
 from .signals import Interruption
 from .training import SPENT, TIMES, Training
@@ -103,6 +104,7 @@ def read_files(experiment: Experiment) -> RaceSetup:
     """
     setup = build_setup(experiment)
     RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
+    check_collector(experiment.collector)
     return setup
 
 
@@ -150,9 +152,9 @@ def _begin(
         tags |= watch.tags
     # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
     what = names["reward"] if lineage is None else f"clone {lineage.generation}"
-    title = f"{what} s{experiment.seed}" if watch is None else watch.title
+    title = f"{what} s{experiment.seed} {time.strftime('%H:%M:%S')}" if watch is None else watch.title
     tracker.start(
-        f"{title} {time.strftime('%H:%M:%S')}",
+        title,
         experiment.name,
         run_params(names, composition.mapping),
         tags,

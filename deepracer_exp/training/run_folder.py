@@ -109,7 +109,7 @@ class RunFolder:
         """Go back to an iteration: what was written later goes."""
         rows = [row for row in self.metrics() if row["iteration"] <= iteration]
         self.write("metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
-        for name in ("summary.json", "best_lap.png", "learning.png"):
+        for name in ("summary.json", "report.html", "best_lap.png", "learning.png"):
             (self.path / name).unlink(missing_ok=True)
         for file in (self.path / "trace").glob("*"):
             # Files of the trace are counted from 0.

@@ -26,10 +26,11 @@ from deepracer_exp.tracking.names import END_TAG
 from deepracer_exp.tracking.recorder import Tracker
 
 from .alerts import Alerts
+from .batches import Batches
 from .best import Best
 from .budget import Budget
 from .checkpoints import CheckpointStore, read_agent
-from .collection import Collection, worker_count
+from .collection import open_collection, worker_count
 from .display import ProgressDisplay
 from .episodes import Finished
 from .examination import NOT_EVALUATED, Examination, Mark
@@ -40,7 +41,7 @@ from .log_file import log_to
 from .origin import origin
 from .outcome import Outcome
 from .ranking import Ranking
-from .report import write_report
+from .report import write_pictures, write_run_page
 from .results import Results
 from .run_folder import RunFolder
 from .signals import Interruption
@@ -53,6 +54,9 @@ TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 """Columns of metrics.jsonl that differ between two runs of the same seed."""
 SPENT = "budget reached"
 """How the reason of a run begins that has used its budget."""
+_OVER = ("finished", "hopeless")
+"""How runs end that do not go on: the only ones whose page is worth the time."""
+_RESULTS = ("summary.json", "metrics.jsonl", "log.txt", "report.html", "best_lap.png", "learning.png")
 _LAST_EVERY, _LAST_EVERY_S = 10, 5.0
 """Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
 
@@ -136,7 +140,7 @@ class Training:
         # The view first: workers take a second or two to start.
         with (
             self._display,
-            Collection(
+            open_collection(
                 experiment.collector,
                 self.setup,
                 self.networks.policy,
@@ -185,7 +189,7 @@ class Training:
         Raises:
             OSError, RunFailed: the folder takes no more.
         """
-        write_report(self.folder.path, self.setup.courses)
+        write_pictures(self.folder.path, self.setup.courses)
         return self._end(status, reason, exit_code)
 
     def fail(self, reason: str, error: BaseException) -> Outcome:
@@ -209,7 +213,7 @@ class Training:
         hopeless = self._beaten if self._decision is None else self._decision.hopeless
         return "hopeless" if hopeless else "finished"
 
-    def _loop(self, collection: Collection, interruption: Interruption) -> str:
+    def _loop(self, collection: Batches, interruption: Interruption) -> str:
         algorithm = self.experiment.algorithm
         self._budget.alerts(*self._usage())  # what was used before this loop needs no alert
         for batch, collect_s in iterations(collection, algorithm, self.experiment.collector.mode == "async"):
@@ -242,12 +246,12 @@ class Training:
                 return reason
         raise RunFailed("the collector ended without a reason")
 
-    def _save(self, collection: Collection, best: bool) -> None:
+    def _save(self, collection: Batches, best: bool) -> None:
         self.checkpoints.save(self.agent, self._counters(), self._state(collection), best=best)
         self._tracker.safe_until(self._env_steps)
         self._saved_at = time.monotonic()
 
-    def _state(self, collection: Collection) -> dict[str, Any]:
+    def _state(self, collection: Batches) -> dict[str, Any]:
         """Return what `go_on_from` needs beside the agent."""
         return {
             "iteration": self._iteration,
@@ -285,9 +289,10 @@ class Training:
         except OSError:
             if status != "failed":
                 raise
+        note = write_run_page(path) if self.experiment.report and status in _OVER else None
         for name in ("config.yaml", "overrides.yaml", "provenance.json", "reward_function.py"):
             self._tracker.log_artifact(path / name)
-        for name in ("summary.json", "metrics.jsonl", "log.txt", "best_lap.png", "learning.png", "faults"):
+        for name in (*_RESULTS, "faults"):
             if (path / name).exists():
                 self._tracker.log_artifact(path / name, "faults" if name == "faults" else None)
         for name in ("best", "last"):
@@ -298,7 +303,7 @@ class Training:
             self._tracker.set_tag(tag, value)
         self._tracker.finish(ENDS.get(status, "KILLED"))
         self._let_go()
-        return Outcome(status, reason, exit_code, path, summary, error)
+        return Outcome(status, reason, exit_code, path, summary, error, note)
 
     def _let_go(self) -> None:
         self._alerts.close()

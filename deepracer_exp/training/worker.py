@@ -52,11 +52,17 @@ class EnvFactory:
             self.n_cars,
             threads=self.threads,
             first_car=self.worker * self.n_cars,
-            prints=RewardPrints(self.run_dir / PRINTS_FILE),
+            prints=self._prints(),
         )
         if self.heartbeat is None:
-            return _StateKeepingEnv(race)
+            return _StateKeepingEnv(race, on_step=self._sign_of_life())
         return _WorkerEnv(race, self._beat(self.heartbeat), self.run_dir, self.worker)
+
+    def _prints(self) -> RewardPrints:
+        return RewardPrints(self.run_dir / PRINTS_FILE)
+
+    def _sign_of_life(self) -> Callable[[], None] | None:
+        return None
 
     def _beat(self, heartbeat: Path) -> Callable[[], None]:
         beats = np.memmap(heartbeat, np.int64, "r+")

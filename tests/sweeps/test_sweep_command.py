@@ -115,6 +115,12 @@ def test_report_and_best_need_no_more_than_the_name(swept, call_at):
     assert "studies: s" in nobody.complaint
 
 
+def test_a_misspelt_study_is_not_begun(swept, call_at):
+    ended = call_at(swept.cwd, "sweep", "study=ss")
+    assert ended.code == 2
+    assert "did you mean s?" in ended.complaint
+
+
 def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_path):
     (tmp_path / "broken.py").write_text(
         "def reward_function(params):\n    return 1 / (params['steps'] < 5)\n"

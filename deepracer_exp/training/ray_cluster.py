@@ -1,0 +1,98 @@
+"""The Ray cluster on which the workers of a sweep, or the cars of a run, are placed."""
+
+import importlib.util
+import os
+import socket
+from typing import Any
+
+from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.errors import BadInput
+
+_ANSWER_S = 5.0
+
+
+def connect(address: str, asked_by: str) -> None:
+    """Join a cluster that runs; none is ever started here, so that none is left behind.
+
+    Args:
+        address: HOST:PORT of its head, or `auto`.
+        asked_by: the setting that wants it, for messages.
+
+    Raises:
+        BadInput: Ray is not installed, or no cluster answers.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise BadInput(f"{asked_by}: needs Ray; install it with: pip install 'deepracer-exp[ray]'")
+    import ray
+    from ray._private import ray_constants
+
+    # A cluster that is gone is asked twenty times for half a minute otherwise; its variable of the environment is
+    # read when TorchRL imports Ray.
+    ray_constants.NUM_REDIS_GET_RETRIES = 1
+    if ray.is_initialized():
+        return
+    told = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
+    try:
+        if told != "auto":
+            _knock(told)
+        ray.init(told, log_to_driver=False, logging_level="error")
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
+        raise BadInput(
+            f"{asked_by}: no Ray cluster at {told}: {reason}; start one with: ray start --head --disable-usage-stats"
+        ) from None
+
+
+def leave() -> None:
+    """Take leave of the cluster: what this process has started there ends."""
+    import ray
+
+    ray.shutdown()
+
+
+def node_addresses() -> list[str]:
+    """Return the addresses of the nodes, each once."""
+    return sorted({node["NodeManagerAddress"] for node in _nodes()})
+
+
+def room(needs: dict[str, float]) -> int:
+    """Return how many workers the cluster has room for when nothing else runs on it.
+
+    Args:
+        needs: what each of them takes of Ray's resources, as `CPU` and `GPU`.
+    """
+    wanted = {name: amount for name, amount in needs.items() if amount > 0}
+    return sum(
+        int(min(node["Resources"].get(name, 0.0) / amount for name, amount in wanted.items()))
+        for node in _nodes()
+    )
+
+
+def check_collector(config: CollectorConfig) -> None:
+    """Join the cluster of `collector=ray`; nothing to do for the other collectors.
+
+    Raises:
+        BadInput: no cluster, or one that is too small.
+    """
+    if config.mode != "ray":
+        return
+    connect("auto", "collector=ray")
+    cores = config.threads or 1
+    places = room({"CPU": cores})
+    if places < (config.processes or 1):
+        raise BadInput(
+            f"collector.processes={config.processes}: the Ray cluster has room for {places} of {cores} cores each"
+        )
+
+
+def _nodes() -> list[dict[str, Any]]:
+    import ray
+
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
+def _knock(address: str) -> None:
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdigit():
+        raise ValueError("accepted: HOST:PORT")
+    socket.create_connection((host, int(port)), _ANSWER_S).close()

@@ -1,0 +1,236 @@
+"""Sweeps and collectors on a local Ray cluster of two nodes; of its processes none listens beyond this machine."""
+
+import functools
+import importlib.util
+import shutil
+import signal
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.run_files import read_metrics, read_object
+from deepracer_exp.tracking.store import Store
+from sweeps.ray_launch import refuse_files
+
+from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, slots  # noqa: TID252
+
+pytestmark = pytest.mark.timeout(600)
+_MEMORY = 80 * 2**20
+"""Bytes of shared memory a node has for objects."""
+_TINY = ("train", "experiment=tiny", "tracking=off", "collector.processes=2", "report=false")
+_CLOCKS = ("wall_clock_s", "_s", "steps_per_s")
+
+
+class TwoNodes:
+    """A head and a node that can be killed; each has room for one worker and a half."""
+
+    def __init__(self, folder):
+        from ray.cluster_utils import Cluster
+
+        self._options = {"num_cpus": 2, "object_store_memory": _MEMORY, "node_ip_address": "127.0.0.1"}
+        self._cluster = Cluster(
+            initialize_head=True,
+            head_node_args={
+                **self._options,
+                "include_dashboard": False,
+                "temp_dir": str(folder),
+                # A lost node is noticed after seconds, and not after half a minute.
+                "_system_config": {"health_check_period_ms": 1000, "health_check_failure_threshold": 3},
+            },
+        )
+        self.address = self._cluster.address
+        self.second()
+
+    def second(self):
+        """Return the second node, started anew if it was killed."""
+        if not self._cluster.worker_nodes:
+            self._cluster.add_node(**self._options)
+        (node,) = self._cluster.worker_nodes
+        return node
+
+    def of_the_second(self):
+        """Return the processes of the second node, and those that workers have started there."""
+        (info,) = self.second().all_processes["raylet"]
+        raylet = psutil.Process(info.process.pid)
+        return [raylet, *raylet.children(recursive=True)]
+
+    def kill_the_second(self):
+        """Let the second node be gone, as if its plug was pulled."""
+        for process in self.of_the_second():
+            process.kill()
+        self._cluster.remove_node(self.second(), allow_graceful=False)
+
+    def actors(self):
+        """Return the processes of actors of any node."""
+        return [
+            one
+            for one in psutil.process_iter(["cmdline"])
+            if "ray::Place" in " ".join(one.info["cmdline"] or ())
+        ]
+
+    def shutdown(self):
+        self._cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def two_nodes():
+    pytest.importorskip("ray")
+    # Not below pytest's folder: the name of a socket may have a hundred characters.
+    folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))
+    with pytest.MonkeyPatch.context() as patch:
+        # The only way to let Ray on Linux stay with 127.0.0.1.
+        patch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        nodes = TwoNodes(folder)
+        patch.setenv("RAY_ADDRESS", nodes.address)
+        yield nodes
+        nodes.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.mark.slow
+def test_a_sweep_goes_on_when_a_node_is_gone(two_nodes, start, tmp_path):
+    running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
+
+    def held_by_the_second():
+        if not known(tmp_path):
+            return None
+        pids = {process.pid for process in two_nodes.of_the_second()}
+        held = [slot for slot in slots(tmp_path) if slot.state == "claimed" and slot.progress]
+        return next((slot for slot in held if int(slot.owner.split(":")[-2]) in pids), None)
+
+    lost = wait_for(running, held_by_the_second, "trial on the second node")
+    two_nodes.kill_the_second()
+    ended = running.end(240)
+    assert ended.code == 0, ended.stderr
+    assert_every_trial_is_accounted_for_once(tmp_path)
+    assert next(slot for slot in slots(tmp_path) if slot.slot == lost.slot).attempt > 1
+    assert not two_nodes.actors()
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_go_on(two_nodes, start, tmp_path):
+    two_nodes.second()
+    running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
+    wait_for(running, lambda: known(tmp_path) and any(slot.progress for slot in slots(tmp_path)), "trial")
+    running.popen.send_signal(signal.SIGINT)
+    assert running.end(240).code == 130
+    assert not two_nodes.actors()
+    assert all(slot.expired or slot.outcome for slot in slots(tmp_path))
+    assert start("sweep", "study=s", "sweep.workers=2").end(240).code == 0
+    assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+def wait_for(running, condition, what):
+    """Wait longer than other tests do: three processes import PyTorch one after the other."""
+    until = time.monotonic() + 280.0
+    while not (value := condition()):
+        said = (running.cwd / "stderr.txt").read_text()
+        assert time.monotonic() < until, f"no {what}: {said}"
+        assert running.popen.poll() is None, f"ended before {what}: {said}"
+        time.sleep(0.1)
+    return value
+
+
+def known(cwd):
+    return (cwd / "runs" / "sweeps.db").exists()
+
+
+@pytest.mark.usefixtures("two_nodes")
+def test_cars_on_a_cluster_drive_as_those_of_processes_on_one_machine(run_at, call, tmp_path):
+    folders = []
+    # The first one in a process of its own: this one may have imported Ray before its variables were set.
+    for collector, run in (("ray", functools.partial(run_at, tmp_path)), ("sync", call)):
+        ended = run(*_TINY, f"collector={collector}", f"name={collector}")
+        assert ended.code == 0, ended.stderr
+        folders += (tmp_path / "runs" / collector).iterdir()
+    on_cluster, here = (read_metrics(folder / "metrics.jsonl") for folder in folders)
+    assert [without_clocks(row) for row in on_cluster] == [without_clocks(row) for row in here]
+
+
+def without_clocks(row):
+    return {key: value for key, value in row.items() if not key.endswith(_CLOCKS) or "lap" in key}
+
+
+@pytest.mark.slow
+def test_what_a_reward_function_says_and_does_wrong_far_away_is_in_the_run_folder(
+    two_nodes, run_at, tmp_path
+):
+    two_nodes.second()
+    (tmp_path / "mine.py").write_text(
+        "def reward_function(params):\n"
+        "    if params['steps'] == 3:\n        print('third')\n"
+        "    return 1.0 if params['steps'] < 40 else params['no_such_parameter']\n"
+    )
+    ended = run_at(tmp_path, *_TINY, "collector=ray", "reward.file=mine.py")
+    ended.assert_run_failed("no_such_parameter")
+    assert "third" in (ended.folder / "reward_prints.log").read_text()
+    (fault, *_) = ended.folder.glob("faults/worker-*.json")
+    assert read_object(fault)["params"]["steps"] >= 40
+
+
+@pytest.mark.slow
+def test_a_collector_that_is_killed_far_away_is_named(two_nodes, start, tmp_path):
+    two_nodes.second()
+    running = start(*_TINY, "collector=ray", "budget.env_steps=100000000")
+    wait_for(running, lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration")
+    next(
+        one for one in psutil.process_iter(["cmdline"]) if "ray::Cars" in " ".join(one.info["cmdline"] or ())
+    ).kill()
+    running.end(240).assert_run_failed("collector worker", "is lost")
+
+
+def test_without_ray_the_extra_is_named(call, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *more: None if name == "ray" else found(name, *more)
+    )
+    call(*_TINY, "collector=ray").assert_bad_input("collector=ray", "pip install 'deepracer-exp[ray]'")
+
+
+def test_a_cluster_that_does_not_answer_is_refused_before_anything_is_made(call, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    ended = call(*SWEEP, "sweep/executor=ray", "sweep.executor.address=127.0.0.1:1")
+    ended.assert_bad_input("no Ray cluster at 127.0.0.1:1", "ray start --head")
+    assert not (ended.cwd / "runs" / "sweeps.db").exists()
+
+
+@pytest.mark.slow
+def test_a_cluster_without_room_is_refused(two_nodes, run_at, tmp_path):
+    more = "sweep.executor.cpus_per_worker=64"
+    ended = run_at(tmp_path, *SWEEP, "sweep/executor=ray", more)
+    ended.assert_bad_input("no node of the Ray cluster has as many", more)
+    ended = run_at(tmp_path, *_TINY, "collector=ray", "collector.processes=64")
+    ended.assert_bad_input("collector.processes=64", "has room for")
+
+
+def test_the_number_of_processes_on_a_cluster_must_be_given(call):
+    call("train", "collector=ray", "collector.processes=null").assert_bad_input(
+        "give the number of processes"
+    )
+
+
+@pytest.mark.parametrize(
+    ("storage", "store", "word"),
+    [
+        (None, None, "sweep.storage=null: a file"),
+        ("sqlite:////tmp/x.db", None, "postgresql+psycopg://"),
+        ("postgresql+psycopg://me@host/name", Store("sqlite:////tmp/m.db", None), "tracking.uri"),
+    ],
+)
+def test_files_are_no_databases_for_several_machines(tmp_path, storage, store, word):
+    with pytest.raises(BadInput, match="2 machines") as error:
+        refuse_files(storage, tmp_path, store, ["10.0.0.1", "10.0.0.2"])
+    assert word in str(error.value)
+    refuse_files(storage, tmp_path, store, ["10.0.0.1"])
+
+
+def test_servers_are_databases_for_several_machines(tmp_path):
+    url = "postgresql+psycopg://me@host/name"
+    refuse_files(url, tmp_path, Store("http://host:5000", None), ["10.0.0.1", "10.0.0.2"])
+    refuse_files(url, tmp_path, None, ["10.0.0.1", "10.0.0.2"])
