@@ -1,0 +1,396 @@
+"""What pruning by entropy saves a sweep, and what it costs, beside Optuna's pruners.
+
+    python -m benchmarks.sweep [--trials 60] [--workers 2] [--reuse DIR] [--json FILE] [OVERRIDE...]
+
+1. `deepracer-exp sweep sweep=lr_entropy track=reinvent_base` really runs, with its defaults (MLflow included).
+2. Its trials are trained once more without pruning, in the same order: the same overrides and seeds, the whole budget.
+3. Median and Hyperband, as `sweep.pruners=[median]` and `[hyperband]` set them up, are replayed on these whole runs.
+4. The winner of each drives fresh laps that have chosen nobody (`benchmarks.fresh`): of these are all lap times told.
+
+Why replaying is exact. Collection in the trial's own process is deterministic, so that a pruned training is the
+beginning of the whole one. This is checked on each trial of the real sweep: its rows of metrics.jsonl must be those of
+the whole run up to its end, what it told Optuna what the whole run tells, and a trial that used its budget must be
+worth the same; else the benchmark fails. A pruner knows nothing of a trial but the values that it reports
+(`sweeps.score`) and their steps; they are read from the rows of the whole run and told to a fresh study in memory, one
+by one, and where the pruner says so the trial ends. Which values are there to compare with depends on who is how far:
+workers are modelled as equally fast, a step and a trial taking as long as they took in the sweep on average. Two things
+are not replayed: what the sampler would have drawn after another pruner's verdicts (all get the same trials), and time:
+rivals' `minutes` follow from the model, only the sweep's own are measured.
+
+Winners are chosen as the sweep does it: of the `sweep.rerank` complete trials with the best values the one that does
+best on `sweep.rerank_laps` more laps. For the sweep itself this must come to the winner that it has told.
+
+- `minutes`, `trials_per_hour`, `env_steps`, `steps_by_fate`, `trials_by_fate`;
+- `steps_saved`: share of the control steps without pruning that need not have been driven;
+- `lap_time_loss`: how much slower the winner's mean lap is than that of the winner without pruning, as a share;
+- `best`: its trial, its value (the race score in seconds) in the sweep and on the re-ranking's laps, and its laps;
+- `rivals`: the same of `no_pruning`, `median` and `hyperband`; each with `at_equal_steps`, the winners of both among
+  what was found when as many steps were driven as the more frugal one needed for all trials, and how much slower
+  the sweep's winner is then (`lap_time_loss`, below zero: faster).
+
+`--reuse DIR` leaves everything in DIR (200 MB a trial, mostly traces), goes on with a sweep that was interrupted and
+takes the runs that it finds finished. `minutes` is the time of all starts of the sweep then; `starts` counts them.
+"""
+
+import argparse
+import collections
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import optuna
+import torch
+from optuna.pruners import NopPruner
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.sweep import Pruner, SweepConfig, compose_sweep
+from sweeps.best import best_trial, cost
+from sweeps.launch import LocalLauncher
+from sweeps.pruners import build_pruner
+from sweeps.rerank import fresh
+from sweeps.storage import open_storage
+from sweeps.study import load_study
+
+from .command import at_once
+from .fresh import TRIALS, Driven, drive
+from .pruning_replay import Course, Ended, Pace, found_within, makespan_s, replay
+from .report import number, table, write_json
+from .stopping import lap_time_loss, percent
+from .sweep_runs import (
+    course_of,
+    full_overrides,
+    full_run,
+    hold_against,
+    pace_of,
+    refuse_others,
+    score,
+    started,
+)
+
+READY = ("sweep=lr_entropy", "track=reinvent_base")
+OWN, NO_PRUNING = "sweep", "no_pruning"
+RIVALS: tuple[Pruner, ...] = ("median", "hyperband")
+WANTED = {
+    "trials_per_hour": 90,
+    "steps_saved": 0.5,
+    "lap_time_loss": 0.02,
+    "lap_time_loss_at_equal_steps": 0.0,
+}
+"""60 trials in 40 minutes and half of the steps, at least; the losses at most."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A way to make the trials, and what became of them."""
+
+    ended: Sequence[Ended]
+    minutes: float
+    runs: dict[int, Path]
+    """By number of the trial."""
+
+
+def winner_of(found: Sequence[Ended], objective: str, rerank: int, again: Callable[[Ended], float]) -> Ended:
+    """Return the winner as a sweep chooses it.
+
+    Args:
+        found: trials that are worth something.
+        objective: of their values.
+        rerank: how many of the best are put to another test.
+        again: that test.
+
+    Raises:
+        SystemExit: there is none.
+    """
+    if not found:
+        raise SystemExit("no trial was complete: there is no winner to compare")
+    first = sorted(found, key=lambda one: (cost([objective], [one.value or 0.0]), one.number))
+    return min(first[:rerank], key=lambda one: cost([objective], [again(one)])) if rerank else first[0]
+
+
+def steps_by_fate(ended: Sequence[Ended]) -> dict[str, int]:
+    """Return the control steps of the trials by how they ended."""
+    steps: dict[str, int] = collections.defaultdict(int)
+    for one in ended:
+        steps[one.fate] += one.env_steps
+    return dict(sorted(steps.items()))
+
+
+def figures(ended: Sequence[Ended], minutes: float, unpruned: Sequence[Ended]) -> dict[str, Any]:
+    """Return what a way to make the trials came to, without its laps.
+
+    Args:
+        ended: its trials.
+        minutes: that it took.
+        unpruned: the same trials, nobody pruning.
+    """
+    steps, every = (sum(one.env_steps for one in each) for each in (ended, unpruned))
+    return {
+        "minutes": round(minutes, 2),
+        "trials_per_hour": round(60 * len(ended) / minutes, 1),
+        "env_steps": steps,
+        "steps_by_fate": steps_by_fate(ended),
+        "trials_by_fate": dict(sorted(collections.Counter(one.fate for one in ended).items())),
+        "steps_saved": round(1 - steps / every, 4),
+    }
+
+
+def held(result: dict[str, Any]) -> dict[str, bool]:
+    """Return what came out as wanted; a winner without a lap has not."""
+
+    def at_most(loss: float | None, most: float) -> bool:
+        return loss is not None and loss <= most
+
+    equal = [result["rivals"][rival]["at_equal_steps"]["lap_time_loss"] for rival in RIVALS]
+    return {
+        "trials_per_hour": result["trials_per_hour"] >= WANTED["trials_per_hour"],
+        "steps_saved": result["steps_saved"] >= WANTED["steps_saved"],
+        "lap_time_loss": at_most(result["lap_time_loss"], WANTED["lap_time_loss"]),
+        "lap_time_loss_at_equal_steps": all(
+            at_most(loss, WANTED["lap_time_loss_at_equal_steps"]) for loss in equal
+        ),
+    }
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """Return the table of the sweep and its rivals, and that of the steps by fate."""
+    ways = {OWN: result, **result["rivals"]}
+    head = (
+        "pruning",
+        "minutes",
+        "trials/h",
+        "steps (M)",
+        "saved",
+        "winner",
+        "value",
+        "lap (s)",
+        "laps done",
+        "loss",
+    )
+    rows = []
+    for name, one in ways.items():
+        equal, best = one.get("at_equal_steps"), one["best"]
+        rows.append(
+            (
+                name.replace("_", " "),
+                number(one["minutes"], 1),
+                number(one["trials_per_hour"]),
+                number(one["env_steps"] / 1e6, 2),
+                percent(one["steps_saved"]),
+                str(best["trial"]),
+                number(best["value_again"], 2),
+                number(best["lap_time_s"], 2),
+                percent(best["lap_share"]),
+                percent(one["lap_time_loss"], 1),
+                "-" if equal is None else number(equal["env_steps"] / 1e6, 2),
+                "-" if equal is None else number(equal["lap_time_s"], 2),
+                "-" if equal is None else number(equal["sweep_lap_time_s"], 2),
+            )
+        )
+    fates = sorted({fate for one in ways.values() for fate in one["steps_by_fate"]})
+    spent = [
+        (
+            name.replace("_", " "),
+            *(
+                f"{one['trials_by_fate'].get(f, 0)}: {one['steps_by_fate'].get(f, 0) / 1e6:.2f} M"
+                for f in fates
+            ),
+        )
+        for name, one in ways.items()
+    ]
+    at_equal = ("at steps (M)", "its lap (s)", "the sweep's (s)")
+    return f"{table((*head, *at_equal), rows)}\n\n{table(('trials: steps', *fates), spent)}"
+
+
+def contenders(
+    trials: Sequence[FrozenTrial],
+    courses: Sequence[Course],
+    config: SweepConfig,
+    measured_s: float,
+    runs: tuple[dict[int, Path], dict[int, Path]],
+    direction: StudyDirection,
+    study_name: str,
+) -> tuple[dict[str, Contender], Pace]:
+    """Return all ways to make the trials, the sweep's own first, and the pace of all.
+
+    Args:
+        trials: of the sweep.
+        courses: their whole runs.
+        config: of the sweep.
+        measured_s: that the sweep took.
+        runs: of the sweep, and the whole ones.
+        direction: of the values.
+        study_name: of the sweep.
+    """
+    pace, workers = pace_of(trials), config.workers or 1
+    again = partial(replay, pace=pace, workers=workers, direction=direction, study_name=study_name)
+    own = [
+        Course(
+            number=trial.number,
+            points=(),
+            env_steps=trial.user_attrs["env_steps"],
+            fate=trial.user_attrs["fate"],
+            value=trial.values[0] if trial.state == TrialState.COMPLETE else None,
+        )
+        for trial in trials
+    ]
+    evaluations = max(len(course.points) for course in courses) or None
+    ended = {OWN: again(own, NopPruner(), ""), NO_PRUNING: again(courses, NopPruner(), "")}
+    for name in RIVALS:
+        pruner = build_pruner(replace(config, pruners=(name,)), evaluations)
+        ended[name] = again(courses, pruner, name)
+    # Start, re-ranking and page, and what the model of the workers does not tell.
+    besides_s = max(measured_s - makespan_s(ended[OWN]), 0.0)
+    return {
+        name: Contender(
+            each,
+            (measured_s if name == OWN else makespan_s(each) + besides_s) / 60,
+            runs[0] if name == OWN else runs[1],
+        )
+        for name, each in ended.items()
+    }, pace
+
+
+def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Make in `folder` what is not there yet, and measure."""
+    torch.set_num_threads(1)
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    overrides = [*READY, *options.overrides]
+    overrides += [f"sweep.trials={options.trials}", f"sweep.workers={options.workers}"]
+    request = compose_sweep(overrides)
+    refuse_others(request)
+    config = request.entry.sweep
+    (objective,) = config.objectives
+    protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
+    noted = started(overrides, folder)
+    study = load_study(request.study, open_storage(config.storage, folder / "runs"))
+    # Without those whose worker was killed before they were anybody's.
+    trials = [trial for trial in study.get_trials(deepcopy=False) if "runs" in trial.user_attrs]
+    places = {
+        trial.number: folder / "runs" / request.study / Path(trial.user_attrs["run_dir"] or "").name
+        for trial in trials
+    }
+    threads = LocalLauncher(config.workers).cores
+    wholes = at_once(
+        options.workers,
+        [
+            partial(
+                full_run,
+                folder / "full" / f"{trial.number:03d}",
+                full_overrides(trial.user_attrs["overrides"], threads),
+            )
+            for trial in trials
+        ],
+    )
+    courses = []
+    for trial, whole in zip(trials, wholes, strict=True):
+        courses.append(course_of(trial.number, whole, objective, protocol))
+        hold_against(trial, places[trial.number], whole, courses[-1])
+    fulls = dict(zip(places, wholes, strict=True))
+    ways, pace = contenders(
+        trials, courses, config, noted["seconds"], (places, fulls), study.direction, request.study
+    )
+    result = compared(ways, pace, config, protocol, options.laps)
+    told = best_trial(study).number
+    if result["best"]["trial"] != told:
+        raise SystemExit(
+            f"the sweep says that trial {told} has won, this benchmark {result['best']['trial']}"
+        )
+    return {
+        **result,
+        "wanted": WANTED,
+        "held": held(result),
+        "trials": len(trials),
+        "workers": options.workers,
+        "starts": noted["starts"],
+        "overrides": overrides,
+        "laps": options.laps,
+        "pace": asdict(pace),
+        "ended": {name: [asdict(one) for one in way.ended] for name, way in ways.items()},
+    }
+
+
+def compared(
+    ways: dict[str, Contender], pace: Pace, config: SweepConfig, protocol: EvaluationConfig, laps: int
+) -> dict[str, Any]:
+    """Return the figures of all ways, with the laps of their winners."""
+    (objective,) = config.objectives
+    test = fresh(protocol, config.rerank_laps)
+    driven: dict[Path, Driven] = {}
+
+    def best(way: Contender, found: Sequence[Ended]) -> tuple[Ended, Driven]:
+        won = winner_of(
+            found, objective, config.rerank, lambda one: score(way.runs[one.number], objective, test)
+        )
+        run = way.runs[won.number]
+        if run not in driven:
+            checkpoint = "best" if (run / "checkpoints" / "best").exists() else "last"
+            (driven[run],) = drive(run, [checkpoint], laps)
+        return won, driven[run]
+
+    unpruned = ways[NO_PRUNING]
+    every = {
+        name: best(way, [one for one in way.ended if one.value is not None]) for name, way in ways.items()
+    }
+    told: dict[str, dict[str, Any]] = {}
+    for name, way in ways.items():
+        won, laps_of = every[name]
+        told[name] = {
+            **figures(way.ended, way.minutes, unpruned.ended),
+            "lap_time_loss": lap_time_loss(laps_of, every[NO_PRUNING][1]),
+            "best": {
+                "trial": won.number,
+                "value": won.value,
+                "value_again": score(way.runs[won.number], objective, test),
+                **asdict(laps_of),
+            },
+        }
+        if name == OWN:
+            continue
+        steps = min(told[OWN]["env_steps"], told[name]["env_steps"])
+        pairs = [found_within(each.ended, steps, pace) for each in (way, ways[OWN])]
+        if not all(pairs):
+            told[name]["at_equal_steps"] = {"env_steps": steps, "lap_time_s": None, "sweep_lap_time_s": None}
+            told[name]["at_equal_steps"]["lap_time_loss"] = None
+            continue
+        (rival, rivals), (mine, own) = best(way, pairs[0]), best(ways[OWN], pairs[1])
+        told[name]["at_equal_steps"] = {
+            "env_steps": steps,
+            "trial": rival.number,
+            "lap_time_s": rivals.lap_time_s,
+            "sweep_trial": mine.number,
+            "sweep_lap_time_s": own.lap_time_s,
+            "lap_time_loss": lap_time_loss(own, rivals),
+        }
+    return {**told.pop(OWN), "rivals": told}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sweep"
+    )
+    parser.add_argument("--trials", type=int, default=60, help="of the sweep")
+    parser.add_argument("--workers", type=int, default=2, help="of the sweep, and whole trainings at once")
+    parser.add_argument("--laps", type=int, default=TRIALS, help="that each winner drives anew")
+    parser.add_argument(
+        "--reuse", type=Path, metavar="DIR", help="keep everything here, and go on with what is there"
+    )
+    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp sweep")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as temporary:
+        result = benchmark(options, (options.reuse or Path(temporary)).resolve())
+    write_json(options.json, result)
+    print(f"\n{markdown(result)}\n\nwanted: {WANTED}\nheld: {result['held']}")
+    print(json.dumps({key: value for key, value in result.items() if key != "ended"}))
+
+
+if __name__ == "__main__":
+    main()

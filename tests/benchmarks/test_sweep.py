@@ -1,0 +1,225 @@
+"""The benchmark of sweeps counts what it says."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
+from optuna.trial import FrozenTrial, TrialState, create_trial
+
+from benchmarks import sweep, sweep_runs
+from benchmarks.pruning_replay import Course, Ended, Pace, found_within, makespan_s, replay, steps_until
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from deepracer_exp.config.sweep import compose_sweep
+
+PACE = Pace(step_s=0.01, trial_s=5.0)
+STEPS = 1000
+
+
+def course(
+    number: int, values: Sequence[float], value: float | None = None, fate: str = "finished"
+) -> Course:
+    """A trial that is evaluated every 1,000 steps, and ends with its last evaluation."""
+    points = tuple((STEPS * place, one) for place, one in enumerate(values, 1))
+    worth = None if fate == "failed" else min(values) if value is None else value
+    return Course(number=number, points=points, env_steps=STEPS * len(values), fate=fate, value=worth)
+
+
+def ended(
+    number: int, env_steps: int, value: float | None, fate: str = "finished", began_s: float = 0.0
+) -> Ended:
+    return Ended(
+        number=number,
+        fate=fate,
+        env_steps=env_steps,
+        value=value,
+        began_s=began_s,
+        ended_s=began_s + env_steps * PACE.step_s + PACE.trial_s,
+    )
+
+
+def test_without_a_pruner_every_trial_comes_to_its_own_end_and_workers_take_the_next_when_they_are_free() -> (
+    None
+):
+    courses = [course(0, [9.0] * 4), course(1, [8.0]), course(2, [7.0] * 2), course(3, [6.0], fate="failed")]
+    found = replay(courses, NopPruner(), "pruned", pace=PACE, workers=2)
+    assert [one.env_steps for one in found] == [4000, 1000, 2000, 1000]
+    assert [one.fate for one in found] == ["finished"] * 3 + ["failed"]
+    assert [one.value for one in found] == [9.0, 8.0, 7.0, None]
+    # 45, 15, 25 and 15 seconds: the second worker makes trials 1 and 2, and is free for 3 when the first one is not.
+    assert [(one.began_s, one.ended_s) for one in found] == [(0, 45), (0, 15), (15, 40), (40, 55)]
+    assert makespan_s(found) == 55
+
+
+def test_the_median_ends_what_is_worse_than_the_median_of_the_complete_trials_at_the_same_step() -> None:
+    courses = [
+        course(0, [10.0, 8.0, 6.0]),
+        course(1, [12.0, 10.0, 8.0]),
+        course(
+            2, [14.0, 9.5, 5.0], 4.0
+        ),  # worse at first, before the warm-up is over; the median is 9 at step 2
+        course(3, [11.0, 8.5, 7.5]),  # 8.5 is better than 9; 7.5 is not better than the median of 6 and 8
+        course(4, [9.0, 7.0, 5.5]),
+    ]
+    pruner = MedianPruner(n_startup_trials=2, n_warmup_steps=2)
+    found = replay(courses, pruner, "median", pace=PACE, workers=1)
+    assert [one.fate for one in found] == ["finished", "finished", "median", "median", "finished"]
+    assert [one.env_steps for one in found] == [3000, 3000, 2000, 3000, 3000]
+    assert [one.value for one in found] == [6.0, 8.0, None, None, 5.5]
+    assert found[3].began_s == found[2].ended_s == 35 + 35 + 25
+
+
+def test_a_trial_is_compared_with_those_only_that_are_complete_by_then() -> None:
+    courses = [course(0, [5.0, 5.0, 5.0]), course(1, [9.0, 9.0, 9.0]), course(2, [9.0, 9.0, 9.0])]
+    pruner = MedianPruner(n_startup_trials=1, n_warmup_steps=1)
+    one_by_one = replay(courses, pruner, "median", pace=PACE, workers=1)
+    assert [one.env_steps for one in one_by_one] == [3000, 1000, 1000]
+    # Two at once: nothing is complete while the second one runs; the third one is held against both.
+    at_once = replay(courses, pruner, "median", pace=PACE, workers=2)
+    assert [one.env_steps for one in at_once] == [3000, 3000, 1000]
+
+
+def test_hyperband_lets_a_third_of_a_rung_go_on() -> None:
+    courses = [course(number, [value] * 3) for number, value in enumerate([5.0, 6.0, 7.0, 4.0, 4.5])]
+    pruner = HyperbandPruner(
+        min_resource=1, max_resource=2, reduction_factor=3
+    )  # one bracket: 1, 3, 9 evaluations
+    found = replay(courses, pruner, "hyperband", pace=PACE, workers=1)
+    # The first is alone at its rung; each new best of a third goes on.
+    assert [one.env_steps for one in found] == [3000, 1000, 1000, 3000, 1000]
+    assert [one.fate for one in found] == ["finished", "hyperband", "hyperband", "finished", "hyperband"]
+
+
+def test_equal_steps_are_those_of_all_workers_together() -> None:
+    found = [ended(0, 1000, 9.0), ended(1, 3000, 8.0), ended(2, 2000, 7.0, began_s=15.0), ended(3, 500, None)]
+    assert steps_until(found, 10.0, PACE) == 1000 + 1000 + 0 + 500
+    # Trial 0 ends after 15 s: it and trial 1 have driven 1,000 and 1,500 steps, and trial 3 its 500.
+    assert [one.number for one in found_within(found, 2999, PACE)] == []
+    assert [one.number for one in found_within(found, 3000, PACE)] == [0]
+    assert [one.number for one in found_within(found, 6500, PACE)] == [0, 1, 2]
+
+
+def test_steps_are_saved_against_the_same_trials_without_pruning() -> None:
+    unpruned = [ended(number, 4000, 9.0) for number in range(4)]
+    pruned = [ended(0, 4000, 9.0), ended(1, 1000, None, "collapsed"), ended(2, 2500, 8.0, "converged")]
+    pruned.append(ended(3, 500, None, "collapsed"))
+    found = sweep.figures(pruned, 12.0, unpruned)
+    assert found["steps_saved"] == 0.5
+    assert found["steps_by_fate"] == {"collapsed": 1500, "converged": 2500, "finished": 4000}
+    assert found["trials_by_fate"] == {"collapsed": 2, "converged": 1, "finished": 1}
+    assert (found["env_steps"], found["trials_per_hour"]) == (8000, 20)
+    assert sweep.figures(unpruned, 12.0, unpruned)["steps_saved"] == 0
+
+
+def test_the_winner_is_the_best_of_the_first_on_more_laps() -> None:
+    found = [ended(0, 1, 9.0), ended(1, 1, 8.0), ended(2, 1, 8.0), ended(3, 1, 12.0)]
+    again = {0: 8.5, 1: 9.5, 2: 9.0, 3: 1.0}
+    asked = []
+
+    def drive(one: Ended) -> float:
+        asked.append(one.number)
+        return again[one.number]
+
+    assert sweep.winner_of(found, "race_score", 3, drive).number == 0
+    assert asked == [1, 2, 0]
+    assert sweep.winner_of(found, "race_score", 0, drive).number == 1
+    assert sweep.winner_of(found, "completion", 1, drive).number == 3
+    with pytest.raises(SystemExit, match="no trial was complete"):
+        sweep.winner_of([], "race_score", 3, drive)
+
+
+def test_a_trial_that_is_not_the_beginning_of_its_whole_run_is_refused() -> None:
+    full = [
+        {"iteration": number, "completion": number / 3, "wall_clock_s": number} for number in range(1, 10)
+    ]
+    slower = [row | {"wall_clock_s": 99.0} for row in full[:5]]
+    sweep_runs.refuse_another_beginning(7, slower, full, "converged")
+    sweep_runs.refuse_another_beginning(7, [*slower, *full[5:]], full, "finished")
+    for rows, fate, words in (
+        ([*slower[:4], slower[4] | {"completion": 1.7}], "collapsed", "row 5: completion"),
+        ([*full, full[-1]], "converged", "9 and 10 rows"),
+        (slower, "finished", "9 and 5 rows"),
+    ):
+        with pytest.raises(
+            SystemExit, match=f"trial 7 .{fate}.: is not the beginning of its whole run: {words}"
+        ):
+            sweep_runs.refuse_another_beginning(7, rows, full, fate)
+
+
+def test_a_trial_that_told_optuna_something_else_than_its_whole_run_is_refused() -> None:
+    whole = course(0, [12.0, 10.0, 9.0, 8.0])
+
+    def trial(reports: dict[int, float]) -> FrozenTrial:
+        attrs = {"env_steps": 2500}
+        return create_trial(state=TrialState.PRUNED, intermediate_values=reports, user_attrs=attrs)
+
+    sweep_runs.refuse_other_reports(trial({1: 12.0, 2: 10.0}), whole)
+    for reports in ({1: 12.0}, {1: 12.0, 2: 10.5}, {1: 12.0, 2: 10.0, 3: 9.0}):
+        with pytest.raises(SystemExit, match="told Optuna"):
+            sweep_runs.refuse_other_reports(trial(reports), whole)
+
+
+def test_the_pace_is_that_of_all_steps_and_of_the_usual_trial() -> None:
+    def trial(env_steps: int, wall_clock_s: float, took_s: float) -> FrozenTrial:
+        run = {"env_steps": env_steps, "wall_clock_s": wall_clock_s, "took_s": took_s}
+        return create_trial(value=1.0, user_attrs={"runs": [run]})
+
+    failed = create_trial(state=TrialState.FAIL, user_attrs={"runs": [{"env_steps": 0, "wall_clock_s": 0.0}]})
+    found = sweep_runs.pace_of(
+        [trial(1000, 10.0, 14.0), trial(3000, 20.0, 26.0), trial(2000, 30.0, 20.0), failed]
+    )
+    assert found == Pace(step_s=0.01, trial_s=4.0)
+
+
+def test_a_whole_run_tells_what_the_sweep_would_report_at_each_evaluation(
+    trained: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trained("budget.iterations=5", "budget.env_steps=null", "checkpoints.every=2").folder
+    config = compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation
+    monkeypatch.setattr(sweep_runs, "score", lambda *_: 12.5)
+    found = sweep_runs.course_of(3, run, "completion", config)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert found.points == tuple((rows[at]["env_steps"], rows[at]["eval_completion"]) for at in (1, 3))
+    assert (found.number, found.env_steps, found.fate, found.value) == (3, 5 * 1024, "finished", 12.5)
+
+
+def test_the_whole_run_is_told_what_the_trial_was_told_save_for_what_ends_it() -> None:
+    told = ["collector=in_process", "stopping.converged.patience=40", "tracking=off", "algorithm.lr=0.001"]
+    overrides = sweep_runs.full_overrides(told, 2)
+    assert overrides[:2] == ["collector=in_process", "algorithm.lr=0.001"]
+    experiment, _ = compose_experiment(overrides)
+    assert (experiment.stopping.kind, experiment.collector.threads) == ("none", 2)
+    kept = sweep_runs.full_overrides([*told, "collector.threads=3"], 2)
+    assert compose_experiment(kept)[0].collector.threads == 3
+
+
+def test_the_sweep_of_the_benchmark_is_one_that_it_can_measure_and_others_are_refused() -> None:
+    sweep_runs.refuse_others(compose_sweep(sweep.READY))
+    for override in ("sweep.seeds=3", "parent=somebody", "sweep.objectives=[lap_time,completion]"):
+        key = override.partition("=")[0]
+        with pytest.raises(SystemExit, match=key):
+            sweep_runs.refuse_others(compose_sweep([*sweep.READY, override]))
+
+
+def test_a_sweep_that_was_made_is_not_begun_again_and_another_one_is_refused(tmp_path: Path) -> None:
+    noted = {"overrides": ["a=1"], "seconds": 90.0, "starts": 2, "done": True}
+    (tmp_path / "sweep_started.json").write_text(json.dumps(noted))
+    assert sweep_runs.started(["a=1"], tmp_path) == noted
+    with pytest.raises(SystemExit, match="has the sweep a=1"):
+        sweep_runs.started(["a=2"], tmp_path)
+
+
+def test_what_is_wanted_is_held_only_with_laps_and_by_every_rival() -> None:
+    def rival(loss: float | None) -> dict[str, Any]:
+        return {"at_equal_steps": {"lap_time_loss": loss}}
+
+    good: dict[str, Any] = {"trials_per_hour": 90.0, "steps_saved": 0.5, "lap_time_loss": -0.01}
+    good["rivals"] = {"median": rival(0.0), "hyperband": rival(-0.1)}
+    assert all(sweep.held(good).values())
+    for key, value in (("trials_per_hour", 89.0), ("steps_saved", 0.49), ("lap_time_loss", None)):
+        assert [name for name, held in sweep.held(good | {key: value}).items() if not held] == [key]
+    for loss in (0.001, None):
+        worse = good | {"rivals": good["rivals"] | {"hyperband": rival(loss)}}
+        assert not sweep.held(worse)["lap_time_loss_at_equal_steps"]
