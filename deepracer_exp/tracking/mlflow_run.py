@@ -14,8 +14,9 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from .names import END_TAG, EXPERIMENT_TAGS
+from .names import END_TAG, EXPERIMENT_TAGS, PARENT
 from .points import Point
+from .registry import pages
 from .store import Store
 from .tracking_file import Told
 
@@ -172,6 +173,23 @@ class MLflowRun:
                 chunk = [RunTag(key, value[:MAX_TAG_VAL_LENGTH]) for key, value in some]
                 self._client.log_batch(self.run_id, tags=chunk)
 
+    def set_experiment_tags(self, tags: Mapping[str, str]) -> None:
+        """Write tags of the experiment that the run is in."""
+        with _told_apart():
+            experiment_id = self._client.get_run(self.run_id).info.experiment_id
+            for key, value in tags.items():
+                self._client.set_experiment_tag(experiment_id, key, value)
+
+    def adopt(self, tags: Mapping[str, str], but: str) -> None:
+        """Put the runs of its experiment that have these tags, and not the tag `but`, below this one."""
+        with _told_apart():
+            experiment_id = self._client.get_run(self.run_id).info.experiment_id
+            for run in pages(
+                self._client.search_runs, experiment_ids=[experiment_id], filter_string=_with(tags)
+            ):
+                if but not in run.data.tags and PARENT not in run.data.tags:
+                    self._client.set_tag(run.info.run_id, PARENT, self.run_id)
+
     def log_artifact(self, path: Path, folder: str | None) -> None:
         """Copy a file, or all that lies in a folder, to the run's files under `folder`."""
         with _told_apart():
@@ -214,8 +232,7 @@ class MLflowRun:
         return None
 
     def _oldest(self, experiment_id: str, tags: Mapping[str, str]) -> str | None:
-        sought = " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
-        runs = self._client.search_runs([experiment_id], sought, ViewType.ACTIVE_ONLY)
+        runs = self._client.search_runs([experiment_id], _with(tags), ViewType.ACTIVE_ONLY)
         return min(((run.info.start_time, run.info.run_id) for run in runs), default=(0, None))[1]
 
     def _has(self, point: Point) -> bool:
@@ -228,6 +245,10 @@ class MLflowRun:
         if there is not None and there != value:
             self._contradicted.add((key, step))
         return there is not None
+
+
+def _with(tags: Mapping[str, str]) -> str:
+    return " and ".join(f"tags.`{key}` = '{value}'" for key, value in tags.items())
 
 
 def _create_whole(file: Path) -> None:

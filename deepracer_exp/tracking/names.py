@@ -41,6 +41,9 @@ TRACK_METRICS = ("completion", "lap_share", "best_lap_time_s", "mean_lap_time_s"
 """Metrics that a run on several tracks has of each: `completion/Oval_track`. The UI shows what stands before the
 slash as one section, so that the tracks stand beside one another."""
 
+PARENT = "mlflow.parentRunId"
+"""Tag of a run that stands below another one in the UI."""
+
 END_TAG = "end"
 """Tag of a run that has ended: how and why."""
 
@@ -67,11 +70,15 @@ _COLUMNS = (
 )
 
 
-def _view(columns: Sequence[str], **more: Any) -> dict[str, str]:
+def _view(columns: Sequence[str]) -> dict[str, str]:
     """Return the tag of an experiment that makes its runs table open with these columns, in this order."""
-    # As wide as their names; MLflow cuts them off at 100 pixels.
-    widths = {column: max(100, 44 + 8 * len(column.partition(".")[2].strip("`"))) for column in columns}
-    state = {"selectedColumns": columns, "columnOrder": columns, "columnWidths": widths, **more}
+    # Pixels; MLflow cuts names and numbers off at 100.
+    least = {"params": 180, "tags": 270}
+    widths = {}
+    for column in columns:
+        kind, _, name = column.partition(".")
+        widths[column] = max(least.get(kind, 100), 44 + 8 * len(name.strip("`")))
+    state = {"selectedColumns": columns, "columnOrder": columns, "columnWidths": widths}
     return {f"mlflow.sharedViewState.{VIEW}": json.dumps(state)}
 
 
@@ -84,27 +91,29 @@ EXPERIMENT_TAGS: Mapping[str, str] = {
 """Tags of an experiment, set when it is created."""
 
 
-def trial_metric(objective: str) -> str:
-    """Return the name of a trial's value in MLflow, which no metric of its training has."""
-    return f"trial_{objective}"
+def trial_metrics(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Return what a trial's best checkpoint came to, by objective, under names that no metric of a training has."""
+    return {_trial_metric(name): None if value is None else round(value, 3) for name, value in values.items()}
 
 
-def study_view(objectives: Sequence[str], searched: Sequence[str], run_id: str) -> dict[str, str]:
+def _trial_metric(objective: str) -> str:
+    return f"trial_{objective}" if objective == "completion" else f"trial_{objective}_s"
+
+
+def study_view(objectives: Sequence[str], searched: Sequence[str]) -> dict[str, str]:
     """Return the tag of an experiment that makes its runs table open as that of a study.
 
     Args:
         objectives: of the study; its trials' values come first.
         searched: parameters that trials differ in.
-        run_id: of the study's run, which is unfolded.
     """
-    metrics = (*map(trial_metric, objectives), "eval_lap_time_s", "eval_completion")
+    metrics = dict.fromkeys(map(_trial_metric, (*objectives, "lap_time", "completion")))
     columns = [
-        "attributes.Duration",
         *(f"metrics.`{name}`" for name in metrics),
         *(f"params.`{name}`" for name in searched[:_MOST_PARAMS]),
         f"tags.`{END_TAG}`",
     ]
-    return _view(columns, runsExpanded={run_id: True})
+    return _view(columns)
 
 
 def in_order(metrics: Mapping[str, float | None]) -> list[tuple[str, float | None]]:
@@ -150,7 +159,7 @@ def joined(names: Sequence[str], between: str = "+") -> str:
 def lineage_tags(lineage: Lineage) -> dict[str, str]:
     """Return the tags of a clone: where it comes from, and the parent it stands under in the UI."""
     tags = {f"lineage.{key}": str(value) for key, value in asdict(lineage).items() if value is not None}
-    return tags if lineage.parent_run_id is None else {**tags, "mlflow.parentRunId": lineage.parent_run_id}
+    return tags if lineage.parent_run_id is None else {**tags, PARENT: lineage.parent_run_id}
 
 
 def run_params(names: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, Scalar]:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import logging
 import re
+import shlex
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING
 from deepracer_exp.config.running import TrackingConfig, TrackingOff
 
 from .flatten import param_text
-from .names import END_TAG
+from .names import END_TAG, PARENT, study_view, trial_metrics
 from .points import now_ms, points_of
 from .store import Store, one_line, resolve_store
 from .tracking_file import Status, Told
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 STUDY, SEARCH, KIND, TRIAL = "sweep.study", "sweep.search", "sweep.kind", "sweep.trial"
 """Tags: the study's name, a hash of what it searches, `study` or `trial`, the number of the trial."""
-PARENT = "mlflow.parentRunId"
 
 _log = logging.getLogger(__name__)
 
@@ -45,9 +45,11 @@ class Progress:
     env_steps: int
     """Control steps of all trials together."""
     best_trial: int | None = None
-    """Its number, as for the four below None as long as no trial is complete."""
+    """Its number, as for the five below None as long as no trial is complete."""
     best_values: Mapping[str, float] = field(default_factory=dict)
     """By objective."""
+    best_shown: str | None = None
+    """The same in words: ``race score 9.84 s``."""
     best_line: str | None = None
     """The command that makes it."""
     lap_time_s: float | None = None
@@ -73,26 +75,38 @@ class StudyRun:
     the study goes on with its run.
     """
 
-    def __init__(self, store: Store, study: str, space: Mapping[str, str], base: Sequence[str]) -> None:
+    def __init__(
+        self,
+        store: Store,
+        study: str,
+        objectives: Sequence[str],
+        space: Mapping[str, str],
+        base: Sequence[str],
+    ) -> None:
         """Begin to create the run, or to find it.
 
         Args:
             store: where trials are recorded.
             study: its name, which is also the experiment of its runs.
+            objectives: what trials are compared by.
             space: what is searched, by key.
             base: overrides of all trials.
         """
         self._store = store
         self._told = _told_of_study(store, study, space, base)
+        self._searched = [_param_name(key) for key in space]
+        self._objectives = objectives
         self._changed = threading.Condition()
         self._progress: Progress | None = None
         self._files: dict[Path, str | None] = {}
-        self._last_step = -1
+        self._last_metrics: Mapping[str, float | None] = {}
         self._status: Status | None = None
         self._end_by = float("inf")
         self._reported = False
         self._refused: set[str] = set()
         self._ended = False
+        self._is_late = False
+        """Whether trials have begun without the id of this run."""
         self._run: MLflowRun | None = None
         self._settled = threading.Event()
         # Daemon: a store that hangs must not keep a process alive whose sweep is over.
@@ -101,7 +115,7 @@ class StudyRun:
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
         """Return MLflow's id of the run; None if the store refuses or has not answered until then."""
-        self._settled.wait(deadline_s)
+        self._is_late |= not self._settled.wait(deadline_s)
         return self.run_id
 
     @property
@@ -141,6 +155,7 @@ class StudyRun:
             return
         self._run = run
         self._settled.set()
+        self._attempt(lambda: self._show_trials(run))
         while not self._ended:
             with self._changed:
                 self._changed.wait_for(self._has_news)
@@ -162,24 +177,57 @@ class StudyRun:
         run.create_once(self._told, (STUDY, SEARCH, KIND))
         run.log_params(self._told.params)
 
+    def _show_trials(self, run: "MLflowRun") -> None:
+        self._adopt(run)
+        run.set_experiment_tags(study_view(self._objectives, self._searched))
+
+    def _adopt(self, run: "MLflowRun") -> None:
+        run.adopt({STUDY: self._told.tags[STUDY]}, but=KIND)
+
     def _write_progress(self, run: "MLflowRun") -> None:
         progress = self._progress
         if progress is None:
             return
-        tags = {"sweep.progress": str(progress), "mlflow.note.content": _note(self._told, progress)}
+        tags = {"sweep.progress": str(progress), "mlflow.note.content": self._note(progress)}
         if progress.best_trial is not None:
             tags["sweep.best_trial"] = str(progress.best_trial)
-        metrics: dict[str, float | None] = {f"best_{name}": one for name, one in progress.best_values.items()}
-        metrics |= {"eval_lap_time_s": progress.lap_time_s, "eval_completion": progress.completion}
+        metrics: dict[str, float | None] = {
+            "lap_time": progress.lap_time_s,
+            "completion": progress.completion,
+        }
+        metrics = trial_metrics({**metrics, **progress.best_values})
         metrics |= {"trials_complete": progress.complete, "trials_pruned": progress.pruned}
         metrics |= {"trials_failed": progress.failed, "sweep_env_steps": progress.env_steps}
         run.set_tags(tags)
-        if progress.ended > self._last_step:
+        if self._is_late:
+            self._adopt(run)
+        # Not once a trial: at the end the best one may be another than before.
+        if metrics != self._last_metrics:
             run.log_metrics(points_of(metrics, progress.ended, self._told.start_ms))
-            self._last_step = progress.ended
+            self._last_metrics = metrics
         with self._changed:
             if self._progress is progress:
                 self._progress = None
+
+    def _note(self, progress: Progress) -> str:
+        """Return the description above the run, Markdown."""
+        lines = [f"{progress}; {progress.env_steps:,} control steps"]
+        if progress.best_trial is not None:
+            lines.append(f"**Best: trial {progress.best_trial}**, {progress.best_shown}")
+        if progress.best_line:
+            # A long line would make the page wider than the screen.
+            command, what, *words = map(shlex.quote, shlex.split(progress.best_line))
+            line = " \\\n    ".join([f"{command} {what}", *words])
+            lines.append(f"```\n{line}\n```")
+        params = self._told.params
+        for title, keys in (
+            ("Searched", self._searched),
+            ("All trials", params.keys() - set(self._searched)),
+        ):
+            if told := [f"- `{key}`: `{value}`" for key, value in params.items() if key in keys]:
+                lines.append("\n".join([f"{title}:", "", *told]))
+        lines.append("Pictures: `sweep.html` among the artifacts.")
+        return "\n\n".join(lines)
 
     def _end(self, run: "MLflowRun") -> None:
         assert self._status is not None
@@ -218,7 +266,12 @@ class StudyRun:
 
 
 def open_study_run(
-    config: TrackingConfig, runs_dir: Path, study: str, space: Mapping[str, str], base: Sequence[str]
+    config: TrackingConfig,
+    runs_dir: Path,
+    study: str,
+    objectives: Sequence[str],
+    space: Mapping[str, str],
+    base: Sequence[str],
 ) -> StudyRun | None:
     """Begin the run of a study; None with `tracking=off`.
 
@@ -227,7 +280,7 @@ def open_study_run(
     """
     if isinstance(config, TrackingOff):
         return None
-    return StudyRun(resolve_store(config.uri, runs_dir), study, space, base)
+    return StudyRun(resolve_store(config.uri, runs_dir), study, objectives, space, base)
 
 
 def open_trial_run(
@@ -333,21 +386,10 @@ def _told_of_study(store: Store, study: str, space: Mapping[str, str], base: Seq
 
 def _params(space: Mapping[str, str], base: Sequence[str]) -> dict[str, str]:
     """Return the overrides and the expressions that are searched as parameters, by key."""
-    plain = {key.lstrip("+~"): value for key, _, value in (override.partition("=") for override in base)}
-    # What MLflow takes as a name.
-    return {
-        re.sub(r"[^A-Za-z0-9_.:/ -]", "_", key): param_text(value)
-        for key, value in (plain | dict(space)).items()
-    }
+    plain = {key: value for key, _, value in (override.partition("=") for override in base)}
+    return {_param_name(key): param_text(value) for key, value in (plain | dict(space)).items()}
 
 
-def _note(told: Told, progress: Progress) -> str:
-    """Return the description above the run, Markdown."""
-    lines = [f"{progress}, {progress.env_steps} control steps"]
-    if progress.best_trial is not None:
-        values = ", ".join(f"{name} {value:.4g}" for name, value in progress.best_values.items())
-        lines.append(f"Best: trial {progress.best_trial}, {values}")
-    if progress.best_line:
-        lines.append(f"```\n{progress.best_line}\n```")
-    searched = "\n".join(f"- `{key}`: `{value}`" for key, value in told.params.items())
-    return "\n\n".join([*lines, "What is searched, and what all trials have:", searched])
+def _param_name(key: str) -> str:
+    """Return what a run calls a key, as MLflow takes it for a name."""
+    return re.sub(r"[^A-Za-z0-9_.:/ -]", "_", key.lstrip("+~"))

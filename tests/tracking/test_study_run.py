@@ -1,3 +1,4 @@
+import json
 import threading
 
 import pytest
@@ -5,6 +6,7 @@ from mlflow import MlflowClient
 
 from deepracer_exp.config.running import TrackingOff
 from deepracer_exp.tracking.mlflow_run import MLflowRun, StoreUnavailableError
+from deepracer_exp.tracking.names import VIEW
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.study_run import (
     Progress,
@@ -28,7 +30,12 @@ def progress(ended=3, **changes) -> Progress:
         "env_steps": 12_000,
         "best_trial": 7,
     }
-    told |= {"best_values": {"race_score": 9.5}, "best_line": "deepracer-exp train a=1", "lap_time_s": 9.4}
+    told |= {
+        "best_values": {"race_score": 9.5},
+        "best_shown": "race score 9.50 s",
+        "best_line": "deepracer-exp train a=1",
+        "lap_time_s": 9.4,
+    }
     return Progress(**(told | {"completion": 98.0} | changes))
 
 
@@ -38,7 +45,7 @@ def runs_of(store: Store, name="spring"):
 
 
 def test_the_run_of_a_study_tells_its_search_its_progress_and_its_best(store, tmp_path):
-    run = StudyRun(store, "spring", SPACE, BASE)
+    run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     run_id = run.wait_for_id(60)
     run.update(progress())
     report = tmp_path / "report.html"
@@ -50,41 +57,89 @@ def test_the_run_of_a_study_tells_its_search_its_progress_and_its_best(store, tm
     assert found.data.params == {**SPACE, "track": "reinvent_base", "reward.constants.X": "a<b"}
     assert found.data.tags["sweep.progress"] == "3 of 60 trials: 1 complete, 1 pruned, 1 failed"
     assert (found.data.tags["sweep.best_trial"], found.data.tags["end"]) == ("7", "finished")
-    assert "deepracer-exp train a=1" in found.data.tags["mlflow.note.content"]
-    assert found.data.metrics["best_race_score"] == 9.5
-    assert (found.data.metrics["eval_lap_time_s"], found.data.metrics["trials_complete"]) == (9.4, 1)
+    assert "deepracer-exp train \\\n    a=1\n" in found.data.tags["mlflow.note.content"]
+    assert found.data.metrics["trial_race_score_s"] == 9.5
+    assert (found.data.metrics["trial_lap_time_s"], found.data.metrics["trials_complete"]) == (9.4, 1)
     client = MlflowClient(tracking_uri=store.uri)
     assert [file.path for file in client.list_artifacts(run_id)] == ["report.html"]
 
 
+def test_the_runs_table_of_a_study_opens_with_what_its_trials_differ_in(store):
+    run = StudyRun(
+        store, "spring", ["lap_time", "completion"], {**SPACE, "+reward.constants.X<": "0,1"}, BASE
+    )
+    run.wait_for_id(60)
+    assert run.finish("FINISHED", 60)
+    experiment = MlflowClient(tracking_uri=store.uri).get_experiment_by_name("spring")
+    view = json.loads(experiment.tags[f"mlflow.sharedViewState.{VIEW}"])
+    columns = view["selectedColumns"]
+    (found,) = runs_of(store)
+    assert [name for name in found.data.params if f"params.`{name}`" in columns] == [
+        "algorithm.lr",
+        "reward.constants.X_",
+    ]
+    assert {"metrics.`trial_lap_time_s`", "metrics.`trial_completion`", "tags.`end`"} <= set(columns)
+
+
 def test_whoever_goes_on_with_a_study_goes_on_with_its_run(store):
-    first = StudyRun(store, "spring", SPACE, BASE)
+    first = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     first.update(progress(3))
     assert first.finish("KILLED", 60)
-    second = StudyRun(store, "spring", SPACE, BASE)
+    second = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     assert second.wait_for_id(60) == first.run_id
     (found,) = runs_of(store)
     assert (found.info.status, "end" in found.data.tags) == ("RUNNING", False)
     second.update(progress(3))
     second.update(progress(4))
+    second.update(progress(4, best_trial=5, best_values={"race_score": 9.75}))
     assert second.finish("FINISHED", 60)
+    (found,) = runs_of(store)
+    assert (found.data.metrics["trial_race_score_s"], found.data.tags["sweep.best_trial"]) == (9.75, "5")
     client = MlflowClient(tracking_uri=store.uri)
     assert [point.step for point in client.get_metric_history(first.run_id, "trials_complete")] == [3, 4]
+
+
+def test_trials_that_began_before_the_run_of_their_study_stand_below_it_none_the_less(store, monkeypatch):
+    is_up, connect = threading.Event(), MLflowRun.connect
+
+    def connect_late(run):
+        is_up.wait(60)
+        connect(run)
+
+    early, other = MLflowRun(store), MLflowRun(store)
+    for run, study in ((early, "spring"), (other, "autumn")):
+        run.connect()
+        tags = {"sweep.study": study, "sweep.trial": "0"}
+        run.create(Told(None, "trial 0", "spring", 1000, store.shown, tags=tags), again=False)
+    monkeypatch.setattr(MLflowRun, "connect", connect_late)
+    study_run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
+    assert study_run.wait_for_id(0.1) is None
+    is_up.set()
+    assert study_run.wait_for_id(60)
+    late = MLflowRun(store)
+    late.connect()
+    tags = {"sweep.study": "spring", "sweep.trial": "1"}
+    late.create(Told(None, "trial 1", "spring", 2000, store.shown, tags=tags), again=False)
+    study_run.update(progress())
+    assert study_run.finish("FINISHED", 60)
+    above = {run.info.run_id: run.data.tags.get("mlflow.parentRunId") for run in runs_of(store)}
+    ids = (early.run_id, late.run_id, other.run_id, study_run.run_id)
+    assert [above[run_id] for run_id in ids] == [study_run.run_id, study_run.run_id, None, None]
 
 
 def test_another_search_of_the_same_name_gets_a_run_of_its_own(store):
     ids = set()
     for space in (SPACE, {"algorithm.lr": "interval(0, 1)"}):
-        run = StudyRun(store, "spring", space, BASE)
+        run = StudyRun(store, "spring", ["race_score"], space, BASE)
         ids.add(run.wait_for_id(60))
         assert run.finish("FINISHED", 60)
     assert len(ids) == 2
 
 
 def test_a_driver_that_begins_while_another_one_works_goes_on_with_its_run(store):
-    first = StudyRun(store, "spring", SPACE, BASE)
+    first = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     ids = {first.wait_for_id(120)}
-    second = StudyRun(store, "spring", SPACE, BASE)
+    second = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     ids.add(second.wait_for_id(120))
     assert all(driver.finish("FINISHED", 60) for driver in (first, second))
     (found,) = runs_of(store)
@@ -118,7 +173,7 @@ def test_a_store_that_comes_late_gets_the_newest_progress_only(store, monkeypatc
         connect(run)
 
     monkeypatch.setattr(MLflowRun, "connect", connect_if_up)
-    run = StudyRun(store, "spring", SPACE, BASE)
+    run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     assert run.wait_for_id(1.0) is None
     for ended in range(3, 9):
         run.update(progress(ended))
@@ -132,7 +187,7 @@ def test_a_store_that_comes_late_gets_the_newest_progress_only(store, monkeypatc
 
 def test_a_store_that_never_answers_holds_up_nothing(free_port, caplog):
     nobody = Store(f"http://127.0.0.1:{free_port}", None)
-    run = StudyRun(nobody, "spring", SPACE, BASE)
+    run = StudyRun(nobody, "spring", ["race_score"], SPACE, BASE)
     run.update(progress())
     assert not run.finish("FINISHED", 1.0)
     assert run.run_id is None
@@ -142,7 +197,7 @@ def test_a_store_that_never_answers_holds_up_nothing(free_port, caplog):
 
 
 def test_a_missing_file_stops_no_other(store, tmp_path, caplog):
-    run = StudyRun(store, "spring", SPACE, BASE)
+    run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     run_id = run.wait_for_id(60)
     (tmp_path / "there.html").write_text("x")
     run.pictures([tmp_path / "there.html", tmp_path / "missing.html"])
@@ -153,7 +208,7 @@ def test_a_missing_file_stops_no_other(store, tmp_path, caplog):
 
 
 def test_a_run_deleted_in_the_ui_is_told_once_and_holds_up_nothing(store, wait_until, caplog):
-    run = StudyRun(store, "spring", SPACE, BASE)
+    run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     MlflowClient(tracking_uri=store.uri).delete_run(run.wait_for_id(60))
     run.update(progress(3))
     wait_until(lambda: "refused" in caplog.text)
@@ -163,7 +218,7 @@ def test_a_run_deleted_in_the_ui_is_told_once_and_holds_up_nothing(store, wait_u
 
 
 def test_the_seeds_of_a_trial_stand_under_one_run_whoever_asks(store):
-    study = StudyRun(store, "spring", SPACE, BASE)
+    study = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     parent = study.wait_for_id(60)
     ids = {open_trial_run(store, "spring", 7, parent, ["algorithm.lr=0.001"]) for _ in range(2)}
     other = open_trial_run(store, "spring", 8, parent, ["algorithm.lr=0.002"])
@@ -192,13 +247,13 @@ def test_a_store_that_hangs_holds_up_a_trial_for_its_deadline_at_most(store, mon
 
 
 def test_without_tracking_a_study_has_no_run(tmp_path):
-    assert open_study_run(TrackingOff(kind="off"), tmp_path, "spring", SPACE, BASE) is None
+    assert open_study_run(TrackingOff(kind="off"), tmp_path, "spring", ["race_score"], SPACE, BASE) is None
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("status", ["FAILED", "KILLED"])
 def test_a_study_that_ended_badly_says_so(store, status):
-    run = StudyRun(store, "spring", SPACE, BASE)
+    run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     assert run.finish(status, 60)
     (found,) = runs_of(store)
     assert found.info.status == status
