@@ -17,7 +17,7 @@ from deepracer_exp.analysis.reward_comparison import compare_rewards
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import LogProblem, Recording
 from tests.browser import browser, needs_chromium
-from tests.html import Html
+from tests.page_html import Html
 
 from .made_up import Drive, made_up_recording
 

@@ -10,7 +10,7 @@ import pytest
 from deepracer_exp.analysis import log_report
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats import recording_reader
-from tests.html import Html
+from tests.page_html import Html
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
 

@@ -6,7 +6,7 @@ from optuna.distributions import FloatDistribution
 from deepracer_exp.errors import BadInput
 from sweeps.report import fates, headline, report, write_report
 from tests.browser import browser, needs_chromium
-from tests.html import Html
+from tests.page_html import Html
 
 from .studies import add, new_study, season, write_metrics
 
