@@ -22,7 +22,8 @@ def _assert_whole(ended, code):
 
 
 @pytest.mark.parametrize(
-    ("signum", "code", "mode"), [(signal.SIGINT, 130, "sync"), (signal.SIGTERM, 143, "async")]
+    ("signum", "code", "mode"),
+    [(signal.SIGINT, 130, "sync"), pytest.param(signal.SIGTERM, 143, "async", marks=pytest.mark.slow)],
 )
 def test_an_interrupted_run_writes_everything(start_training, signum, code, mode):
     training = start_training(f"collector={mode}")

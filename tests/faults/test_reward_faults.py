@@ -74,7 +74,7 @@ def test_a_reward_that_fails_later_leaves_what_was_learned_before(train_here, re
     assert len(list((ended.folder / "trace").glob("*.parquet"))) == len(ended.metrics)
 
 
-@pytest.mark.parametrize("mode", ["sync", "async"])
+@pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
 def test_a_reward_that_raises_in_a_worker_ends_the_run_with_the_workers_own_words(
     start_training, reward, mode
 ):

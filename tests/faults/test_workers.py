@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-MODES = pytest.mark.parametrize("mode", ["sync", "async"])
+MODES = pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
 SOON_S = 30.0
 
 

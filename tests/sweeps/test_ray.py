@@ -81,7 +81,10 @@ def two_nodes():
     pytest.importorskip("ray")
     # Not below pytest's folder: the name of a socket may have a hundred characters.
     folder = Path(tempfile.mkdtemp(prefix="ray-", dir="/tmp"))
+    (folder / "ray").mkdir()
     with pytest.MonkeyPatch.context() as patch:
+        # Where the cluster notes its address, in a folder that Ray expects to be there.
+        patch.setenv("RAY_TMPDIR", str(folder))
         # The only way to let Ray on Linux stay with 127.0.0.1.
         patch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
