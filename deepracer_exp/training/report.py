@@ -44,7 +44,7 @@ def write_run_page(run_dir: Path) -> str | None:
         from deepracer_exp.evaluation.run_terms import run_terms
         from deepracer_exp.formats.own_recording import read_own_recording
 
-        view, terms = run_terms(prepare(read_own_recording(run_dir)))
+        view, terms = run_terms(prepare(read_own_recording(run_dir)), just_trained=True)
         write_page(run_dir / PAGE, LogPage(view, findings(view), terms=terms))
     except KeyboardInterrupt:
         return f"{PAGE} was left off; {again}"

@@ -86,7 +86,10 @@ def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not
     for file in (tmp_path / "theirs").rglob("reward_function.py"):
         file.write_text(trap)
     (tmp_path / "theirs" / "reward_function.py").write_text(trap)
+    shutil.copytree(run_dir, tmp_path / "their_run")
+    (tmp_path / "their_run" / "reward_function.py").write_text(trap)
     assert call("analyze", "theirs").code == 0
+    assert call("analyze", "their_run").code == 0
     assert not (tmp_path / "trapped").exists()
 
 

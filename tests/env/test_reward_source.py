@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.env.reward_source import (
     RewardSource,
+    is_of_zoo,
     load_reward_source,
     source_with_constants,
     zoo_names,
@@ -146,3 +147,14 @@ def test_the_text_with_constants_has_exactly_those_constants(
     written = source_with_constants(from_text(folder, text, **values))
     again = from_text(folder, written)
     assert again.constants == {"A": 1, "B": 2.0, "C": 3, "D": -4.0} | values
+
+
+def test_a_function_of_the_zoo_is_known_by_its_text_whatever_its_constants() -> None:
+    source = load_reward_source(config())
+    name = next(iter(source.constants))
+    other = load_reward_source(config(**{name: 7.5}))
+    assert is_of_zoo(source.text)
+    assert is_of_zoo(source_with_constants(other))
+    assert not is_of_zoo(source.text + "\nprint('hello')\n")
+    assert not is_of_zoo("def reward_function(params):\n    return 1.0\n")
+    assert not is_of_zoo("no Python at all")
