@@ -1,6 +1,6 @@
 """What a report of a training costs, and how fast logs are read.
 
-    python -m benchmarks.analysis [--path DIR] [--turns 7] [--json FILE]
+    python -m benchmarks.analysis [--path DIR] [--turns 7] [--long-gb 2] [--json FILE]
 
 - `report_s`, `peak_gb`: seconds and peak memory of `deepracer-exp analyze DIR`, from the start of the process to its
   end; the median and the largest of three runs;
@@ -11,6 +11,9 @@ Ours reads everything in the folder: training, evaluations and races from CSVs a
 and settings. deepracer-utils reads the training with the one call that its documentation names for a folder,
 `DeepRacerLog(...).load()`: of a console archive from the text log, of others from the CSVs. `read_ratio_csv` is the
 harder comparison, with its quickest way to all drives: training and evaluations from the CSVs, races from the logs.
+
+With `--long-gb` also a report of a text log of so many gigabytes, the longest log of the folder again and again:
+`long_s`, `long_peak_gb`, `long_steps` in the log. Of it the last steps are held (formats/step_tables.py).
 
 Wanted: at most 20 s and 1.5 GB on two cores for the 44,247 steps of the console training, `read_ratio` at least 1.
 """
@@ -30,6 +33,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording_reader import read_recording
 
 from .command import command_line
+from .long_log import write_long_log
 from .report import number, table, write_json
 
 CONSOLE_TRAINING = Path(__file__).parents[2] / "shared/reference/console_training"
@@ -98,7 +102,17 @@ def measure_reading(path: Path, turns: int) -> dict[str, float]:
     return {**figures, "read_ratio": ratio("peer_s"), "read_ratio_csv": ratio("peer_csv_s")}
 
 
-def measure(path: Path, turns: int) -> dict[str, Any]:
+def measure_long(path: Path, gigabytes: float) -> dict[str, float]:
+    """Report a long log."""
+    source = max(path.rglob("*.log"), key=lambda file: file.stat().st_size)
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / source.name
+        steps = write_long_log(source, log, int(gigabytes * 1e9))
+        taken, peak = report(log, Path(folder) / "report.html")
+    return {"long_gb": gigabytes, "long_steps": steps, "long_s": taken, "long_peak_gb": peak}
+
+
+def measure(path: Path, turns: int, long_gb: float) -> dict[str, Any]:
     """Return all figures."""
     reading = measure_reading(path, turns)
     steps = len(read_recording(path).steps)
@@ -111,6 +125,7 @@ def measure(path: Path, turns: int) -> dict[str, Any]:
         "peak_gb": max(peak for _, peak in reports),
         "page_mb": size_mb,
         **reading,
+        **(measure_long(path, long_gb) if long_gb else {}),
     }
     return {"steps": steps, **{name: round(value, 3) for name, value in figures.items()}}
 
@@ -131,6 +146,10 @@ def show(figures: dict[str, Any]) -> str:
         ),
         ("how much faster than all drives", number(figures["read_ratio_csv"], 2), ""),
     ]
+    if "long_gb" in figures:
+        what = f"log of {figures['long_gb']:g} GB, {figures['long_steps']:,.0f} steps"
+        rows.append((f"{what}: report, s", number(figures["long_s"], 0), ""))
+        rows.append((f"{what}: peak memory, GB", number(figures["long_peak_gb"], 2), "bounded"))
     return table((f"{figures['steps']:,} steps", "measured", "wanted"), rows)
 
 
@@ -141,10 +160,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--path", type=Path, default=CONSOLE_TRAINING, help="logs in a layout that both know")
     parser.add_argument("--turns", type=int, default=7, help="readings of each")
+    parser.add_argument("--long-gb", type=float, default=0.0, help="size of a long log, none without")
     parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
     options = parser.parse_args(arguments)
     try:
-        figures = measure(options.path, options.turns)
+        figures = measure(options.path, options.turns, options.long_gb)
     except BadInput as error:
         print(error, file=sys.stderr)
         return error.exit_code

@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import LogProblem, Recording
+from deepracer_exp.formats.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.tracks.track import Track
 
 from .episode_table import episode_table, first_rows
@@ -15,7 +15,6 @@ from .iteration_table import iteration_table
 from .log_course import catalogue_track, find_courses
 from .step_columns import add_derived
 
-TRAINING = "training"
 DISCOUNT = 0.99
 """Where the hyperparameters tell none: the service's default."""
 

@@ -100,8 +100,7 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
     found: list[OffTrackPlace] = []
     while len(found) < PLACES and left.any():
         at = position[rows]
-        near = _apart(at[:, None], at[left][None, :]) <= half
-        busiest = int(near.sum(axis=1).argmax())
+        busiest = int(neighbours(at, at[left], half).argmax())
         here = left & (_apart(at, at[busiest]) <= half)
         if here.sum() < LEAST:
             break
@@ -187,6 +186,12 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
 def _before(values: Values, rows: int) -> Values:
     """Return the values of so many rows before, 0 where there is none."""
     return values if not rows else np.concatenate([np.zeros(min(rows, len(values))), values[:-rows]])
+
+
+def neighbours(at: Values, others: Values, within: float) -> NDArray[np.intp]:
+    """Count for each lap position the others that are near it on the shorter way round."""
+    around = np.sort(np.concatenate([others - 1.0, others, others + 1.0]))
+    return np.searchsorted(around, at + within, "right") - np.searchsorted(around, at - within, "left")
 
 
 def _apart(a: Values | float, b: Values | float) -> Values:

@@ -12,7 +12,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
-from omegaconf import OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
@@ -121,13 +121,8 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         rest = [override for override in own if override.key_or_group.partition(".")[0] != TRACK]
         own = [*map(parse_single, several.choosing), *rest, *several.changing]
     parsed = [*map(parse_single, files.lines), *own]
-    project, *more = conf_dirs()
-    lines = [line_for_hydra(override) for override in parsed]
     try:
-        with initialize_config_dir(str(project), version_base="1.3"):
-            if more:
-                lines.append(override_line("hydra.searchpath", [f"file://{folder}" for folder in more]))
-            config = compose(entry, overrides=lines, return_hydra_config=True)
+        config = _composed(entry, [line_for_hydra(override) for override in parsed])
         choices = {
             str(group): str(option).removesuffix(".yaml")
             for group, option in config.hydra.runtime.choices.items()
@@ -151,6 +146,37 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         names=files.names,
         notes=files.notes,
     )
+
+
+def _composed(name: str | None, lines: list[str]) -> DictConfig:
+    """Let Hydra put together a file of `conf/`, or what the overrides alone choose, with Hydra's own settings."""
+    project, *more = conf_dirs()
+    if more:
+        lines = [*lines, override_line("hydra.searchpath", [f"file://{folder}" for folder in more])]
+    with initialize_config_dir(str(project), version_base="1.3"):
+        return compose(name, overrides=lines, return_hydra_config=True)
+
+
+def compose_option(group: str, option: str, kind: type[Config]) -> Config:
+    """Compose one option by itself, a quarter of the work of an experiment, and validate it.
+
+    Raises:
+        BadInput: there is no such option, or its values are not accepted or refer to other groups.
+    """
+    known = options(group)
+    if option not in known:
+        raise BadInput(_no_such_option(group, option, known))
+    try:
+        mapping = OmegaConf.to_container(
+            _composed(None, [f"+{override_line(group, option)}"])[group], resolve=True
+        )
+    except (HydraException, OmegaConfBaseException) as error:
+        raise BadInput(f"{group}={option}: {' '.join(str(error).split())}") from error
+    assert isinstance(mapping, dict)
+    try:
+        return typed({str(key): value for key, value in mapping.items()}, kind)
+    except BadInput as error:
+        raise BadInput(f"{group}={option}: {error}") from error
 
 
 def validate(mapping: dict[str, Any]) -> Experiment:
@@ -241,7 +267,7 @@ def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
         group = max(groups_within, key=len)  # sweep/executor rather than sweep
         option = missing[1].removeprefix(f"{group}/")
         known = options(group)
-        return f"{group}={option}: no such {group}{nearest(option, known)}; options: {', '.join(known)}"
+        return _no_such_option(group, option, known)
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
         known = groups(entry)
@@ -252,6 +278,10 @@ def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
         key = next((o.key_or_group for o in parsed if o.key_or_group in text), parsed[0].key_or_group)
         return f"{key}: no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
     return f"{entry}: " + " ".join(text.split())
+
+
+def _no_such_option(group: str, option: str, known: Sequence[str]) -> str:
+    return f"{group}={option}: no such {group}{nearest(option, known)}; options: {', '.join(known)}"
 
 
 def _unknown_key(entry: str, key: str, chosen: Composition) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.compose import compose_experiment, compose_option
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
@@ -175,7 +175,7 @@ def _conditions(key: str, option: str | None, experiment: Experiment) -> Randomi
     if option is None:
         return experiment.randomization
     try:
-        return compose_experiment([override_line("randomization", option)])[0].randomization
+        return compose_option("randomization", option, RandomizationConfig)
     except BadInput as error:
         raise BadInput(f"evaluation.{key}: {error}") from None
 

@@ -1,7 +1,7 @@
 """A run of ours as a recording, in the schema of everybody's."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,20 @@ import pyarrow.parquet as pq
 
 from deepracer_exp.errors import BadInput
 
+from . import step_tables
 from .model_metadata import NEURAL_NETWORKS, Action, LidarConfig, ModelMetadata, read_model_metadata
-from .recording import EVALUATED_COLUMNS, STEP_COLUMNS, TOLD_COLUMNS, UPDATE_COLUMNS, LogProblem, Recording
+from .recording import (
+    EVALUATED_COLUMNS,
+    STEP_COLUMNS,
+    TOLD_COLUMNS,
+    TRAINING,
+    UPDATE_COLUMNS,
+    LogProblem,
+    Recording,
+)
 from .run_files import read_config
 from .trace import EPISODE_STATUS
 
-STREAM = "training"
 LEARNING = {
     "batch_size": "batch_size",
     "num_epochs": "epochs",
@@ -28,7 +36,7 @@ LEARNING = {
     "num_episodes_between_training": "episodes_per_iteration",
 }
 """The service's words for values of the group `algorithm`."""
-_CONSTANT = {"stream": STREAM, "worker": 0, "wall_clock": np.nan}
+_CONSTANT = {"stream": TRAINING, "worker": 0, "wall_clock": np.nan}
 _WORDS = ("episode_status", "track")
 _READ = [name for name in STEP_COLUMNS if name not in _CONSTANT]
 
@@ -41,8 +49,8 @@ def is_own_run(folder: Path) -> bool:
 def read_own_recording(folder: Path) -> Recording:
     """Read a run of ours.
 
-    The rows are those of its trace in the order of iterations; the rows of one episode may run on into the next
-    iteration. What cannot be read of it is left out and listed.
+    The rows are those of its trace in the order of iterations, the last `MOST_STEPS` of them; the rows of one episode
+    may run on into the next iteration. What cannot be read of it is left out and listed.
 
     Args:
         folder: of the run, with `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
@@ -77,7 +85,7 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
         raise BadInput(
             f"{folder / 'trace'}: no *-iteration.parquet; accepted: the folder of a run with its trace"
         )
-    counts = [_count(path, problems) for path in found]
+    counts = _last(found, [_count(path, problems) for path in found], problems)
     total = sum(counts)
     columns = {name: np.empty(total, STEP_COLUMNS[name][0]) for name in _READ if name not in _WORDS}
     codes = {name: np.zeros(total, np.int16) for name in _WORDS}
@@ -112,6 +120,20 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
     return pd.DataFrame(whole, copy=False)
 
 
+def _last(found: Sequence[Path], counts: list[int], problems: list[LogProblem]) -> list[int]:
+    """Return the rows to be read of each file: 0 of the first files where all together have too many."""
+    so_far = np.cumsum(counts[::-1])[::-1]
+    read = [
+        count if after <= step_tables.MOST_STEPS else 0
+        for count, after in zip(counts, so_far.tolist(), strict=True)
+    ]
+    gone = sum(counts) - sum(read)
+    if gone:
+        reason = step_tables.left_out(gone)
+        problems.append(LogProblem(str(found[0].parent), None, reason, lines=gone))
+    return read
+
+
 def _count(path: Path, problems: list[LogProblem]) -> int:
     """Return the rows of a file, 0 for one that cannot be read."""
     try:
@@ -139,7 +161,7 @@ def _codes(column: pa.ChunkedArray, place: dict[str, int]) -> np.ndarray:
 
 def _constant(name: str, count: int) -> Any:
     if name == "stream":
-        return pd.Categorical.from_codes(np.zeros(count, np.int8), [STREAM])
+        return pd.Categorical.from_codes(np.zeros(count, np.int8), [TRAINING])
     return np.full(count, _CONSTANT[name], STEP_COLUMNS[name][0])
 
 

@@ -9,6 +9,8 @@ import pandas as pd
 
 from .model_metadata import ModelMetadata
 
+TRAINING = "training"
+"""The stream, and the kind of job, of what a training drove."""
 STEP_COLUMNS: Mapping[str, tuple[str, str]] = {
     "stream": ("category", "`training`, or the name of an evaluation or race"),
     "worker": ("int16", "process of the service that drove, from 0"),

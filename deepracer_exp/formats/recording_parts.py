@@ -7,19 +7,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import pyarrow as pa
 import yaml
 
 from deepracer_exp.errors import BadInput
 
+from . import step_tables
 from .hyperparameters import Hyperparameters, read_hyperparameters
 from .json_object import MAX_BYTES
 from .log_blocks import READ_ERRORS
 from .log_folder import LogFile, LogFolder, Place, place_of
 from .metrics_json import MetricsJson, read_metrics_json
 from .model_metadata import ModelMetadata, read_model_metadata
-from .recording import LogProblem
+from .recording import TRAINING, LogProblem
 from .sim_trace_csv import read_trace_csv
+from .step_tables import StepTables
 from .training_log import MARKER, TrainingLog, read_training_log
 
 MOST_LISTED = 20
@@ -46,7 +47,7 @@ class TraceFile:
     place: Place
     number: int | None
     """That in its name."""
-    table: pa.Table
+    steps: StepTables
 
 
 @dataclass
@@ -89,21 +90,48 @@ def read_parts(folder: LogFolder) -> Parts:
     alone = len(folder.files) == 1
     whole = Parts(problems=list(folder.problems))
     others: list[LogFile] = []
+    held = 0
     # The members of an archive come out of one stream.
     with ThreadPoolExecutor(_THREADS if folder.apart else 1) as pool:
         found = pool.map(lambda file: _read_one(file, alone), folder.files)
         for file, (parts, known) in zip(folder.files, found, strict=True):
             whole.add(parts)
+            held += sum(steps.rows for _, steps in _steps_of_files(parts))
+            held -= _leave_out_first(whole, held - step_tables.MOST_STEPS)
             if known:
                 whole.files.append(file)
             elif not parts.problems and not _BESIDE.fullmatch(file.name):
                 others.append(file)
+    for file, steps in _steps_of_files(whole):
+        if steps.left_out:
+            reason = step_tables.left_out(steps.left_out)
+            whole.problems.append(LogProblem(str(file.path), None, reason, lines=steps.left_out))
     if others:
         named = ", ".join("/".join(file.parts[-2:]) for file in others[:_MOST_NAMED])
         more = ", …" if len(others) > _MOST_NAMED else ""
         reason = f"no log of the service: {named}{more}"
         whole.problems.append(LogProblem(f"{len(others)} other files", None, reason))
     return whole
+
+
+def _steps_of_files(parts: Parts) -> list[tuple[LogFile, StepTables]]:
+    """Return the steps of each file, a training's first, in the order of reading."""
+    found = [(trace.file, trace.steps) for trace in parts.traces] + [
+        (file, log.steps) for file, log in parts.logs
+    ]
+    return sorted(found, key=lambda one: (place_of(one[0].parts).kind != TRAINING, one[0].order))
+
+
+def _leave_out_first(parts: Parts, too_many: int) -> int:
+    """Let go of the first steps of all, of at least so many, and return how many those were."""
+    gone = 0
+    for _, steps in _steps_of_files(parts) if too_many > 0 else ():
+        before = steps.rows
+        while gone < too_many and steps.rows:
+            steps.leave_out_first()
+            gone += before - steps.rows
+            before = steps.rows
+    return gone
 
 
 def _read_one(file: LogFile, alone: bool) -> tuple[Parts, bool]:

@@ -16,6 +16,7 @@ from .own_recording import is_own_run, read_own_recording
 from .recording import (
     EVALUATED_COLUMNS,
     TOLD_COLUMNS,
+    TRAINING,
     UPDATE_COLUMNS,
     LogProblem,
     Recording,
@@ -36,9 +37,9 @@ from .recording_drives import (
     steps_of,
 )
 from .recording_parts import Parts, TraceFile, read_parts
+from .step_tables import StepTables
 from .training_log import TrainingLog, Update
 
-TRAINING = "training"
 _KINDS = (TRAINING, "evaluation", "leaderboard")
 Numbers = Mapping[tuple[int, int, int], int]
 
@@ -125,7 +126,7 @@ class _Assembly:
             groups.setdefault(place, []).append(trace)
         for place, traces in groups.items():
             traces.sort(key=lambda trace: (-1 if trace.number is None else trace.number, trace.file.order))
-            tables = [in_degrees(trace.table) for trace in traces]
+            tables = [in_degrees(trace.steps.whole) for trace in traces]
             iterations = [
                 table["episode"].to_numpy().astype(np.int64) // self._per_iteration
                 if trace.number is None
@@ -143,12 +144,12 @@ class _Assembly:
             name = place.name.replace(str(place.worker), "#") if place.worker else place.name
             place = replace(place, root=(*place.root, name))
         self.roots[number] = place.root
-        if not log.steps.num_rows:
+        if not log.steps.rows:
             return
         settings = log.hyperparameters or {}
         per_iteration = settings.get("num_episodes_between_training", self._per_iteration)
         whole = per_iteration if isinstance(per_iteration, int) and per_iteration > 0 else self._per_iteration
-        table = in_degrees(concatenated([log.steps]))
+        table = in_degrees(concatenated([log.steps.whole]))
         mine = Drives(place, table, iterations_of(table, log, whole), log.world or "", [place.name])
         if place.kind != TRAINING:
             mine.iteration[:] = 0
@@ -344,7 +345,7 @@ def _rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[LogF
     for pieces in groups.values():
         pieces.sort(key=_time_of_piece)
         whole = TrainingLog(
-            tables=[table for _, log in pieces for table in log.tables],
+            steps=StepTables.joined([log.steps for _, log in pieces]),
             updates=[update for _, log in pieces for update in log.updates],
             evaluated_after=[count for _, log in pieces for count in log.evaluated_after],
             iteration_of={key: value for _, log in pieces for key, value in log.iteration_of.items()},
@@ -360,8 +361,8 @@ def _time_of_piece(piece: tuple[LogFile, TrainingLog]) -> tuple[int, int, int]:
     number = file.name.rpartition(".")[2]
     # The highest number is the oldest piece; that without one is being written.
     age = -int(number) if number.isdigit() else 1
-    if log.steps.num_rows:
-        return (*first_row(log.steps), age)
+    if log.steps.rows:
+        return (*first_row(log.steps.whole), age)
     return (next(iter(log.iteration_of), -1), 0, age)
 
 

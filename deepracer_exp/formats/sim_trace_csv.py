@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import IO
 
-import pyarrow as pa
-
 from .log_blocks import Blocks
 from .sim_trace import COMMON, SCHEMA, read_at_once, read_rows
+from .step_tables import StepTables
 
 _HEADER = b"episode"
 
@@ -16,14 +15,9 @@ _HEADER = b"episode"
 class TraceCsv:
     """The rows of one file."""
 
-    tables: list[pa.Table] = field(default_factory=list)
+    steps: StepTables = field(default_factory=StepTables)
     refused: list[tuple[int | None, str]] = field(default_factory=list)
     """Line (None: from somewhere on) and reason of what is no row."""
-
-    @property
-    def steps(self) -> pa.Table:
-        """All rows, columns of `sim_trace.SCHEMA`."""
-        return pa.concat_tables(self.tables) if self.tables else SCHEMA.empty_table()
 
 
 def read_trace_csv(stream: IO[bytes]) -> TraceCsv:
@@ -47,7 +41,7 @@ def read_trace_csv(stream: IO[bytes]) -> TraceCsv:
         count = data.count(b"\n") + (not data.endswith(b"\n"))
         table = read_at_once(data, header, count) if data else SCHEMA.empty_table()
         if table is not None:
-            trace.tables.append(table)
+            trace.steps.add(table)
         else:
             header = _read_slowly(trace, data, number, header)
     if header is None:
@@ -72,7 +66,7 @@ def _read_slowly(trace: TraceCsv, data: bytes, first: int, header: Sequence[str]
     def flush() -> None:
         names = header
         table, refused = read_rows(lines, lambda count: names if count == len(names) else None)
-        trace.tables.append(table)
+        trace.steps.add(table)
         trace.refused += [(numbers[one.place], one.reason) for one in refused]
         lines.clear()
         numbers.clear()

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import IO, Any, NamedTuple
 
-import pyarrow as pa
-
 from .log_blocks import Blocks
-from .sim_trace import SCHEMA, line_layout, read_rows
+from .sim_trace import line_layout, read_rows
+from .step_tables import StepTables
 
 MARKER = b"SIM_TRACE_LOG:"
 """Begins the values of a control step; anything may stand before it."""
@@ -47,7 +46,7 @@ class Update(NamedTuple):
 class TrainingLog:
     """What one log tells."""
 
-    tables: list[pa.Table] = field(default_factory=list)
+    steps: StepTables = field(default_factory=StepTables)
     updates: list[Update] = field(default_factory=list)
     iteration_of: dict[int, int] = field(default_factory=dict)
     """Iteration of an episode; both count from 0. The log of a simulation says 0 of all, that of a trainer knows."""
@@ -62,14 +61,16 @@ class TrainingLog:
     """Line (None: from somewhere on) and reason of what cannot be read."""
 
     @property
-    def steps(self) -> pa.Table:
-        """All rows, columns of `sim_trace.SCHEMA`."""
-        return pa.concat_tables(self.tables) if self.tables else SCHEMA.empty_table()
-
-    @property
     def tells(self) -> bool:
         """Whether it is a log of the service at all."""
-        told = (self.tables, self.updates, self.iteration_of, self.hyperparameters, self.sensors, self.world)
+        told = (
+            self.steps.told,
+            self.updates,
+            self.iteration_of,
+            self.hyperparameters,
+            self.sensors,
+            self.world,
+        )
         return any(map(bool, told))
 
     @property
@@ -96,7 +97,7 @@ def read_training_log(stream: IO[bytes]) -> TrainingLog:
 def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
     lines = _TRACE.findall(block)
     table, refused = read_rows(lines, line_layout, before)
-    log.tables.append(table)
+    log.steps.add(table)
     if refused:
         starts = [found.start() for found in _TRACE.finditer(block)]
         log.refused += [(_line(block, starts[one.place], lines_before), one.reason) for one in refused]

@@ -5,11 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from deepracer_exp.analysis.candidates import candidates, lap_chance
 from deepracer_exp.analysis.findings import Finding, findings
 from deepracer_exp.analysis.learning import PATIENCE, convergence
 from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 
 from .made_up import Drive, made_up_course, made_up_recording
@@ -238,3 +241,17 @@ def test_without_a_course_only_what_needs_its_shape_is_left_out() -> None:
     assert view.course is None
     assert "nowhere" in str(view.problems[0])
     assert [one.rule for one in findings(view)] == ["converged", "submit", "chance", "runs_off", "steering"]
+
+
+@given(
+    at=st.lists(st.floats(0.0, 1.0, exclude_max=True), min_size=1, max_size=40),
+    others=st.lists(st.floats(0.0, 1.0, exclude_max=True), min_size=1, max_size=40),
+    within=st.floats(0.001, 0.4),
+)
+def test_places_off_the_road_are_counted_the_shorter_way_round(at, others, within):
+    away = np.abs(np.array(at)[:, None] - np.array(others)[None, :])
+    away = np.minimum(away, 1.0 - away)
+    # At the very edge rounding decides.
+    assume(not (np.abs(away - within) < 1e-12).any())
+    counted = neighbours(np.array(at), np.array(others), within)
+    assert counted.tolist() == (away <= within).sum(axis=1).tolist()

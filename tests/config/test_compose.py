@@ -6,9 +6,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.config.compose import compose_experiment, expand_grid, validate
+from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid, validate
 from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
+from deepracer_exp.config.randomization import RandomizationConfig
 from deepracer_exp.errors import BadInput
 
 
@@ -323,3 +324,46 @@ def test_the_configuration_stays_usable_after_a_refusal(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert compose_experiment(["track=Monaco"])[0].track.name == "Monaco"
     assert list(Path(tmp_path).iterdir()) == []
+
+
+# --- An option by itself
+
+
+@pytest.mark.parametrize("option", options_of("randomization"))
+def test_an_option_by_itself_is_what_an_experiment_has_with_it(option):
+    alone = compose_option("randomization", option, RandomizationConfig)
+    assert alone == compose_experiment([f"randomization={option}"])[0].randomization
+
+
+def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
+    own = tmp_path / "conf" / "randomization"
+    own.mkdir(parents=True)
+    (own / "wet.yaml").write_text("defaults: [sim2real, _self_]\nfriction_scale: [0.3, 0.4]\n")
+    monkeypatch.chdir(tmp_path)
+    wet, usual = (compose_option("randomization", name, RandomizationConfig) for name in ("wet", "sim2real"))
+    assert wet == dataclasses.replace(usual, friction_scale=(0.3, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("friction_scale: [0.3, wet]", ["randomization=mine", "friction_scale", "wet"]),
+        ("friction: [0.3, 0.4]", ["randomization=mine", "friction", "no such key"]),
+        ("friction_scale: ${car.nothing}", ["randomization=mine", "car.nothing"]),
+    ],
+)
+def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, monkeypatch):
+    own = tmp_path / "conf" / "randomization"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text(f"defaults: [none, _self_]\n{text}\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInput) as caught:
+        compose_option("randomization", "mine", RandomizationConfig)
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_an_option_by_itself_that_is_not_there_is_refused_with_the_nearest():
+    with pytest.raises(BadInput, match=r"randomization=sim2rael: no such .*did you mean sim2real"):
+        compose_option("randomization", "sim2rael", RandomizationConfig)

@@ -1,0 +1,19 @@
+"""A long log made of a short one is read as one long training."""
+
+from benchmarks.long_log import write_long_log
+from deepracer_exp.formats.recording_reader import read_recording
+from tests.formats import made_up_logs as made
+
+
+def test_every_turn_is_driven_later_and_in_episodes_of_its_own(tmp_path):
+    short, long = tmp_path / "short.log", tmp_path / "long.log"
+    rows = made.drives([0, 1, 2])
+    short.write_text(made.log_text(rows) + made.trainer_text(2))
+    steps = write_long_log(short, long, int(3.5 * short.stat().st_size))
+    assert steps == 4 * len(rows)
+    recording = read_recording(long)
+    assert not recording.problems
+    assert recording.steps["episode"].tolist() == sorted(list(range(12)) * 6)
+    assert recording.steps["tstamp"].is_monotonic_increasing
+    for name in ("X", "Y", "reward", "progress"):
+        assert recording.steps[name].tolist() == 4 * read_recording(short).steps[name].tolist()
