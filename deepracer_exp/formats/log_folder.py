@@ -1,13 +1,16 @@
 """The files of a folder or of an archive, and what their places in it say."""
 
+import bz2
+import gzip
+import lzma
 import re
 import stat
 import tarfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, Any
 
 from deepracer_exp.errors import BadInput
 
@@ -22,6 +25,13 @@ _STAMP = re.compile(r"\d{14}|\d{4}-\d\d-\d\dT[\d:.]+Z")
 _ENDINGS = re.compile(
     r"(?:-(?:robomaker|sagemaker|simulation|training))?(?:\.(?:log|txt|csv|json))?(?:\.\d+)?$"
 )
+_PACKED = re.compile(r"\.(?:tar|tgz|tbz2?|txz|(?:tar\.)?(?:gz|bz2|xz))$", re.IGNORECASE)
+_DRIVEN = re.compile(r"\.(?:csv|log)(?:\.\d+)?$")
+_OPEN: Mapping[bytes, Any] = {
+    b"\x1f\x8b": gzip.open,
+    b"BZh": bz2.open,
+    b"\xfd7zXZ": lzma.open,
+}
 
 
 @dataclass(frozen=True)
@@ -118,25 +128,26 @@ def same_job(one: str, other: str) -> bool:
 
 @contextmanager
 def log_folder(path: Path) -> Iterator[LogFolder]:
-    """Find the files below a folder, in an archive, or the one file.
+    """Find the files below a folder and in the archives there, in one archive, or the one file.
 
-    Links are not followed. An archive stays as it is: its members are read out of it.
+    Links are not followed. Archives and packed files stay as they are: what is in them is read out of them.
 
     Raises:
         BadInput: nothing is there, or it cannot be opened.
     """
     try:
         mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
-            yield _walk(path)
-        elif not stat.S_ISREG(mode):
+        if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
             raise BadInput(f"{path}: is no file or folder; accepted: logs of the service or a run's folder")
-        elif _is_archive(path):
-            with tarfile.open(path, "r:*") as archive:
-                yield _members(path, archive)
-        else:
-            parts = path.resolve().parts[-3:]
-            yield LogFolder([LogFile(path, parts, path.open, ("rb",))])
+        with ExitStack() as opened:
+            if stat.S_ISDIR(mode):
+                yield _walk(path, opened)
+            elif _is_packed(path):
+                found = LogFolder(apart=False)
+                _unpack(found, path, (), path.resolve().parts[-3:-1], opened)
+                yield found
+            else:
+                yield LogFolder([LogFile(path, path.resolve().parts[-3:], path.open, ("rb",))])
     except FileNotFoundError as error:
         raise BadInput(
             f"{path}: no such file or folder; accepted: trace CSVs or logs of the service"
@@ -147,10 +158,10 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
         raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
 
 
-def _walk(root: Path) -> LogFolder:
+def _walk(root: Path, opened: ExitStack) -> LogFolder:
     found = LogFolder()
     above = root.resolve().parts[-2:]
-    waiting = [root]
+    waiting, packed = [root], []
     while waiting:
         folder = waiting.pop()
         try:
@@ -163,17 +174,80 @@ def _walk(root: Path) -> LogFolder:
                 found.problems.append(LogProblem(str(entry), None, "a link; not followed"))
             elif entry.is_dir():
                 waiting.append(entry)
+            elif entry.is_file() and _PACKED.search(entry.name):
+                packed.append(entry)
             elif entry.is_file():
                 parts = (*above, *entry.relative_to(root).parts)
                 found.files.append(LogFile(entry, parts, entry.open, ("rb",)))
     found.files.sort(key=lambda file: file.order)
+    for path in sorted(packed):
+        folders = (*above, *path.relative_to(root).parts[:-1])
+        try:
+            _unpack(found, path, (*folders, _PACKED.sub("", path.name)), folders, opened)
+        except (*READ_ERRORS, ValueError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason})"))
     return found
 
 
-def _is_archive(path: Path) -> bool:
+def _is_packed(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(512)
-    return head.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ")) or head[257:262] == b"ustar"
+    return head.startswith(tuple(_OPEN)) or head[257:262] == b"ustar"
+
+
+def _unpack(
+    found: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], opened: ExitStack
+) -> None:
+    """Add the members of an archive, or the one file that is packed.
+
+    Args:
+        found: what they are added to.
+        path: of the archive or packed file.
+        inside: folders that the members of an archive are in.
+        beside: folders that a packed file is in.
+        opened: what is closed in the end.
+
+    Raises:
+        OSError: it cannot be read.
+        tarfile.TarError: it is no archive and nothing packed.
+    """
+    try:
+        archive = opened.enter_context(tarfile.open(path, "r:*"))  # noqa: SIM115 - the stack closes it
+    except tarfile.ReadError:
+        with path.open("rb") as file:
+            head = file.read(8)
+        opener = next((known for mark, known in _OPEN.items() if head.startswith(mark)), None)
+        if opener is None:
+            raise
+        with opener(path, "rb") as stream:
+            stream.read(1)
+        found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path, "rb")))
+        return
+    members = _members(path, archive)
+    if inside and not any(_DRIVEN.search(file.name) for file in members.files):
+        found.files.append(
+            LogFile(path, (*beside, path.name), path.open, ("rb",))
+        )  # a model for the car, perhaps
+        return
+    found.apart = False
+    found.problems += members.problems
+    again = _unpacked(path, members) if inside else None
+    if again is not None:
+        found.problems.append(LogProblem(str(path), None, f"not read: {again} beside it holds the same"))
+        return
+    found.files += [replace(file, parts=(*inside, *file.parts)) for file in members.files]
+
+
+def _unpacked(path: Path, members: LogFolder) -> str | None:
+    """Return the name of what lies beside an archive and has the drives in it."""
+    for file in members.files:
+        if _DRIVEN.search(file.name):
+            named = (_PACKED.sub("", path.name),)
+            for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
+                if path.parent.joinpath(*place).is_file():
+                    return place[0]
+    return None
 
 
 def _members(path: Path, archive: tarfile.TarFile) -> LogFolder:

@@ -1,6 +1,9 @@
 """Folders and archives of every layout are read as the same table."""
 
+import bz2
+import gzip
 import io
+import lzma
 import tarfile
 from pathlib import Path
 
@@ -216,6 +219,59 @@ def test_an_archive_reaches_nothing_outside_and_leaves_nothing_behind(tmp_path):
     assert len(recording.steps) == 12
     assert sum("a link" in problem.reason for problem in recording.problems) == 2
     assert all(file.is_relative_to(path) and ".." not in file.parts for file in recording.files)
+
+
+def test_archives_in_a_folder_are_read_as_what_they_hold(tmp_path):
+    folder = made.write_folder(made.drfc_upload(), tmp_path / "downloads")
+    made.write_archive(made.console(), folder / "week-one.tar.gz")
+    (folder / "other").mkdir()
+    made.write_archive(made.droa(), folder / "other" / "week-two.tgz")
+    recording = read_recording(folder)
+    assert not recording.problems
+    assert len(training(recording)) == ROWS["console"] + ROWS["droa"]
+    assert [round_.name.rpartition("downloads/")[2].split("/")[0] for round_ in recording.rounds] == [
+        "other",
+        "week-one",
+    ]
+    streams = set(recording.steps["stream"].unique()) - {"training"}
+    assert len(streams) == sum(EVALUATIONS[layout] for layout in ("drfc_upload", "console", "droa"))
+
+
+@pytest.mark.parametrize("beside", ["week-one", "model"])
+def test_an_archive_beside_what_it_holds_is_not_read_again(beside, tmp_path):
+    # The members' own folder is called model.
+    made.write_archive(made.console(), tmp_path / "week-one.tar.gz")
+    made.write_folder(made.console(), tmp_path / beside)
+    recording = read_recording(tmp_path)
+    assert len(training(recording)) == ROWS["console"]
+    (problem,) = recording.problems
+    assert str(problem) == f"{tmp_path / 'week-one.tar.gz'}: not read: {beside} beside it holds the same"
+
+
+@pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
+@pytest.mark.parametrize("alone", [True, False])
+def test_logs_that_were_packed_one_by_one_are_read(pack, alone, tmp_path):
+    ending = {gzip.compress: "gz", bz2.compress: "bz2", lzma.compress: "xz"}[pack]
+    first, second = made.drives([0, 1], seed=1), made.drives([2, 3], seed=2)
+    packed = tmp_path / f"robomaker.log.1.{ending}"
+    packed.write_bytes(pack(made.log_text(first).encode()))
+    if not alone:
+        (tmp_path / "robomaker.log").write_text(made.log_text(second))
+    recording = read_recording(packed if alone else tmp_path)
+    assert not recording.problems
+    assert recording.steps["episode"].tolist() == sorted([0, 1] * 6 if alone else [0, 1, 2, 3] * 6)
+
+
+def test_a_model_for_the_car_is_no_log_and_a_torn_archive_is_told(tmp_path):
+    made.write_folder(made.drfc_single(), tmp_path)
+    made.write_archive({"agent/model.pb": "weights"}, tmp_path / "carfile.tar.gz")
+    assert not read_recording(tmp_path).problems
+    torn = tmp_path / "week-one.tar.gz"
+    made.write_archive(made.console(), torn)
+    torn.write_bytes(torn.read_bytes()[:20])
+    recording = read_recording(tmp_path)
+    assert len(training(recording)) == ROWS["drfc_single"]
+    assert str(torn) in "\n".join(map(str, recording.problems))
 
 
 def test_nothing_readable_is_refused_in_one_line(tmp_path):
