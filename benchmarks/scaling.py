@@ -17,6 +17,7 @@ import time
 import uuid
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +162,7 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
         calls: dict[str, Callable[[], object]] = {
             "renewal of a lease": lambda far=far, claim=claim: far.renew(claim, 3600.0, {"iteration": 1}),  # type: ignore[misc]
             "look of the live table": lambda far=far: far.slots(),  # type: ignore[misc]
+            "claim when nothing is free": partial(far.claim, "bench:2:b", slots + 1, 3600),
         }
         for name, call in calls.items():
             relay.taken()

@@ -119,16 +119,13 @@ class Ledger:
         """
         lost = 0
         while True:
-            rows = self._rows()
-            below = [row for row in rows if row.slot < total and row.state == _CLAIMED]
-            for row in below:
+            rows, free = self._open_to(owner, total)
+            for row in rows:
                 if row.owner == owner and not row.expired:
                     return self._as_claim(row)
-            for row in below:
+            for row in rows:
                 if row.expired and (claim := self._take_over(row, owner, lease_s)) is not None:
                     return claim
-            taken = {row.slot for row in rows}
-            free = [slot for slot in range(total) if slot not in taken]
             if not free:
                 return None
             # In order; processes that want the same one spread out.
@@ -210,6 +207,20 @@ class Ledger:
         )
         with self._engine.connect() as connection:
             return connection.execute(ended).scalar_one() >= total
+
+    def _open_to(self, owner: str, total: int) -> tuple[list[sa.Row[Any]], list[int]]:
+        """Return the slots that an owner holds or may take over, and those that nobody has ever claimed.
+
+        Whoever finds nothing to do asks again and again: it reads few rows, however many the study has.
+        """
+        within = (_of.study == self._study, _of.slot < total)
+        mine = (_of.state == _CLAIMED, sa.or_(_of.owner == owner, _of.expires_s <= self._now))
+        with self._engine.connect() as connection:
+            rows = list(connection.execute(self._select(_of.slot < total, *mine)).all())
+            if connection.execute(sa.select(sa.func.count()).where(*within)).scalar_one() >= total:
+                return rows, []
+            taken = set(connection.execute(sa.select(_of.slot).where(*within)).scalars())
+        return rows, [slot for slot in range(total) if slot not in taken]
 
     def _rows(self, *where: sa.ColumnElement[bool]) -> list[sa.Row[Any]]:
         with self._engine.connect() as connection:
