@@ -46,6 +46,8 @@ class SweepView:
         self._began = time.monotonic()
         self._before: set[int] | None = None
         """Slots that had ended before this start."""
+        self._begun_before = 0
+        """Trials that were under way then: the rest of one says nothing of how long a trial takes."""
         self._told: set[int] = set()
         self._courses: dict[int, collections.deque[float]] = {}
         self._evaluated: dict[int, str] = {}
@@ -71,6 +73,7 @@ class SweepView:
         ended = {slot.slot for slot in slots if slot.outcome is not None}
         if self._before is None:
             self._before, self._told = set(ended), set(ended)
+            self._begun_before = sum(bool(slot.progress) for slot in slots if slot.outcome is None)
         for slot in slots:
             self._follow(slot)
             if self._live is None and slot.slot in ended - self._told:
@@ -108,7 +111,7 @@ class SweepView:
         told = ", ".join(f"{counts[one]} {word}" for one, word in _OUTCOMES.items())
         here = ended - len(self._before or ())
         hours = (time.monotonic() - self._began) / 3600
-        rate = here / hours if here else None
+        rate = here / hours if here > self._begun_before else None
         grid = Table.grid(padding=(0, 2))
         grid.add_column(style="dim")
         grid.add_column()

@@ -30,11 +30,11 @@ def slot(number, outcome=None, values=None, **attrs):
     )
 
 
-def shown(slots, is_terminal=True):
+def shown(slots, is_terminal=True, first=()):
     text = io.StringIO()
     console = Console(file=text, force_terminal=is_terminal, width=100, height=30, color_system=None)
     with SweepView(PLAN, 2, console) as view:
-        view.show([])
+        view.show(first)
         view.show(slots)
     return text.getvalue()
 
@@ -49,6 +49,13 @@ def test_it_tells_how_many_trials_ended_how_and_which_is_best():
     view = shown([*ENDED, slot(2)])
     for words in ("2 of 4: 1 done, 1 pruned, 0 failed", "trial 0, race score 8.25 s", "8,192", "51 %"):
         assert words in view
+
+
+def test_the_rest_of_a_trial_from_before_says_nothing_of_the_time_that_is_left():
+    assert "an hour" in shown([*ENDED, slot(2)])
+    under_way = [slot(0), slot(1)]
+    assert "an hour" not in shown([*ENDED, slot(2)], first=under_way)
+    assert "an hour" in shown([*ENDED, slot(2, "COMPLETE", [9.0])], first=under_way)
 
 
 def test_before_the_first_trial_it_says_what_is_waited_for():
