@@ -41,6 +41,8 @@ from .verdict import Verdict
 
 Value = TypeVar("Value")
 Start = tuple[ActorCritic, Lineage]
+_MOST_TRIES = 3
+"""How often a run is begun or gone on with at the same checkpoint, if each time its process is lost."""
 _SHOWN = ("iteration", "env_steps", "completion", "entropy", "eval_completion", "eval_lap_time_s")
 """Columns of metrics.jsonl for the live table."""
 
@@ -160,7 +162,8 @@ class TrialRun:
     def begins(self, run_dir: Path) -> None:
         """Note where the run lies, before it is recorded anywhere."""
         run = {"seed": self._now, "run_dir": str(run_dir.resolve()), "status": None, "value": None}
-        self._note(self._now, run)
+        known = self._runs[self._now] if self._now < len(self._runs) else {}
+        self._note(self._now, run | {key: known[key] for key in ("tries", "tried_at") if key in known})
         # The entropy pruner reads the run's rows there.
         self._patiently(lambda: self._trial.set_user_attr("run_dir", run["run_dir"]))
 
@@ -192,6 +195,9 @@ class TrialRun:
         """Return what the trial is, as told to `deepracer-exp train` (of a clone: `clone`)."""
         told = self._trial.user_attrs.get("overrides")
         if told is None:
+            # The study's cache knows a trial that it has not made itself once it has read all of them; not every
+            # sampler asks for them.
+            self._patiently(lambda: self._study.get_trials(deepcopy=False))
             told = self._patiently(lambda: self._plan.space.suggest(self._trial))
             self._lease.confirm()
             self._patiently(lambda: self._trial.set_user_attr("overrides", told))
@@ -202,10 +208,14 @@ class TrialRun:
         began = time.monotonic()
         known = self._runs[index] if index < len(self._runs) else None
         self._pruned_by = None
+        if known is not None and (lost := self._lost_again(known)) is not None:
+            self._note(index, lost)
+            return lost
         outcome = None if known is None else self._gone_on(Path(known["run_dir"]))
         if outcome is None:
             outcome = self._trained(index, overrides)
         if outcome.status == "interrupted":
+            self._note(index, self._runs[index] | {"tries": 0})
             raise Interrupted
         decision = outcome.summary.get("stopping") or {}
         run = {
@@ -241,6 +251,29 @@ class TrialRun:
         if index:
             experiment, composition, start = self._composed([*own, f"seed={experiment.seed + index}"])
         return train(experiment, composition, Console(quiet=True), start, self)
+
+    def _lost_again(self, run: dict[str, Any]) -> dict[str, Any] | None:
+        """Count that a run is gone on with; return it as failed where it takes its process with it each time."""
+        kept = [
+            path for path in kept_checkpoints(Path(run["run_dir"]) / "checkpoints") if path.name.isdecimal()
+        ]
+        at = int(kept[0].name) if kept else 0
+        lost = run.get("tries", 1) if run.get("tried_at", 0) == at else 0
+        self._note(self._now, run | {"tried_at": at, "tries": lost + 1})
+        if lost < _MOST_TRIES:
+            return None
+        reason = f"its worker was lost {lost} times after iteration {at}: killed, or ended by what it ran"
+        metrics = Path(run["run_dir"]) / "metrics.jsonl"
+        last = (read_metrics(metrics) or [{}])[-1] if metrics.is_file() else {}
+        return {
+            **run,
+            "status": "failed",
+            "fate": "failed",
+            "reason": reason,
+            "traceback": reason,
+            "env_steps": last.get("env_steps", 0),
+            "wall_clock_s": last.get("wall_clock_s", 0.0),
+        }
 
     def _composed(self, overrides: list[str]) -> tuple[Experiment, Composition, Start | None]:
         if self._plan.parent is None:

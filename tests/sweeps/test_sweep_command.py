@@ -5,6 +5,7 @@ import shlex
 
 import optuna
 import pytest
+from optuna.trial import TrialState
 
 from deepracer_exp.formats.run_files import read_config, read_object
 from sweeps.storage import open_storage
@@ -130,6 +131,27 @@ def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_p
     assert "all 3 trials so far failed" in ended.complaint
     assert "ZeroDivisionError" in ended.complaint
     states = [trial.state for trial in load(tmp_path, "f").trials]
-    assert states.count(optuna.trial.TrialState.FAIL) >= 3
-    assert optuna.trial.TrialState.PRUNED not in states
+    assert states.count(TrialState.FAIL) >= 3
+    assert TrialState.PRUNED not in states
     assert all("ZeroDivisionError" in t.user_attrs["traceback"] for t in load(tmp_path, "f").trials[:3])
+
+
+@pytest.mark.slow
+def test_a_trial_that_takes_its_worker_with_it_each_time_fails_and_the_others_are_made(start, tmp_path):
+    (tmp_path / "deadly.py").write_text(
+        "import os\n\nDEADLY = 0\n\n\n"
+        "def reward_function(params):\n"
+        "    if DEADLY and params['steps'] > 4:\n"
+        "        os.kill(os.getpid(), 9)\n"
+        "    return params['speed']\n"
+    )
+    ended = start(
+        *(*TINY, "study=d", "reward.constants.DEADLY=0,1", "sweep.sampler=grid", "sweep.trials=2"),
+        "reward.file=deadly.py",
+    ).end()
+    assert ended.code == 0, ended.stderr
+    states = {trial.params["reward.constants.DEADLY"]: trial.state for trial in load(tmp_path, "d").trials}
+    assert states == {0: TrialState.COMPLETE, 1: TrialState.FAIL}
+    (failed,) = load(tmp_path, "d").get_trials(states=(TrialState.FAIL,))
+    assert failed.user_attrs["reason"].startswith("its worker was lost 3 times after iteration 0")
+    assert failed.user_attrs["attempt"] == 4

@@ -1,0 +1,54 @@
+"""Trials as a worker makes them in a real database, but for their trainings."""
+
+from typing import get_args
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.sweep import Sampler, compose_sweep
+from deepracer_exp.training.signals import Interruption
+from sweeps.plan import Plan
+from sweeps.space import SearchSpace
+from sweeps.storage import open_storage
+from sweeps.study import open_study
+from sweeps.trial_run import Result, TrialRun
+from sweeps.worker import Worker
+
+SPACE = {
+    "grid": ("algorithm.lr=1e-4,3e-4,1e-3", "network=mlp_small,mlp"),
+    "cmaes": ("algorithm.lr=tag(log,interval(1e-5,1e-3))", "algorithm.entropy_coeff=interval(0,0.05)"),
+}
+MIXED = ("algorithm.lr=tag(log,interval(1e-5,1e-3))", "network=mlp_small,mlp")
+
+
+@pytest.mark.parametrize("sampler", get_args(Sampler))
+def test_with_every_sampler_all_trials_draw_their_values_and_are_told(sampler, tmp_path, monkeypatch):
+    def untrained(self: TrialRun, overrides, attrs) -> Result:
+        return Result(outcome="COMPLETE", values=[9.0 + len(overrides)], attrs={**attrs, "reason": "made up"})
+
+    monkeypatch.setattr(TrialRun, "_result", untrained)
+    searched = SPACE.get(sampler, MIXED)
+    told = [*searched, f"sweep.sampler={sampler}", "sweep.trials=5", "sweep.startup_trials=2", "tracking=off"]
+    request = compose_sweep([*told, "study=s"])
+    space = SearchSpace.from_request(request)
+    storage = open_storage(None, tmp_path)
+    open_study(request, told, space, storage, tmp_path)
+    plan = Plan(
+        study="s",
+        runs_dir=tmp_path,
+        config=request.entry.sweep,
+        protocol=compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation,
+        space=space,
+        parent=None,
+        store=None,
+        study_run_id=None,
+        evaluations=None,
+        cores=1,
+    )
+    Worker(plan, storage, "host:1:a").work(Interruption())
+    trials = optuna.load_study(study_name="s", storage=storage.optuna).trials
+    assert [trial.state for trial in trials] == [TrialState.COMPLETE] * 5, trials[0].user_attrs
+    assert all(set(trial.params) == {one.partition("=")[0] for one in searched} for trial in trials)
+    assert len({tuple(trial.params.values()) for trial in trials}) == 5
