@@ -30,6 +30,9 @@ from .several_tracks import in_own_words, several_tracks
 
 Config = TypeVar("Config")
 
+_UNREADABLE = (yaml.YAMLError, UnicodeDecodeError, RecursionError)
+"""What reading an option file that is no YAML raises, and one that holds itself."""
+
 _adapters: dict[type, TypeAdapter[Any]] = {}
 
 # Option files name the files beside them by it, whatever the working folder: ${conf:'reward/mine.py'}.
@@ -133,6 +136,9 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         mapping = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise BadInput(_explain(entry, parsed, error)) from error
+    except _UNREADABLE as error:
+        why = "it holds itself" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        raise BadInput(f"{_unreadable_file()}: no YAML that can be read: {why}") from error
     assert isinstance(mapping, dict)
     if has_tracks and TRACK in mapping and TRACK not in choices:
         raise BadInput("track: a list of tracks in a file; several are chosen as an override: track=[A,B]")
@@ -170,9 +176,10 @@ def compose_option(group: str, option: str, kind: type[Config]) -> Config:
         mapping = OmegaConf.to_container(
             _composed(None, [f"+{override_line(group, option)}"])[group], resolve=True
         )
-    except (HydraException, OmegaConfBaseException) as error:
+    except (*_UNREADABLE, HydraException, OmegaConfBaseException) as error:
         raise BadInput(f"{group}={option}: {' '.join(str(error).split())}") from error
-    assert isinstance(mapping, dict)
+    if not isinstance(mapping, dict):
+        raise BadInput(f"{group}={option}: {_short(mapping)} is no mapping of keys to values")
     try:
         return typed({str(key): value for key, value in mapping.items()}, kind)
     except BadInput as error:
@@ -278,6 +285,17 @@ def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
         key = next((o.key_or_group for o in parsed if o.key_or_group in text), parsed[0].key_or_group)
         return f"{key}: no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
     return f"{entry}: " + " ".join(text.split())
+
+
+def _unreadable_file() -> str:
+    """Return the option file that cannot be read, as far as it can be found; the project's own can."""
+    for folder in conf_dirs()[1:]:
+        for path in sorted(folder.rglob("*.yaml")):
+            try:
+                json.dumps(yaml.safe_load(path.read_bytes()), default=str)
+            except (*_UNREADABLE, ValueError):  # a mapping that holds itself
+                return str(path)
+    return "an option file"
 
 
 def _no_such_option(group: str, option: str, known: Sequence[str]) -> str:

@@ -9,7 +9,9 @@ from typing import IO
 
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError)
 """How a file or a member of an archive refuses to be read on."""
-_SIZE = 2**23
+SIZE = 2**23
+"""Of a block, in bytes."""
+_PIECE = 2**16
 _LONGEST_LINE = 2**24
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -20,9 +22,10 @@ class Blocks:
     A file that begins with the mark of UTF-16, as PowerShell writes logs, comes out as UTF-8.
     """
 
-    def __init__(self, stream: IO[bytes], size: int = _SIZE) -> None:
+    def __init__(self, stream: IO[bytes]) -> None:
         self.stream = stream
-        self.size = size
+        self.size = SIZE
+        self._torn = False
         self.lines = 0
         """Lines before the block that is out."""
         self.refused: list[tuple[int | None, str]] = []
@@ -64,9 +67,18 @@ class Blocks:
             chunk = self._read()
 
     def _read(self) -> bytes:
-        try:
-            return self.stream.read(self.size)
-        except READ_ERRORS as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            self.refused.append((None, f"cannot be read to its end ({reason})"))
-            return b""
+        # In pieces: what a torn archive still gave before its end would be lost with the piece that fails.
+        pieces, size = [], 0
+        while size < self.size and not self._torn:
+            try:
+                piece = self.stream.read(min(_PIECE, self.size - size))
+            except READ_ERRORS as error:
+                reason = " ".join(str(error).split()) or type(error).__name__
+                self.refused.append((None, f"cannot be read to its end ({reason})"))
+                self._torn = True
+                break
+            if not piece:
+                break
+            pieces.append(piece)
+            size += len(piece)
+        return b"".join(pieces)

@@ -1,13 +1,13 @@
 """The files of a folder or of an archive, and what their places in it say."""
 
 import bz2
+import contextlib
 import gzip
 import lzma
 import re
 import stat
 import tarfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
@@ -15,7 +15,7 @@ from typing import IO, Any
 from deepracer_exp.errors import BadInput
 
 from .log_blocks import READ_ERRORS
-from .recording import LogProblem
+from .recording import LogProblem, readable
 
 _KIND = re.compile(r"(?:^|[-_.])(training|evaluation|leaderboard)(?=[-_.]|$)", re.IGNORECASE)
 _FOLDERS = {"training": "training", "evaluation": "evaluation", "leaderboard": "leaderboard"}
@@ -25,13 +25,12 @@ _STAMP = re.compile(r"\d{14}|\d{4}-\d\d-\d\dT[\d:.]+Z")
 _ENDINGS = re.compile(
     r"(?:-(?:robomaker|sagemaker|simulation|training))?(?:\.(?:log|txt|csv|json))?(?:\.\d+)?$"
 )
-_PACKED = re.compile(r"\.(?:tar|tgz|tbz2?|txz|(?:tar\.)?(?:gz|bz2|xz))$", re.IGNORECASE)
-_DRIVEN = re.compile(r"\.(?:csv|log)(?:\.\d+)?$")
-_OPEN: Mapping[bytes, Any] = {
-    b"\x1f\x8b": gzip.open,
-    b"BZh": bz2.open,
-    b"\xfd7zXZ": lzma.open,
-}
+LOG = re.compile(r"(?:\.(?:log|txt|out|err)(?:\.\d{1,4})?|^(?:stdout|stderr))$", re.IGNORECASE)
+"""Names of files that may be logs."""
+# The group is there where it is one packed file and no archive.
+_PACKED = re.compile(r"\.(?:tar|tgz|tbz2?|txz|tar\.(?:gz|bz2|xz)|(gz|bz2|xz))$", re.IGNORECASE)
+_OPEN: Mapping[str, Any] = {"gz": gzip.open, "bz2": bz2.open, "xz": lzma.open}
+_MARKS = {b"\x1f\x8b": "gz", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,10 @@ class LogFile:
     """Names of the folders it is in, as far as they may tell something, and its own."""
     opener: Callable[..., IO[bytes]]
     given: tuple[object, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Make the names ones that can be shown."""
+        object.__setattr__(self, "parts", tuple(readable(part) for part in self.parts))
 
     def open(self) -> IO[bytes]:
         """Open it for reading."""
@@ -126,7 +129,7 @@ def same_job(one: str, other: str) -> bool:
     return bool(stamps[0] and stamps[1] and first and first == second)
 
 
-@contextmanager
+@contextlib.contextmanager
 def log_folder(path: Path) -> Iterator[LogFolder]:
     """Find the files below a folder and in the archives there, in one archive, or the one file.
 
@@ -139,12 +142,13 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
         mode = path.stat().st_mode
         if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
             raise BadInput(f"{path}: is no file or folder; accepted: logs of the service or a run's folder")
-        with ExitStack() as opened:
+        with contextlib.ExitStack() as opened:
             if stat.S_ISDIR(mode):
                 yield _walk(path, opened)
             elif _is_packed(path):
                 found = LogFolder(apart=False)
-                _unpack(found, path, (), path.resolve().parts[-3:-1], opened)
+                archives = opened.enter_context(contextlib.closing(_Archives()))
+                _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
                 yield found
             else:
                 yield LogFolder([LogFile(path, path.resolve().parts[-3:], path.open, ("rb",))])
@@ -158,7 +162,7 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
         raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
 
 
-def _walk(root: Path, opened: ExitStack) -> LogFolder:
+def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
     found = LogFolder()
     above = root.resolve().parts[-2:]
     waiting, packed = [root], []
@@ -180,10 +184,15 @@ def _walk(root: Path, opened: ExitStack) -> LogFolder:
                 parts = (*above, *entry.relative_to(root).parts)
                 found.files.append(LogFile(entry, parts, entry.open, ("rb",)))
     found.files.sort(key=lambda file: file.order)
+    archives = opened.enter_context(contextlib.closing(_Archives()))
     for path in sorted(packed):
         folders = (*above, *path.relative_to(root).parts[:-1])
+        plain = path.with_name(_PACKED.sub("", path.name))
         try:
-            _unpack(found, path, (*folders, _PACKED.sub("", path.name)), folders, opened)
+            if plain.is_file():
+                found.problems.append(LogProblem(str(path), None, f"not read: {plain.name} lies beside it"))
+            else:
+                _unpack(found, path, (*folders, path.name), folders, archives)
         except (*READ_ERRORS, ValueError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason})"))
@@ -193,86 +202,118 @@ def _walk(root: Path, opened: ExitStack) -> LogFolder:
 def _is_packed(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(512)
-    return head.startswith(tuple(_OPEN)) or head[257:262] == b"ustar"
+    return head.startswith(tuple(_MARKS)) or head[257:262] == b"ustar"
+
+
+class _Archives:
+    """Opens members of archives, of which one at a time is open: a folder may hold more than a process may open."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._archive: tarfile.TarFile | None = None
+
+    def open(self, path: Path, member: tarfile.TarInfo) -> IO[bytes]:
+        """Open a member for reading; one of another archive must have been read."""
+        if self._archive is None or self._path != path:
+            self.close()
+            self._path, self._archive = path, tarfile.open(path, "r:*")  # noqa: SIM115 - closed by the next or the last
+        stream = self._archive.extractfile(member)
+        if stream is None:
+            raise OSError(f"{member.name} is no plain file")
+        ending = _ending(member.name)
+        return stream if ending is None else _OPEN[ending](stream)
+
+    def close(self) -> None:
+        """Close what is open."""
+        if self._archive is not None:
+            self._archive.close()
 
 
 def _unpack(
-    found: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], opened: ExitStack
+    found: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], archives: _Archives
 ) -> None:
     """Add the members of an archive, or the one file that is packed.
 
     Args:
         found: what they are added to.
         path: of the archive or packed file.
-        inside: folders that the members of an archive are in.
+        inside: folders that the members of an archive are in; none if it is all there is.
         beside: folders that a packed file is in.
-        opened: what is closed in the end.
+        archives: that open them.
 
     Raises:
-        OSError: it cannot be read.
-        tarfile.TarError: it is no archive and nothing packed.
+        OSError: it cannot be read, or is no archive and nothing packed.
     """
     try:
-        archive = opened.enter_context(tarfile.open(path, "r:*"))  # noqa: SIM115 - the stack closes it
+        with tarfile.open(path, "r:*") as archive:
+            members = _members(path, archive, archives)
     except tarfile.ReadError:
         with path.open("rb") as file:
             head = file.read(8)
-        opener = next((known for mark, known in _OPEN.items() if head.startswith(mark)), None)
+        opener = next((_OPEN[ending] for mark, ending in _MARKS.items() if head.startswith(mark)), None)
         if opener is None:
-            raise
-        with opener(path, "rb") as stream:
+            raise OSError("neither an archive nor packed" if head else "empty") from None
+        with opener(path) as stream:
             stream.read(1)
-        found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path, "rb")))
+        found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path,)))
         return
-    members = _members(path, archive)
-    if inside and not any(_DRIVEN.search(file.name) for file in members.files):
+    if inside and not any(_holds_drives(file.name) for file in members.files):
+        found.problems += members.problems
         found.files.append(
             LogFile(path, (*beside, path.name), path.open, ("rb",))
         )  # a model for the car, perhaps
         return
     found.apart = False
     found.problems += members.problems
-    again = _unpacked(path, members) if inside else None
-    if again is not None:
-        found.problems.append(LogProblem(str(path), None, f"not read: {again} beside it holds the same"))
-        return
-    found.files += [replace(file, parts=(*inside, *file.parts)) for file in members.files]
+    rest = [file for file in members.files if not inside or not _lies_beside(path, file)]
+    if len(rest) < len(members.files):
+        count = len(members.files) - len(rest)
+        reason = f"{count} of {len(members.files)} files are not read: the same lie unpacked beside it"
+        found.problems.append(LogProblem(str(path), None, reason))
+    found.files += [replace(file, parts=(*inside, *file.parts)) for file in rest]
 
 
-def _unpacked(path: Path, members: LogFolder) -> str | None:
-    """Return the name of what lies beside an archive and has the drives in it."""
-    for file in members.files:
-        if _DRIVEN.search(file.name):
-            named = (_PACKED.sub("", path.name),)
-            for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
-                if path.parent.joinpath(*place).is_file():
-                    return place[0]
-    return None
+def _lies_beside(path: Path, file: LogFile) -> bool:
+    """Tell whether a member of an archive lies unpacked beside it: the same name, the same size."""
+    named = (_PACKED.sub("", path.name),)
+    _, member = file.given
+    assert isinstance(member, tarfile.TarInfo)
+    for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
+        with contextlib.suppress(OSError):  # not there, or a name that no file system takes
+            if path.parent.joinpath(*place).stat().st_size == member.size:
+                return True
+    return False
 
 
-def _members(path: Path, archive: tarfile.TarFile) -> LogFolder:
+def _holds_drives(name: str) -> bool:
+    return name.lower().endswith(".csv") or LOG.search(name) is not None
+
+
+def _ending(name: str) -> str | None:
+    """Return how a packed file is packed, None for any other and for an archive."""
+    packed = _PACKED.search(name)
+    return packed[1].lower() if packed is not None and packed[1] else None
+
+
+def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFolder:
     """List the members in the order in which they stand: going back in an archive means reading it anew."""
     found = LogFolder(apart=False)
-    members: dict[str, tarfile.TarInfo] = {}
+    members: dict[tuple[str, ...], tarfile.TarInfo] = {}
     try:
         while (member := archive.next()) is not None:
             if member.isfile():
-                members.pop(member.name, None)
-                members[member.name] = member  # the later one counts, as in unpacking
+                parts = tuple(
+                    part for part in PurePosixPath(member.name).parts if part not in ("/", "..", ".")
+                )
+                members.pop(parts, None)
+                members[parts] = member  # the later one counts, as in unpacking
             elif member.islnk() or member.issym():
                 found.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
     except (*READ_ERRORS, ValueError, OverflowError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         found.problems.append(LogProblem(str(path), None, f"cannot be read to its end ({reason})"))
-    for name, member in members.items():
-        parts = tuple(part for part in PurePosixPath(name).parts if part not in ("/", "..", "."))
+    for parts, member in members.items():
         if parts:
-            found.files.append(LogFile(path.joinpath(*parts), parts, _open, (archive, member)))
+            plain = parts if _ending(parts[-1]) is None else (*parts[:-1], _PACKED.sub("", parts[-1]))
+            found.files.append(LogFile(path.joinpath(*parts), plain, archives.open, (path, member)))
     return found
-
-
-def _open(archive: tarfile.TarFile, member: tarfile.TarInfo) -> IO[bytes]:
-    stream = archive.extractfile(member)
-    if stream is None:
-        raise OSError(f"{member.name} is no plain file")
-    return stream

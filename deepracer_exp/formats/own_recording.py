@@ -137,10 +137,15 @@ def _last(found: Sequence[Path], counts: list[int], problems: list[LogProblem]) 
 def _count(path: Path, problems: list[LogProblem]) -> int:
     """Return the rows of a file, 0 for one that cannot be read."""
     try:
-        return int(pq.read_metadata(path).num_rows)
+        found = pq.read_metadata(path)
     except (OSError, pa.ArrowException) as error:
         problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
         return 0
+    missing = [name for name in _READ if name not in found.schema.to_arrow_schema().names]
+    if missing:
+        problems.append(LogProblem(str(path), None, f"left out: no column {', '.join(missing)}"))
+        return 0
+    return int(found.num_rows)
 
 
 def _numbers(column: pa.ChunkedArray) -> np.ndarray:

@@ -76,6 +76,11 @@ EVALUATED_COLUMNS: Mapping[str, tuple[str, str]] = {
 """Columns of `Recording.evaluated`: type and meaning with unit."""
 
 
+def readable(name: str) -> str:
+    """Return a file's name with a question mark for each byte that is no UTF-8."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
 def empty(columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
     """Return a table of these columns without rows."""
     return pd.DataFrame({name: pd.Series(dtype=kind) for name, (kind, _) in columns.items()})
@@ -91,6 +96,10 @@ class LogProblem:
     reason: str
     lines: int = 1
     """How many lines it stands for; after the first of a file that cannot be read, the others are only counted."""
+
+    def __post_init__(self) -> None:
+        """Make the name of the file one that can be shown."""
+        object.__setattr__(self, "file", readable(self.file))
 
     def __str__(self) -> str:
         """Return it as one line."""

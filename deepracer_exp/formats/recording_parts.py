@@ -1,11 +1,13 @@
 """What each file of a recording tells, before it is put together."""
 
+import heapq
 import json
 import re
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
@@ -15,7 +17,7 @@ from . import step_tables
 from .hyperparameters import Hyperparameters, read_hyperparameters
 from .json_object import MAX_BYTES
 from .log_blocks import READ_ERRORS
-from .log_folder import LogFile, LogFolder, Place, place_of
+from .log_folder import LOG, LogFile, LogFolder, Place, natural, place_of
 from .metrics_json import MetricsJson, read_metrics_json
 from .model_metadata import ModelMetadata, read_model_metadata
 from .recording import TRAINING, LogProblem
@@ -23,9 +25,10 @@ from .sim_trace_csv import read_trace_csv
 from .step_tables import StepTables
 from .training_log import MARKER, TrainingLog, read_training_log
 
+Result = TypeVar("Result")
+
 MOST_LISTED = 20
 """Lines of one file that are listed one by one; the others are counted."""
-_LOG = re.compile(r"(?:\.(?:log|txt|out|err)(?:\.\d{1,4})?|^(?:stdout|stderr))$", re.IGNORECASE)
 _NUMBER = re.compile(r"(\d{1,9})-iteration")
 _METADATA = re.compile(r"model_metadata.*\.json")
 _HYPERPARAMETERS = re.compile(r"hyper_?parameters.*?(?:\.json)?")
@@ -65,6 +68,13 @@ class Parts:
     files: list[LogFile] = field(default_factory=list)
     problems: list[LogProblem] = field(default_factory=list)
 
+    @property
+    def left_out(self) -> bool:
+        """Whether there were more steps than are held."""
+        return any(trace.steps.left_out for trace in self.traces) or any(
+            log.steps.left_out for _, log in self.logs
+        )
+
     def add(self, other: "Parts") -> None:
         """Add what other files tell."""
         for part in fields(self):
@@ -90,22 +100,18 @@ def read_parts(folder: LogFolder) -> Parts:
     alone = len(folder.files) == 1
     whole = Parts(problems=list(folder.problems))
     others: list[LogFile] = []
-    held = 0
+    held = _Held()
     # The members of an archive come out of one stream.
     with ThreadPoolExecutor(_THREADS if folder.apart else 1) as pool:
-        found = pool.map(lambda file: _read_one(file, alone), folder.files)
+        found = _in_turn(pool, lambda file: _read_one(file, alone), folder.files)
         for file, (parts, known) in zip(folder.files, found, strict=True):
             whole.add(parts)
-            held += sum(steps.rows for _, steps in _steps_of_files(parts))
-            held -= _leave_out_first(whole, held - step_tables.MOST_STEPS)
+            held.add(parts)
             if known:
                 whole.files.append(file)
             elif not parts.problems and not _BESIDE.fullmatch(file.name):
                 others.append(file)
-    for file, steps in _steps_of_files(whole):
-        if steps.left_out:
-            reason = step_tables.left_out(steps.left_out)
-            whole.problems.append(LogProblem(str(file.path), None, reason, lines=steps.left_out))
+    whole.problems += held.problems()
     if others:
         named = ", ".join("/".join(file.parts[-2:]) for file in others[:_MOST_NAMED])
         more = ", …" if len(others) > _MOST_NAMED else ""
@@ -114,24 +120,63 @@ def read_parts(folder: LogFolder) -> Parts:
     return whole
 
 
-def _steps_of_files(parts: Parts) -> list[tuple[LogFile, StepTables]]:
-    """Return the steps of each file, a training's first, in the order of reading."""
-    found = [(trace.file, trace.steps) for trace in parts.traces] + [
-        (file, log.steps) for file, log in parts.logs
-    ]
-    return sorted(found, key=lambda one: (place_of(one[0].parts).kind != TRAINING, one[0].order))
+class _Held:
+    """The steps of all files that were read, in the order in which they go if there are too many."""
+
+    def __init__(self) -> None:
+        self._steps: list[tuple[Any, LogFile, StepTables]] = []
+        self._next: list[tuple[Any, int]] = []
+        self._rows = 0
+
+    def add(self, parts: Parts) -> None:
+        """Add what one file tells, and let go of the first steps of all while there are too many."""
+        for trace in parts.traces:
+            self._put((1, trace.place, trace.number or 0), trace.file, trace.steps)
+        for file, log in parts.logs:
+            # Before CSVs, which have more digits; of a rolled log the highest number is the oldest piece.
+            stem, _, number = file.name.rpartition(".")
+            age = -int(number) if number.isdigit() else 1
+            name = stem if number.isdigit() else file.name
+            self._put((0, place_of((*file.parts[:-1], name)), age), file, log.steps)
+        while self._rows > step_tables.MOST_STEPS:
+            _, first = self._next[0]
+            steps = self._steps[first][2]
+            if steps.rows:
+                self._rows -= steps.rows
+                steps.leave_out_first()
+                self._rows += steps.rows
+            else:
+                heapq.heappop(self._next)
+
+    def problems(self) -> list[LogProblem]:
+        """Return what was left out of each file."""
+        return [
+            LogProblem(str(file.path), None, step_tables.left_out(steps.left_out), lines=steps.left_out)
+            for _, file, steps in sorted(self._steps, key=lambda one: one[0])
+            if steps.left_out
+        ]
+
+    def _put(self, where: tuple[int, Place, int], file: LogFile, steps: StepTables) -> None:
+        if not (steps.rows or steps.left_out):
+            return
+        is_csv, place, age = where
+        key = (place.kind != TRAINING, is_csv, natural("/".join(place.root)), age, place.worker, file.order)
+        heapq.heappush(self._next, (key, len(self._steps)))
+        self._steps.append((key, file, steps))
+        self._rows += steps.rows
 
 
-def _leave_out_first(parts: Parts, too_many: int) -> int:
-    """Let go of the first steps of all, of at least so many, and return how many those were."""
-    gone = 0
-    for _, steps in _steps_of_files(parts) if too_many > 0 else ():
-        before = steps.rows
-        while gone < too_many and steps.rows:
-            steps.leave_out_first()
-            gone += before - steps.rows
-            before = steps.rows
-    return gone
+def _in_turn(
+    pool: ThreadPoolExecutor, read: Callable[[LogFile], Result], files: Sequence[LogFile]
+) -> Iterator[Result]:
+    """Read files side by side and yield what they tell in their order; few of them wait to be taken."""
+    waiting: deque[Future[Result]] = deque()
+    for file in files:
+        waiting.append(pool.submit(read, file))
+        if len(waiting) > _THREADS:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 def _read_one(file: LogFile, alone: bool) -> tuple[Parts, bool]:
@@ -148,7 +193,7 @@ def _read_one(file: LogFile, alone: bool) -> tuple[Parts, bool]:
 def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
     """Read one file; return whether it was one that tells something."""
     name = file.name
-    if name.endswith(".csv"):
+    if name.lower().endswith(".csv"):
         return _read_csv(parts, file)
     if _METADATA.fullmatch(name):
         with file.open() as stream:
@@ -176,7 +221,7 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         if world:
             parts.worlds[params[1]] = world
         return True
-    return _read_log(parts, file) if alone or _LOG.search(name) else False
+    return _read_log(parts, file) if alone or LOG.search(name) else False
 
 
 def _read_csv(parts: Parts, file: LogFile) -> bool:

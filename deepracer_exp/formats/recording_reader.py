@@ -1,5 +1,6 @@
 """Reads what anybody recorded of a training or a race: folders and archives of all layouts, single files, our runs."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from .recording import (
     Recording,
     Round,
     empty,
+    readable,
 )
 from .recording_drives import (
     EPISODES_PER_ITERATION,
@@ -60,7 +62,7 @@ def read_recording(path: Path) -> Recording:
     with log_folder(path) as folder:
         parts = read_parts(folder)
     name = path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".tgz")
-    recording = _Assembly(parts).recording(name)
+    recording = _Assembly(parts).recording(readable(name))
     if not (len(recording.steps) or len(recording.updates) or len(recording.told)):
         why = f" ({recording.problems[0]})" if recording.problems else ""
         raise BadInput(f"{path}: no recorded drive{why}; accepted: trace CSVs or logs of the service")
@@ -78,8 +80,11 @@ class _Assembly:
         self.logs = _rolled(parts.logs)
         self.drives = [*self._drives_of_csv()]
         self.roots: dict[int, tuple[str, ...]] = {}
+        self.copies: dict[tuple[str, ...], Drives] = {}
+        """Trainings that stand in another place, too, by their folders."""
         for number, (files, log) in enumerate(self.logs):
             self._add_log(number, files, log)
+        self._without_copies()
         self._without_repeats()
         self.training = [one for one in self.drives if one.place.kind == TRAINING]
         self.rounds = sorted(
@@ -188,6 +193,18 @@ class _Assembly:
             )
             self.problems.append(LogProblem(str(file.path), None, reason, lines=rest.table.num_rows))
 
+    def _without_copies(self) -> None:
+        """Leave out drives that stand in two places, as a folder and its copy do."""
+        known: dict[tuple[str, bytes, bytes], Drives] = {}
+        for one in list(self.drives):
+            times = one.table["tstamp"].to_numpy()
+            first = known.setdefault((one.place.kind, one.key.tobytes(), times.tobytes()), one)
+            if first is not one and len(times):
+                reason = f"{len(times)} steps are those of {'/'.join(first.place.root)}: left out"
+                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=len(times)))
+                self.drives.remove(one)
+                self.copies[one.place.root] = one
+
     def _without_repeats(self) -> None:
         for number, one in enumerate(self.drives):
             twice = repeated(one)
@@ -255,38 +272,66 @@ class _Assembly:
         for number, (files, log) in enumerate(self.logs):
             if not log.updates:
                 continue
-            begin = first.get(self._round(files[0], self.roots[number]), 0)
+            of = self._round(files[0], self.roots[number])
+            if of is None:
+                continue
+            if first and of not in first:
+                self._leave_out(files[0], "policy updates", len(log.updates))
+                continue
+            begin = first.get(of, 0)
             for iteration, update in zip(_iterations(log.updates), log.updates, strict=True):
                 row = {"iteration": begin + iteration, "value_loss": np.nan, **update._asdict()}
                 rows.setdefault((row["iteration"], update.epoch), row)
         return _table([rows[key] for key in sorted(rows)], UPDATE_COLUMNS)
 
-    def _round(self, file: LogFile, root: tuple[str, ...]) -> int:
-        """Return the round that a file tells of: by its drives, its name, or the folder it is in."""
-        if root in self.rounds or len(self.rounds) == 1:
+    def _round(self, file: LogFile, root: tuple[str, ...]) -> int | None:
+        """Return the round that a file tells of: by its drives, its name, or the folder it is in.
+
+        None: of a copy, whose files tell it a second time.
+        """
+        if root in self.copies:
+            return None
+        if root in self.rounds or (len(self.rounds) == 1 and not self.copies):
             return self.rounds.index(root) if root in self.rounds else 0
         names: dict[tuple[str, ...], list[str]] = {}
-        for one in self.training:
+        for one in (*self.training, *self.copies.values()):
             names.setdefault(one.place.root, []).extend(one.names)
 
-        def nearness(number: int) -> tuple[bool, int]:
-            of = self.rounds[number]
+        def nearness(of: tuple[str, ...]) -> tuple[bool, int]:
             common = next(
                 (at for at, (a, b) in enumerate(zip(of, file.parts, strict=False)) if a != b), len(of)
             )
-            return any(same_job(file.name, known) for known in names[of]), common
+            return any(same_job(file.name, known) for known in names.get(of, ())), common
 
-        return max(range(len(self.rounds)), key=nearness)
+        nearest = max((*self.rounds, *self.copies), key=nearness)
+        return self.rounds.index(nearest) if nearest in self.rounds else None
+
+    def _leave_out(self, file: LogFile, what: str, count: int) -> None:
+        """List what is told of steps that are left out."""
+        reason = f"{count} {what}: the steps they tell of are left out"
+        self.problems.append(LogProblem(str(file.path), None, reason, lines=count))
 
     def _told(self, numbers: Numbers) -> pd.DataFrame:
         rows: list[dict[str, Any]] = []
+        evaluated: set[tuple[str, str]] = set()
+        begins: dict[tuple[int, int], int] = {}
+        for of, own_worker, own in numbers if self.parts.left_out else ():
+            begins[of, own_worker] = min(own, begins.get((of, own_worker), own))
         evaluations = self._evaluations()
         for file, metrics in self.parts.metrics:
             if not metrics.rows:
                 continue
             if _of_training(file, metrics):
                 worker, number = place_of(file.parts).worker, self._round(file, ())
+                if number is None:
+                    continue
+                begin = begins.get((number, worker), math.inf if begins else 0)
+                gone = sum(row["episode"] < begin for row in metrics.rows)
+                if gone:
+                    self._leave_out(file, "episodes", gone)
                 for row in metrics.rows:
+                    if row["episode"] < begin:
+                        continue
                     key = (number, worker, row["episode"])
                     episode = numbers.get(key)
                     if episode is None:
@@ -298,6 +343,10 @@ class _Assembly:
                     if any(same_job(file.name, known) for known in one.names):
                         stream = name
                         break
+                # Of an evaluation whose folder was copied.
+                if (stream, repr(metrics.rows)) in evaluated:
+                    continue
+                evaluated.add((stream, repr(metrics.rows)))
                 rows += [{**row, "stream": stream, "worker": 0} for row in metrics.rows]
         rows.sort(key=lambda row: (0, row["episode"]) if row["stream"] == TRAINING else (1, 0))
         return _table(rows, TOLD_COLUMNS)

@@ -14,7 +14,7 @@ about 2.5 GB."""
 
 def left_out(steps: int) -> str:
     """Return why so many steps are not read."""
-    return f"{steps:,} steps left out: of a recording the last {MOST_STEPS:,} are looked at"
+    return f"{steps:,} steps of it are left out: of a recording the last {MOST_STEPS:,} are held"
 
 
 class StepTables:
@@ -22,6 +22,8 @@ class StepTables:
 
     def __init__(self, tables: Iterable[pa.Table] = (), left_out: int = 0) -> None:
         self._tables = deque(tables)
+        self.rows = sum(table.num_rows for table in self._tables)
+        """Rows held."""
         self.left_out = left_out
         """Rows that are gone."""
 
@@ -35,17 +37,15 @@ class StepTables:
     def add(self, table: pa.Table) -> None:
         """Add rows that stand behind the others; let go of the first tables if there are too many."""
         self._tables.append(table)
+        self.rows += table.num_rows
         while self.rows > MOST_STEPS and len(self._tables) > 1:
             self.leave_out_first()
 
     def leave_out_first(self) -> None:
         """Let go of the first table; its memory is free then, as it would not be of a part of it."""
-        self.left_out += self._tables.popleft().num_rows
-
-    @property
-    def rows(self) -> int:
-        """Number of rows held."""
-        return sum(table.num_rows for table in self._tables)
+        gone = self._tables.popleft().num_rows
+        self.rows -= gone
+        self.left_out += gone
 
     @property
     def told(self) -> bool:

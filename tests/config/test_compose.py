@@ -350,6 +350,8 @@ def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
         ("friction_scale: [0.3, wet]", ["randomization=mine", "friction_scale", "wet"]),
         ("friction: [0.3, 0.4]", ["randomization=mine", "friction", "no such key"]),
         ("friction_scale: ${car.nothing}", ["randomization=mine", "car.nothing"]),
+        ("x: [1", ["randomization=mine", "mine.yaml"]),
+        ("a: &a [*a]", ["randomization=mine"]),
     ],
 )
 def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, monkeypatch):
@@ -367,3 +369,21 @@ def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, mon
 def test_an_option_by_itself_that_is_not_there_is_refused_with_the_nearest():
     with pytest.raises(BadInput, match=r"randomization=sim2rael: no such .*did you mean sim2real"):
         compose_option("randomization", "sim2rael", RandomizationConfig)
+
+
+def test_an_option_that_is_no_mapping_is_refused(tmp_path, monkeypatch):
+    own = tmp_path / "conf" / "randomization"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text("- a\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInput, match="randomization=mine"):
+        compose_option("randomization", "mine", RandomizationConfig)
+
+
+@pytest.mark.parametrize("raw", [b"x: [1", b"x: \xff", b"a: &a [*a]"])
+def test_an_option_file_that_is_no_yaml_is_named(raw, tmp_path, monkeypatch):
+    own = tmp_path / "conf" / "reward"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_bytes(raw)
+    monkeypatch.chdir(tmp_path)
+    assert refusal("reward=mine").startswith(str(own / "mine.yaml"))

@@ -231,6 +231,7 @@ def write_folder(files: dict[str, str], folder: Path) -> Path:
 
 def write_archive(files: dict[str, str], path: Path) -> Path:
     """Write the files as a tar.gz below one folder, in no helpful order."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with tarfile.open(path, "w:gz") as archive:
         for name in sorted(files, key=lambda name: name[::-1]):
             member = tarfile.TarInfo(f"model/{name}")

@@ -7,7 +7,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from deepracer_exp.formats import step_tables
+from deepracer_exp.formats import log_blocks, step_tables
 from deepracer_exp.formats.recording_reader import read_recording
 from deepracer_exp.formats.trace import read_trace
 from deepracer_exp.formats.training_log import read_training_log
@@ -23,6 +23,7 @@ def most_steps(monkeypatch):
 
     def most(steps: int) -> None:
         monkeypatch.setattr(step_tables, "MOST_STEPS", steps)
+        monkeypatch.setattr(log_blocks, "SIZE", 2**16)
 
     return most
 
@@ -31,21 +32,14 @@ def test_of_a_log_longer_than_memory_the_last_steps_are_held_and_the_others_coun
     raw = "".join(made.log_text(made.drives([episode], seed=episode)) for episode in range(4000)).encode()
     assert len(raw) > 2**21
     lines = raw.count(b"SIM_TRACE_LOG")
-    whole = read_training_log(Pieces(raw)).steps
+    whole = read_training_log(io.BytesIO(raw)).steps
     assert (whole.rows, whole.left_out) == (lines, 0)
     most_steps(lines // 3)
-    last = read_training_log(Pieces(raw)).steps
+    last = read_training_log(io.BytesIO(raw)).steps
     assert last.rows + last.left_out == lines
     assert lines // 6 < last.rows <= lines // 3
     rows = whole.whole.to_pandas()[last.left_out :].reset_index(drop=True)
     pd.testing.assert_frame_equal(last.whole.to_pandas(), rows, check_categorical=False)
-
-
-class Pieces(io.BytesIO):
-    """Hands out a sixteenth of a megabyte at a time."""
-
-    def read(self, size: int | None = -1) -> bytes:
-        return super().read(2**16)
 
 
 def peak_of_arrow(raw: bytes) -> int:
@@ -53,7 +47,7 @@ def peak_of_arrow(raw: bytes) -> int:
     counting = pa.proxy_memory_pool(before)
     pa.set_memory_pool(counting)
     try:
-        read_training_log(Pieces(raw))
+        read_training_log(io.BytesIO(raw))
         return counting.max_memory()
     finally:
         pa.set_memory_pool(before)
@@ -81,8 +75,10 @@ def test_of_many_files_the_first_of_the_training_go_and_evaluations_stay(tmp_pat
     rest = short.steps[short.steps["stream"] == "training"]
     assert sorted(set(rest["iteration"])) == iterations[1:]
     assert len(short.steps) - len(rest) == len(whole.steps) - training
-    told = [problem for problem in short.problems if "left out: of a recording the last" in problem.reason]
-    assert any(f"{training - len(rest)} steps" in problem.reason for problem in told)
+    told = [
+        problem for problem in short.problems if "are left out: of a recording the last" in problem.reason
+    ]
+    assert any(f"{training - len(rest)} steps of it" in problem.reason for problem in told)
     assert all(str(tmp_path) in problem.file for problem in told)
 
 
@@ -101,5 +97,60 @@ def test_of_a_run_of_ours_the_last_iterations_are_read(trained, most_steps):
     )
     (problem,) = last.problems
     assert problem.lines == counts[:-2].sum()
-    assert problem.reason.startswith(f"{counts[:-2].sum():,} steps left out: of a recording the last")
+    assert problem.reason.startswith(
+        f"{counts[:-2].sum():,} steps of it are left out: of a recording the last"
+    )
     assert len(last.updates) == len(counts)
+
+
+def test_of_a_rolled_log_the_oldest_pieces_go(tmp_path, most_steps):
+    pieces = {".10": [0, 1], ".2": [2, 3], ".1": [4, 5], "": [6, 7]}
+    for ending, episodes in pieces.items():
+        log = made.log_text(made.drives(episodes, seed=episodes[0] + 1))
+        (tmp_path / f"robomaker.log{ending}").write_text(log)
+    assert set(read_recording(tmp_path).steps["episode"]) == set(range(8))
+    most_steps(3 * 12)
+    assert set(read_recording(tmp_path).steps["episode"]) == set(range(2, 8))
+    most_steps(12)
+    assert set(read_recording(tmp_path).steps["episode"]) == {6, 7}
+
+
+def test_of_several_workers_the_first_iterations_go(tmp_path, most_steps):
+    made.write_folder(made.drfc_workers(), tmp_path)
+    whole = read_recording(tmp_path)
+    counts = whole.steps.groupby("iteration").size()
+    most_steps(int(counts.iloc[1:].sum()))
+    short = read_recording(tmp_path)
+    assert set(short.steps["iteration"]) == set(counts.index[1:])
+    assert set(short.steps["worker"]) == set(whole.steps["worker"])
+
+
+def test_what_is_told_of_steps_that_are_left_out_is_left_out_and_counted(tmp_path, most_steps):
+    rounds = {
+        name: {
+            **{
+                f"sim-trace/training/training-simtrace/{n}-iteration.csv": made.csv_text(
+                    made.drives([2 * n, 2 * n + 1], seed=100 * seed + n)
+                )
+                for n in range(3)
+            },
+            f"logs/training/training-2024010{seed}101010-a-sagemaker.log": made.trainer_text(3),
+            f"metrics/training/training-2024010{seed}101010-a.json": made.training_metrics(
+                made.drives(range(6), seed=seed)
+            ),
+        }
+        for seed, name in ((1, "a"), (2, "b"))
+    }
+    for name, files in rounds.items():
+        made.write_folder(files, tmp_path / name)
+    whole = read_recording(tmp_path)
+    assert (len(whole.steps), len(whole.told), whole.updates["iteration"].nunique()) == (72, 12, 6)
+    most_steps(36)
+    last = read_recording(tmp_path)
+    assert (len(last.steps), len(last.told), last.updates["iteration"].nunique()) == (36, 6, 3)
+    reasons = [problem.reason for problem in last.problems]
+    assert any("policy updates: the steps they tell of are left out" in reason for reason in reasons)
+    assert any("6 episodes: the steps they tell of are left out" in reason for reason in reasons)
+    most_steps(60)
+    last = read_recording(tmp_path)
+    assert sorted(last.told["episode"]) == sorted(set(last.steps["episode"]))
