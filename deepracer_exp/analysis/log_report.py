@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from deepracer_exp.formats.recording import Recording
+from deepracer_exp.formats.recording import Recording, readable
 from deepracer_exp.formats.whole_file import write_whole
 
 from .chart import Chart
@@ -87,7 +87,7 @@ def html(page: LogPage) -> str:
         sections = [Section("Another reward function", page.replay.charts), *sections]
     drawn = [(section.title, [_Figure.of(chart) for chart in section.charts]) for section in sections]
     figures = {figure.name: figure for _, some in drawn for figure in some}
-    files = [str(file) for file in recording.files]
+    files = [readable(str(file)) for file in recording.files]
     return render(
         __package__,
         "log_report.html.j2",

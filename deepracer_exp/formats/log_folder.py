@@ -257,7 +257,7 @@ def _unpack(
             stream.read(1)
         found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path,)))
         return
-    if inside and not any(_holds_drives(file.name) for file in members.files):
+    if inside and not any(map(_tells, members.files)):
         found.problems += members.problems
         found.files.append(
             LogFile(path, (*beside, path.name), path.open, ("rb",))
@@ -285,8 +285,14 @@ def _lies_beside(path: Path, file: LogFile) -> bool:
     return False
 
 
-def _holds_drives(name: str) -> bool:
-    return name.lower().endswith(".csv") or LOG.search(name) is not None
+def _tells(file: LogFile) -> bool:
+    """Tell whether a file may be a trace, a log or metrics."""
+    name = "/".join(file.parts).lower()
+    return (
+        name.endswith(".csv")
+        or LOG.search(file.name) is not None
+        or ("metric" in name and name.endswith(".json"))
+    )
 
 
 def _ending(name: str) -> str | None:

@@ -77,8 +77,9 @@ EVALUATED_COLUMNS: Mapping[str, tuple[str, str]] = {
 
 
 def readable(name: str) -> str:
-    """Return a file's name with a question mark for each byte that is no UTF-8."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    """Return a file's name with a mark for each byte that is no UTF-8 and for what would steer a terminal."""
+    text = name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def empty(columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:

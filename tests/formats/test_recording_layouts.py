@@ -4,6 +4,7 @@ import bz2
 import gzip
 import io
 import lzma
+import os
 import resource
 import tarfile
 from pathlib import Path
@@ -321,6 +322,28 @@ def test_logs_of_any_name_are_read_in_an_archive_packed_or_not(tmp_path):
             recording = read_recording(place)
             assert len(recording.steps) == 6, (place, name)
             assert not recording.problems
+
+
+def test_an_archive_of_metrics_alone_is_read(tmp_path):
+    made.write_folder(made.training_csvs("sim-trace/training/training-simtrace"), tmp_path)
+    metrics = {
+        "metrics/training/training-20240101101010-a.json": made.training_metrics(made.whole_training())
+    }
+    made.write_archive(metrics, tmp_path / "rest.tar.gz")
+    recording = read_recording(tmp_path)
+    assert not recording.problems
+    assert len(recording.told) == 6
+
+
+def test_a_name_that_is_no_utf_8_can_be_shown(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/tr\xff\x1b[31m"))
+    folder.mkdir()
+    (folder / "robomaker.log").write_text(made.log_text(made.drives([0])) + "SIM_TRACE_LOG:1\n")
+    recording = read_recording(folder)
+    assert len(recording.steps) == 6
+    told = [recording.name, *map(str, recording.problems), *recording.steps["stream"].unique()]
+    assert "tr\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}[31m" in "".join(told)
+    assert "".join(told).isprintable()
 
 
 def test_a_folder_may_hold_more_archives_than_a_process_may_open(tmp_path):
