@@ -32,9 +32,13 @@ def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
 
 
 def reranked(study: optuna.Study) -> list[Mapping[str, Any]]:
-    """Return what the best trials came to on fresh laps, the best first; empty before that."""
-    objectives = objectives_of(study)
-    return sorted(study.user_attrs.get("reranked") or (), key=lambda one: cost(objectives, one["values"]))
+    """Return what the best trials came to on fresh laps, the best first; empty before that.
+
+    They are not the best any more once trials have been made since.
+    """
+    objectives, count = objectives_of(study), len(complete_trials(study))
+    found = study.user_attrs.get("reranked") if study.user_attrs.get("reranked_of", count) == count else None
+    return sorted(found or (), key=lambda one: cost(objectives, one["values"]))
 
 
 def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
@@ -45,7 +49,7 @@ def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def best_trial(study: optuna.Study) -> FrozenTrial:
-    """Return the winner: the one the sweep has told, the first of those re-ranked, or the best complete trial.
+    """Return the winner: the first of those re-ranked, or else the best complete trial.
 
     Raises:
         BadInput: no trial is complete.
@@ -53,7 +57,7 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
     complete = complete_trials(study)
     if not complete:
         raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
-    told = study.user_attrs.get("best") or next(iter(reranked(study)), {})
+    told = next(iter(reranked(study)), {})
     return next((trial for trial in complete if trial.number == told.get("trial")), complete[0])
 
 
@@ -75,8 +79,8 @@ def best_line(study: optuna.Study) -> str:
         BadInput: no trial is complete.
     """
     overrides = [str(override) for override in best_trial(study).user_attrs.get("overrides", ())]
-    if parent := study.user_attrs.get("parent"):
-        return shlex.join(["deepracer-exp", "clone", f"run={parent}", *overrides])
+    if parent := study.user_attrs.get("parent_run"):
+        return shlex.join(["deepracer-exp", "clone", *parent, *overrides])
     return shlex.join(["deepracer-exp", "train", *overrides])
 
 

@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import re
 import time
 import uuid
 from collections.abc import Callable, Sequence
@@ -129,7 +130,9 @@ class Driver:
         ended = [slot for slot in slots if slot.outcome is not None]
         if len(ended) < min(_FEW, self._plan.config.trials) or any(slot.outcome != "FAIL" for slot in ended):
             return
-        why = collections.Counter(str(slot.attrs.get("reason")) for slot in ended)
+        # The same error names the file of another run in each.
+        folder = re.escape(str(self._plan.folder.resolve())) + r"/[^/\s:]+"
+        why = collections.Counter(re.sub(folder, "RUN", str(slot.attrs.get("reason"))) for slot in ended)
         ((reason, count),) = why.most_common(1)
         self._end()
         raise RunFailed(f"all {len(ended)} trials so far failed, {count} of them with: {reason}")

@@ -19,8 +19,8 @@ class Plan:
     config: SweepConfig
     protocol: EvaluationConfig
     space: SearchSpace
-    parent: str | None
-    """The run that trials are clones of, as it was given."""
+    parent: tuple[str, ...]
+    """Overrides that name the run and the checkpoint that trials are clones of, the same for all; else none."""
     store: Store | None
     """Where runs are recorded; None with `tracking=off`."""
     study_run_id: str | None

@@ -1,8 +1,9 @@
 """What chooses the values of the next trial, by name."""
 
+import copy
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import numpy as np
@@ -131,6 +132,43 @@ class _EndlessGrid(GridSampler):
         pass
 
 
+class _PrunedToo(GPSampler):
+    """Learns from pruned trials what they were worth at their end.
+
+    Optuna's own knows complete and running trials only: where the best guess is pruned it guesses the same again.
+    """
+
+    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        return super().infer_relative_search_space(_WithPruned(study), trial)
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        return super().sample_relative(_WithPruned(study), trial, search_space)
+
+
+class _WithPruned(Study):
+    """A study whose pruned trials count as complete."""
+
+    def __init__(self, study: Study):
+        self.__dict__ |= study.__dict__
+
+    def _get_trials(
+        self, deepcopy: bool = True, states: Container[TrialState] | None = None, use_cache: bool = False
+    ) -> list[FrozenTrial]:
+        found = super()._get_trials(deepcopy, None, use_cache)
+        seen = [_as_complete(trial) for trial in found]
+        return [trial for trial in seen if states is None or trial.state in states]
+
+
+def _as_complete(trial: FrozenTrial) -> FrozenTrial:
+    if trial.state != TrialState.PRUNED or trial.values is None:
+        return trial
+    seen = copy.copy(trial)
+    seen.state = TrialState.COMPLETE
+    return seen
+
+
 def _make(config: SweepConfig, space: SearchSpace, grid: Values, slot: int) -> BaseSampler:
     seed = int(np.random.SeedSequence([config.seed, slot]).generate_state(1)[0])
     startup = config.startup_trials
@@ -142,7 +180,7 @@ def _make(config: SweepConfig, space: SearchSpace, grid: Values, slot: int) -> B
             )
         case "gp":
             # It would warn at each trial that keys which only some trials have are left to chance.
-            return GPSampler(n_startup_trials=startup, seed=seed, warn_independent_sampling=False)
+            return _PrunedToo(n_startup_trials=startup, seed=seed, warn_independent_sampling=False)
         case "cmaes":
             # As for gp, and the same of choices.
             return CmaEsSampler(

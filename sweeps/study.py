@@ -15,9 +15,9 @@ from .labels import MEASURES
 from .space import SearchSpace
 from .storage import Storage
 
-_MAY_DIFFER = (
+MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
-    *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps"),
+    *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps", "runs_dir"),
 )
 """Keys that change nothing of what the trials are."""
 _SAME = ("objectives", "seeds", "protocol", "parent")
@@ -46,6 +46,11 @@ def load_study(name: str, storage: Storage) -> Study:
     return study
 
 
+def goes_on(overrides: Sequence[str]) -> bool:
+    """Tell whether overrides say nothing of what the trials are: they name a study to go on with."""
+    return not {override.partition("=")[0].strip().lstrip("+~") for override in overrides} - {*MAY_DIFFER}
+
+
 def completed(overrides: Sequence[str], study: Study) -> list[str]:
     """Return the overrides that go on with a study, for which no more than its name need be given.
 
@@ -56,12 +61,20 @@ def completed(overrides: Sequence[str], study: Study) -> list[str]:
     Returns:
         Those it was begun with and the given ones; only the given ones if they say themselves what the trials are.
     """
-    keys = {override.partition("=")[0].strip().lstrip("+~") for override in overrides}
-    return list(overrides) if keys - {*_MAY_DIFFER} else [*study.user_attrs.get("overrides", ()), *overrides]
+    if not goes_on(overrides):
+        return list(overrides)
+    # The total of the start before this one: it may have been raised since the study was begun.
+    total = [f"sweep.trials={study.user_attrs['trials']}"] if "trials" in study.user_attrs else []
+    return [*study.user_attrs.get("overrides", ()), *total, *overrides]
 
 
 def open_study(
-    request: SweepRequest, overrides: Sequence[str], space: SearchSpace, storage: Storage, runs_dir: Path
+    request: SweepRequest,
+    overrides: Sequence[str],
+    space: SearchSpace,
+    parent: Sequence[str],
+    storage: Storage,
+    runs_dir: Path,
 ) -> Study:
     """Begin a study, or go on with the one of that name.
 
@@ -69,6 +82,7 @@ def open_study(
         request: what is asked for.
         overrides: that it was composed from.
         space: of the request.
+        parent: as `Plan.parent`.
         storage: where studies are.
         runs_dir: where its runs are.
 
@@ -82,6 +96,7 @@ def open_study(
         "seeds": sweep.seeds,
         "protocol": sweep.protocol,
         "parent": request.entry.parent,
+        "parent_run": list(parent),
         "runs_dir": str(runs_dir),
         # The address may have a password in it, and whoever goes on knows it.
         "overrides": [line for line in overrides if not line.lstrip("+").startswith("sweep.storage=")],

@@ -19,6 +19,7 @@ from deepracer_exp.config.running import TrackingConfig, TrackingOff
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest, compose_sweep
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import build_setup
+from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
 from deepracer_exp.tracking.tracking_file import Status
@@ -35,9 +36,10 @@ from .pruners import build_pruner
 from .samplers import build_sampler
 from .space import SearchSpace
 from .storage import Storage, open_storage, patiently
-from .study import completed, find_study, load_study, open_study
+from .study import MAY_DIFFER, completed, find_study, goes_on, load_study, open_study
 from .table import SweepView
 from .telling import tell_settled, tell_strays
+from .trial_run import Interrupted
 
 REPORT = "sweep.html"
 """A study's page, in the folder of its runs."""
@@ -58,24 +60,20 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
         RunFailed: all trials fail, or the database stays away.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    request = compose_sweep(overrides)
+    overrides, request, known = whole_request(overrides)
     runs_dir = _runs_dir(request)
-    # Before anything is searched for: a study of that name knows itself what it searches.
-    known = _known(request, runs_dir)
-    if known is not None:
-        overrides = completed(overrides, known)
-        request = compose_sweep(overrides)
     config = request.entry.sweep
     protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
     request = _without_rules(request)
-    space = SearchSpace.from_request(request, _check(request, runs_dir))
+    parent = _parent(request, runs_dir, known)
+    space = SearchSpace.from_request(request, _check(request, parent, runs_dir))
     build_sampler(config, space)
     build_pruner(config)
-    experiment = _experiment(request, space, runs_dir)
+    experiment = _experiment(request, parent, space, runs_dir)
     store = _store(experiment, runs_dir)
     with contextlib.closing(_launcher(config, runs_dir, store)) as launcher:
         storage = open_storage(config.storage, runs_dir)
-        study = open_study(request, overrides, space, storage, runs_dir)
+        study = open_study(request, overrides, space, parent, storage, runs_dir)
         study_run, study_run_id = begin_study_run(request, space, experiment.tracking, storage, runs_dir)
         plan = Plan(
             study=request.study,
@@ -83,10 +81,10 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
             config=config,
             protocol=protocol,
             space=space,
-            parent=request.entry.parent,
+            parent=parent,
             store=store,
             study_run_id=study_run_id,
-            evaluations=_evaluations(experiment),
+            evaluations=_evaluations(experiment, request),
             cores=launcher.cores,
         )
         if plan.study_run_id is not None:
@@ -99,6 +97,26 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
             if study_run is not None:
                 study_run.finish(status)
         return study, plan.folder, code
+
+
+def whole_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Study | None]:
+    """Return what is asked for, with what a study that is to go on knows itself, and that study.
+
+    Raises:
+        BadInput: an override is not accepted, there is nothing to search, or no study of that name to go on with.
+    """
+    request = compose_sweep(overrides)
+    known = _known(request, goes_on(overrides), _runs_dir(request))
+    if known is None:
+        return list(overrides), request, None
+    whole = completed(overrides, known)
+    request = compose_sweep(whole)
+    if not request.space:
+        raise BadInput(
+            f"study={request.study}: exists; to go on with it only {', '.join(MAY_DIFFER)} may be given beside its "
+            "name; for anything else give the whole search again"
+        )
+    return whole, request, known
 
 
 def begin_study_run(
@@ -146,7 +164,11 @@ def _driven(
                 return code
         for call in (tell_settled, tell_strays):
             patiently(partial(call, plan.study, ledger, storage.optuna), patience_s)
-        _conclude(plan, study, view, ledger)
+        try:
+            _conclude(plan, study, view, ledger, interruption)
+        except Interrupted:
+            assert interruption.exit_code is not None
+            return interruption.exit_code
         record(patiently(ledger.slots, patience_s))
     if study_run is not None:
         study_run.pictures([plan.folder / REPORT])
@@ -179,8 +201,12 @@ def _progress(slots: Sequence[Slot], plan: Plan, study: Study) -> Progress:
     )
 
 
-def _conclude(plan: Plan, study: Study, view: SweepView, ledger: Ledger) -> None:
-    """Find the winner, and write what is told of the study."""
+def _conclude(plan: Plan, study: Study, view: SweepView, ledger: Ledger, interruption: Interruption) -> None:
+    """Find the winner, and write what is told of the study.
+
+    Raises:
+        Interrupted: the process was told to end while the best trials drove.
+    """
     # Both take seconds to import, and workers shall begin before.
     from .report import write_report
 
@@ -192,13 +218,18 @@ def _conclude(plan: Plan, study: Study, view: SweepView, ledger: Ledger) -> None
         torch.set_num_threads(1)
 
         def tell(trial: FrozenTrial) -> None:
+            if interruption.signum is not None:
+                raise Interrupted
             view.stage = f"trial {trial.number} drives {plan.config.rerank_laps} fresh laps"
             view.show(ledger.slots())
 
         again = [{**asdict(one), "interval": list(one.interval)} for one in rerank(plan, study, tell)]
+        study.set_user_attr("reranked_of", len(complete_trials(study)))
         study.set_user_attr("reranked", again)
         view.stage = ""
         view.show(ledger.slots())
+    else:
+        study.set_user_attr("reranked", [])
     if complete_trials(study):
         write_best(study, plan.runs_dir)
     write_report(study, plan.folder / REPORT)
@@ -209,14 +240,13 @@ def _runs_dir(request: SweepRequest) -> Path:
     return Path(compose_experiment([f"runs_dir={given[-1]}"] if given else [])[0].runs_dir)
 
 
-def _known(request: SweepRequest, runs_dir: Path) -> Study | None:
+def _known(request: SweepRequest, must_be_there: bool, runs_dir: Path) -> Study | None:
     """Return the study that is asked for by its name, if it is there; no file is made for looking."""
     if request.entry.study is None:
         return None
     if request.entry.sweep.storage is None and not (runs_dir / "sweeps.db").exists():
         return None
-    # A name without anything to search is that of a study to go on with.
-    find = find_study if request.space else load_study
+    find = load_study if must_be_there else find_study
     return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))
 
 
@@ -228,27 +258,48 @@ def _without_rules(request: SweepRequest) -> SweepRequest:
     return replace(request, base=(*request.base, "stopping=none"))
 
 
-def _check(request: SweepRequest, runs_dir: Path) -> Any:
-    """Return what tries overrides: None as a training does, else as clones of the parent do."""
+def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple[str, ...]:
+    """Return what names the parent's run and checkpoint, as `Plan.parent`.
+
+    `best:NAME` and aliases lead elsewhere some day: they are looked up when a study is begun.
+    """
     parent = request.entry.parent
     if parent is None:
+        return ()
+    if known is not None and known.user_attrs.get("parent") == parent and "parent_run" in known.user_attrs:
+        return tuple(known.user_attrs["parent_run"])
+
+    from deepracer_exp.training.clone import prepare_clone
+
+    try:
+        _, lineage = prepare_clone([f"run={parent}", f"name={request.study}"], runs_dir, None).start
+    except BadInput as error:
+        raise BadInput(f"parent={parent}: {str(error).removeprefix(f'run={parent}: ')}") from error
+    return f"run={lineage.parent_dir}", f"checkpoint={int(lineage.checkpoint)}"
+
+
+def _check(request: SweepRequest, parent: tuple[str, ...], runs_dir: Path) -> Any:
+    """Return what tries overrides: None as a training does, else as clones of the parent do."""
+    if not parent:
         return None
 
     from deepracer_exp.training.clone import prepare_clone
 
     def check(overrides: list[str]) -> Mapping[str, Any]:
-        clone = prepare_clone([f"run={parent}", *overrides, f"name={request.study}"], runs_dir, None)
+        clone = prepare_clone([*parent, *overrides, f"name={request.study}"], runs_dir, None)
         return clone.composition.mapping
 
     return check
 
 
-def _experiment(request: SweepRequest, space: SearchSpace, runs_dir: Path) -> Experiment:
+def _experiment(
+    request: SweepRequest, parent: tuple[str, ...], space: SearchSpace, runs_dir: Path
+) -> Experiment:
     """Return the experiment of one trial, and read its files."""
-    if request.entry.parent is not None:
+    if parent:
         from deepracer_exp.training.clone import prepare_clone
 
-        line = [f"run={request.entry.parent}", *space.example(), f"name={request.study}"]
+        line = [*parent, *space.example(), f"name={request.study}"]
         return prepare_clone(line, runs_dir, None).experiment
     experiment, _ = compose_experiment(space.example())
     setup = build_setup(experiment)
@@ -261,8 +312,12 @@ def _store(experiment: Experiment, runs_dir: Path) -> Store | None:
     return None if isinstance(tracking, TrackingOff) else resolve_store(tracking.uri, runs_dir)
 
 
-def _evaluations(experiment: Experiment) -> int | None:
-    """Return how often a trial is evaluated on its way, None where the number of its iterations is not known."""
+def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
+    """Return how often a trial is evaluated on its way, None where that is not known or differs between trials."""
+    if {key.partition(".")[0] for key in request.space} & {"budget", "checkpoints", "experiment"} or any(
+        key == "algorithm" or key.endswith("_per_iteration") for key in request.space
+    ):
+        return None
     every, algorithm, budget = experiment.checkpoints.every, experiment.algorithm, experiment.budget
     if every is None or algorithm.frames_per_iteration is None:
         return None

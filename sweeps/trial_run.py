@@ -184,7 +184,7 @@ class TrialRun:
         """Tell Optuna of an evaluation, and return what the pruners say."""
         if len(self._plan.config.objectives) == 1:
             # Optuna compares trials by one number only.
-            rows = read_metrics(Path(self._runs[0]["run_dir"]) / "metrics.jsonl")
+            rows = _rows(Path(self._runs[0]["run_dir"]))
             step = 1 + sum(row["eval_completion"] is not None for row in rows)
             if step not in self._storage.get_trial(self._trial_id).intermediate_values:
                 self._trial.report(value, step)
@@ -198,10 +198,22 @@ class TrialRun:
             # The study's cache knows a trial that it has not made itself once it has read all of them; not every
             # sampler asks for them.
             self._patiently(lambda: self._study.get_trials(deepcopy=False))
-            told = self._patiently(lambda: self._plan.space.suggest(self._trial))
+            drawn = self._patiently(lambda: self._plan.space.suggest(self._trial))
+            told = self._with_own_seed(drawn)
             self._lease.confirm()
+            self._patiently(lambda: self._trial.set_user_attr("drawn", drawn))
             self._patiently(lambda: self._trial.set_user_attr("overrides", told))
         return list(told)
+
+    def _with_own_seed(self, drawn: list[str]) -> list[str]:
+        """Return what was drawn, with the next seed if an earlier trial drew the same: it would be the same run."""
+        trials = self._patiently(lambda: self._study.get_trials(deepcopy=False))
+        earlier = [trial.user_attrs.get("drawn") for trial in trials if trial.number < self._number]
+        again = earlier.count(drawn)
+        if not again:
+            return drawn
+        experiment, _, _ = self._composed(drawn)
+        return [*drawn, f"seed={experiment.seed + again * self._plan.config.seeds}"]
 
     def _made(self, index: int, overrides: Sequence[str]) -> dict[str, Any]:
         """Make the run of one seed, evaluate it, and note both."""
@@ -263,8 +275,7 @@ class TrialRun:
         if lost < _MOST_TRIES:
             return None
         reason = f"its worker was lost {lost} times after iteration {at}: killed, or ended by what it ran"
-        metrics = Path(run["run_dir"]) / "metrics.jsonl"
-        last = (read_metrics(metrics) or [{}])[-1] if metrics.is_file() else {}
+        last = (_rows(Path(run["run_dir"])) or [{}])[-1]
         return {
             **run,
             "status": "failed",
@@ -276,9 +287,9 @@ class TrialRun:
         }
 
     def _composed(self, overrides: list[str]) -> tuple[Experiment, Composition, Start | None]:
-        if self._plan.parent is None:
+        if not self._plan.parent:
             return *compose_experiment(overrides), None
-        clone = prepare_clone([f"run={self._plan.parent}", *overrides], self._plan.runs_dir, None)
+        clone = prepare_clone([*self._plan.parent, *overrides], self._plan.runs_dir, None)
         return clone.experiment, clone.composition, clone.start
 
     def _gone_on(self, run_dir: Path) -> Outcome | None:
@@ -368,3 +379,9 @@ class TrialRun:
             "mlflow_run_id": self._runs[0].get("mlflow_run_id"),
             **({"traceback": last["traceback"]} if "traceback" in last else {}),
         }
+
+
+def _rows(run_dir: Path) -> list[dict[str, Any]]:
+    """Return the rows of metrics.jsonl, none before there is a first."""
+    metrics = run_dir / "metrics.jsonl"
+    return read_metrics(metrics) if metrics.is_file() else []

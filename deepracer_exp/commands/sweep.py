@@ -1,6 +1,7 @@
 """`deepracer-exp sweep`: search for the values that race best."""
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 
@@ -48,9 +49,7 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "overrides", nargs="*", metavar="KEY=EXPRESSION | GROUP=OPTION | KEY=VALUE | report NAME | best NAME"
     )
     sweep.add_argument("--cfg", action="store_true", help="print the composed sweep as YAML and stop")
-    sweep.add_argument(
-        "--runs-dir", default="runs", help="for report and best: where runs are (default: runs)"
-    )
+    sweep.add_argument("--runs-dir", help="for report and best: where runs are (default: runs)")
     sweep.add_argument("--storage", help="for report and best: the study's database, as in sweep.storage")
     sweep.set_defaults(command=_sweep)
 
@@ -58,6 +57,10 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 def _sweep(args: argparse.Namespace) -> int:
     if args.overrides and args.overrides[0] in _WORDS:
         return _told(args)
+    if args.runs_dir is not None or args.storage is not None:
+        raise BadInput(
+            "--runs-dir and --storage are of report and best; write runs_dir=DIR or sweep.storage=URL"
+        )
     from deepracer_exp.config.sweep import compose_sweep
     from deepracer_exp.tracking.store import redact
     from sweeps.process import PRELOADED
@@ -67,6 +70,9 @@ def _sweep(args: argparse.Namespace) -> int:
     request = compose_sweep(args.overrides)
     args.debug = request.entry.debug
     if args.cfg:
+        from sweeps.sweep import whole_request
+
+        _, request, _ = whole_request(args.overrides)
         # What the command line says of the training stands where a ready-made sweep has it.
         request.composition.mapping["sweep"] |= {"train": list(request.base), "space": dict(request.space)}
         print(redact(request.composition.yaml()), end="")
@@ -84,7 +90,9 @@ def _sweep(args: argparse.Namespace) -> int:
     with warnings_on_stderr():
         study, folder, code = sweep(args.overrides, Console(stderr=True))
     if code:
-        print(f"\ninterrupted; `deepracer-exp sweep study={study.study_name}` goes on", file=sys.stderr)
+        where = [one for one in args.overrides if one.startswith(("runs_dir=", "sweep.storage="))]
+        line = redact(shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where]))
+        print(f"\ninterrupted; `{line}` goes on", file=sys.stderr)
         return code
     if complete_trials(study):
         _tell_best(study)
@@ -104,7 +112,7 @@ def _told(args: argparse.Namespace) -> int:
     from sweeps.study import load_study
     from sweeps.sweep import REPORT
 
-    runs_dir = Path(args.runs_dir)
+    runs_dir = Path(args.runs_dir or "runs")
     if args.storage is None and not (runs_dir / "sweeps.db").is_file():
         raise BadInput(f"--runs-dir {runs_dir}: has no sweeps.db; give the folder, or --storage URL")
     study = load_study(names[0], open_storage(args.storage, runs_dir))
@@ -116,9 +124,10 @@ def _told(args: argparse.Namespace) -> int:
 
 
 def _tell_best(study: object) -> None:
-    from sweeps.best import best_line, best_trial, best_values
+    from sweeps.best import best_line, best_trial, best_values, reranked
     from sweeps.labels import objectives_of, shown_values
 
     trial = best_trial(study)  # type: ignore[arg-type]
     values = shown_values(objectives_of(study), best_values(study))  # type: ignore[arg-type]
+    values += " on fresh laps" * any(one["trial"] == trial.number for one in reranked(study))  # type: ignore[arg-type]
     print(f"\nbest: trial {trial.number}, {values}\n\n  {best_line(study)}")  # type: ignore[arg-type]

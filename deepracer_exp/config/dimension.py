@@ -139,7 +139,7 @@ def _choices(line: str, elements: Sequence[Any]) -> Choices:
         value: Choice = element
         if isinstance(element, str | QuotedString | list | dict):
             value = _in_words(element)
-        if value in values:
+        if any(type(value) is type(one) and value == one for one in values):  # 1 == True
             raise BadInput(f"{line}: {as_override('', value)[1:]} stands there twice")
         values.append(value)
     return Choices(tuple(values))

@@ -45,8 +45,11 @@ def test_on_fresh_laps_another_trial_may_win(tmp_path):
     ]
     study.set_user_attr("reranked", again)
     assert (best_trial(study).number, best_values(study)) == (1, [9.3])
-    study.set_user_attr("best", {"trial": 2})
-    assert (best_trial(study).number, best_values(study)) == (2, [12.0])
+    study.set_user_attr("reranked_of", 3)
+    assert (best_trial(study).number, best_values(study)) == (1, [9.3])
+    # Trials made since may be better, and nobody has driven them on fresh laps.
+    add(study, [8.0])
+    assert (best_trial(study).number, best_values(study)) == (3, [8.0])
 
 
 def test_without_a_complete_trial_there_is_no_best(tmp_path):
@@ -61,8 +64,10 @@ def test_the_line_gives_back_every_override_when_a_shell_reads_it(tmp_path):
     overrides = ["algorithm.lr=0.0003", "network.hidden=[64, 64]", "reward.constants.NAME=it's <a> $HOME"]
     add(study, [9.0], overrides=overrides)
     assert shlex.split(best_line(study)) == ["deepracer-exp", "train", *overrides]
-    study.set_user_attr("parent", "my run")
-    assert shlex.split(best_line(study)) == ["deepracer-exp", "clone", "run=my run", *overrides]
+    study.set_user_attr("parent", "best:spring")
+    study.set_user_attr("parent_run", ["run=/my runs/a", "checkpoint=40"])
+    cloned = ["deepracer-exp", "clone", "run=/my runs/a", "checkpoint=40", *overrides]
+    assert shlex.split(best_line(study)) == cloned
 
 
 def with_runs(study, values):

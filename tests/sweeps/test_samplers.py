@@ -221,3 +221,19 @@ def test_a_sampler_searches_the_space_of_a_sweep(name):
 @functools.cache
 def real_space(*lines: str) -> SearchSpace:
     return SearchSpace.from_request(compose_sweep(list(lines)))
+
+
+def test_gp_does_not_ask_again_for_what_was_pruned():
+    study = optuna.create_study(sampler=build_sampler(settings("gp", startup_trials=1), Space()))
+    tried = []
+    for _ in range(10):
+        study.sampler = build_sampler(settings("gp", startup_trials=1), Space())
+        trial = study.ask()
+        tried.append(tuple(Space().suggest(trial).values()))
+        trial.report(100.0, 1)
+        # The best guess of a model that never hears of them would stay the same.
+        done = trial.number < 1
+        study.tell(
+            trial, 9.0 + trial.number if done else None, TrialState.COMPLETE if done else TrialState.PRUNED
+        )
+    assert len(set(tried)) == 10

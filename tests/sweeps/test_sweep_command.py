@@ -5,13 +5,14 @@ import shlex
 
 import optuna
 import pytest
+import yaml
 from optuna.trial import TrialState
 
 from deepracer_exp.formats.run_files import read_config, read_object
 from sweeps.storage import open_storage
 
 TINY = (
-    *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=2"),
+    *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=1"),
     *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=4", "sweep.protocol=three_trials"),
     *("sweep.workers=1", "sweep.rerank_laps=2"),
 )
@@ -40,7 +41,8 @@ def assert_nothing_begun(ended):
         ((LR, "sweep.protocol=three_trial"), ("three_trials",)),
         ((LR, "seed=0,1"), ("sweep.seeds",)),
         ((LR, "study=../evil"), ("study",)),
-        ((LR, "parent=no_such_run"), ("no_such_run",)),
+        ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
+        ((LR, "--storage", "sqlite:///x.db"), ("--storage", "sweep.storage=URL")),
         ((LR, "reward.file=missing.py"), ("missing.py",)),
         (
             (LR, "sweep.storage=postgresql+psycopg://me:secret@127.0.0.1:1/none"),
@@ -104,6 +106,20 @@ def test_another_search_under_the_same_name_is_refused_with_the_difference(swept
     assert ended.code == 2
     for word in ("study=s: exists", "algorithm.lr", "1e-3", "1e-2"):
         assert word in ended.complaint
+
+
+def test_a_study_that_goes_on_knows_its_search_and_says_what_else_may_be_given(swept, call_at):
+    shown = call_at(swept.cwd, "sweep", "study=s", "--cfg")
+    assert shown.code == 0
+    sweep = yaml.safe_load(shown.stdout)["sweep"]
+    assert (sweep["trials"], sweep["space"]) == (2, {"algorithm.lr": LR.partition("=")[2]})
+    load(swept.cwd, "s").set_user_attr("trials", 5)  # as `sweep.trials=5` leaves it
+    assert yaml.safe_load(call_at(swept.cwd, "sweep", "study=s", "--cfg").stdout)["sweep"]["trials"] == 5
+    load(swept.cwd, "s").set_user_attr("trials", 2)
+    refused = call_at(swept.cwd, "sweep", "study=s", "sweep.pruners=[]")
+    assert refused.code == 2
+    assert "study=s: exists; to go on with it only" in refused.complaint
+    assert "runs_dir" in refused.complaint
 
 
 def test_report_and_best_need_no_more_than_the_name(swept, call_at):

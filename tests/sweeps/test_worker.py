@@ -4,9 +4,9 @@ from typing import get_args
 
 import optuna
 import pytest
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import Sampler, compose_sweep
 from deepracer_exp.training.signals import Interruption
 from sweeps.plan import Plan
@@ -23,32 +23,49 @@ SPACE = {
 MIXED = ("algorithm.lr=tag(log,interval(1e-5,1e-3))", "network=mlp_small,mlp")
 
 
-@pytest.mark.parametrize("sampler", get_args(Sampler))
-def test_with_every_sampler_all_trials_draw_their_values_and_are_told(sampler, tmp_path, monkeypatch):
+def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
+    """Make the trials of a sweep, all of them worth nearly the same and none of them trained."""
+
     def untrained(self: TrialRun, overrides, attrs) -> Result:
         return Result(outcome="COMPLETE", values=[9.0 + len(overrides)], attrs={**attrs, "reason": "made up"})
 
     monkeypatch.setattr(TrialRun, "_result", untrained)
-    searched = SPACE.get(sampler, MIXED)
-    told = [*searched, f"sweep.sampler={sampler}", "sweep.trials=5", "sweep.startup_trials=2", "tracking=off"]
+    told = [*asked, "sweep.startup_trials=2", "tracking=off"]
     request = compose_sweep([*told, "study=s"])
     space = SearchSpace.from_request(request)
     storage = open_storage(None, tmp_path)
-    open_study(request, told, space, storage, tmp_path)
+    open_study(request, told, space, (), storage, tmp_path)
     plan = Plan(
         study="s",
         runs_dir=tmp_path,
         config=request.entry.sweep,
         protocol=compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation,
         space=space,
-        parent=None,
+        parent=(),
         store=None,
         study_run_id=None,
         evaluations=None,
         cores=1,
     )
     Worker(plan, storage, "host:1:a").work(Interruption())
-    trials = optuna.load_study(study_name="s", storage=storage.optuna).trials
+    return optuna.load_study(study_name="s", storage=storage.optuna).trials
+
+
+@pytest.mark.parametrize("sampler", get_args(Sampler))
+def test_with_every_sampler_all_trials_draw_their_values_and_are_told(sampler, tmp_path, monkeypatch):
+    searched = SPACE.get(sampler, MIXED)
+    trials = made(tmp_path, monkeypatch, *searched, f"sweep.sampler={sampler}", "sweep.trials=5")
     assert [trial.state for trial in trials] == [TrialState.COMPLETE] * 5, trials[0].user_attrs
     assert all(set(trial.params) == {one.partition("=")[0] for one in searched} for trial in trials)
     assert len({tuple(trial.params.values()) for trial in trials}) == 5
+
+
+def test_what_is_drawn_again_is_trained_with_the_next_seed(tmp_path, monkeypatch):
+    asked = ("network=mlp_small,mlp", "seed=7", "sweep.sampler=random", "sweep.trials=6", "sweep.seeds=2")
+    seeds: dict[str, list[int]] = {}
+    for trial in made(tmp_path, monkeypatch, *asked):
+        experiment, _ = compose_experiment(trial.user_attrs["overrides"])
+        seeds.setdefault(trial.params["network"], []).append(experiment.seed)
+    assert sorted(map(len, seeds.values()))[-1] >= 3
+    for found in seeds.values():
+        assert found == [7 + 2 * again for again in range(len(found))]
