@@ -31,7 +31,8 @@ def write_long_log(source: Path, target: Path, size_bytes: int) -> int:
                     written += file.write(line)
                     continue
                 prefix, episode, values = line
-                later = b"%.3f" % (float(values[_TIME]) + turn * lasting_s)
+                time = values[_TIME]
+                later = b"%.3f%b" % (float(time) + turn * lasting_s, time[len(time.rstrip()) :])
                 told = [*values[:_TIME], later, *values[_TIME + 1 :]]
                 written += file.write(b"%b%d,%b" % (prefix, episode + turn * episodes, b",".join(told)))
                 steps += 1
@@ -41,6 +42,6 @@ def write_long_log(source: Path, target: Path, size_bytes: int) -> int:
 
 def _taken_apart(line: bytes) -> bytes | tuple[bytes, int, list[bytes]]:
     step = _STEP.fullmatch(line)
-    if step is not None and step[3].count(b",") > _TIME:
+    if step is not None and step[3].count(b",") >= _TIME:
         return step[1], int(step[2]), step[3].split(b",")
     return b"" if b"Training> Name" in line else line

@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.best_of_sweep import BestOfSweep, write_best_of_sweep
 
-from .labels import MEASURES, objectives_of
+from .labels import MEASURES, objectives_of, shown_values
 
 _LEAST_SHARE = 0.01  # of the lap; a trial that never moved must not divide by zero
 
@@ -70,6 +70,16 @@ def best_values(study: optuna.Study) -> list[float]:
     trial = best_trial(study)
     again = next((one for one in reranked(study) if one["trial"] == trial.number), None)
     return list(trial.values if again is None else again["values"])
+
+
+def best_shown(study: optuna.Study) -> str:
+    """Return the values of the best trial in words, and whether fresh laps gave them.
+
+    Raises:
+        BadInput: no trial is complete.
+    """
+    number, values = best_trial(study).number, shown_values(objectives_of(study), best_values(study))
+    return values + " on fresh laps" * any(one["trial"] == number for one in reranked(study))
 
 
 def best_line(study: optuna.Study) -> str:

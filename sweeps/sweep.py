@@ -25,10 +25,9 @@ from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
-from .best import best_line, best_trial, best_values, complete_trials, reranked, write_best
+from .best import best_line, best_shown, best_trial, best_values, complete_trials, write_best
 from .database import resolve_database
 from .driver import Driver
-from .labels import shown_values
 from .launch import Launcher, LocalLauncher
 from .ledger import Ledger, Slot
 from .plan import Plan
@@ -189,12 +188,11 @@ def _progress(slots: Sequence[Slot], plan: Plan, study: Study) -> Progress:
     if not complete_trials(study):
         return Progress(**told)
     best = best_trial(study)
-    fresh = any(one["trial"] == best.number for one in reranked(study))
     return Progress(
         **told,
         best_trial=best.number,
         best_values=dict(zip(plan.config.objectives, best_values(study), strict=True)),
-        best_shown=shown_values(plan.config.objectives, best_values(study)) + " on fresh laps" * fresh,
+        best_shown=best_shown(study),
         best_line=best_line(study),
         lap_time_s=best.user_attrs.get("lap_time_s"),
         completion=best.user_attrs.get("completion"),

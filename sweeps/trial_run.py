@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import optuna
 from optuna.storages import BaseStorage
+from optuna.trial import FrozenTrial
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import ActorCritic
@@ -195,21 +196,19 @@ class TrialRun:
         """Return what the trial is, as told to `deepracer-exp train` (of a clone: `clone`)."""
         told = self._trial.user_attrs.get("overrides")
         if told is None:
-            # The study's cache knows a trial that it has not made itself once it has read all of them; not every
-            # sampler asks for them.
-            self._patiently(lambda: self._study.get_trials(deepcopy=False))
+            # Before anything is drawn: the study's cache knows a trial that it has not made itself once it has read all
+            # of them, and not every sampler asks for them.
+            trials = self._patiently(lambda: self._study.get_trials(deepcopy=False))
             drawn = self._patiently(lambda: self._plan.space.suggest(self._trial))
-            told = self._with_own_seed(drawn)
+            told = self._with_own_seed(drawn, [one for one in trials if one.number < self._number])
             self._lease.confirm()
             self._patiently(lambda: self._trial.set_user_attr("drawn", drawn))
             self._patiently(lambda: self._trial.set_user_attr("overrides", told))
         return list(told)
 
-    def _with_own_seed(self, drawn: list[str]) -> list[str]:
+    def _with_own_seed(self, drawn: list[str], earlier: Sequence[FrozenTrial]) -> list[str]:
         """Return what was drawn, with the next seed if an earlier trial drew the same: it would be the same run."""
-        trials = self._patiently(lambda: self._study.get_trials(deepcopy=False))
-        earlier = [trial.user_attrs.get("drawn") for trial in trials if trial.number < self._number]
-        again = earlier.count(drawn)
+        again = sum(trial.user_attrs.get("drawn") == drawn for trial in earlier)
         if not again:
             return drawn
         experiment, _, _ = self._composed(drawn)

@@ -124,10 +124,7 @@ def _told(args: argparse.Namespace) -> int:
 
 
 def _tell_best(study: object) -> None:
-    from sweeps.best import best_line, best_trial, best_values, reranked
-    from sweeps.labels import objectives_of, shown_values
+    from sweeps.best import best_line, best_shown, best_trial
 
-    trial = best_trial(study)  # type: ignore[arg-type]
-    values = shown_values(objectives_of(study), best_values(study))  # type: ignore[arg-type]
-    values += " on fresh laps" * any(one["trial"] == trial.number for one in reranked(study))  # type: ignore[arg-type]
-    print(f"\nbest: trial {trial.number}, {values}\n\n  {best_line(study)}")  # type: ignore[arg-type]
+    number, shown = best_trial(study).number, best_shown(study)  # type: ignore[arg-type]
+    print(f"\nbest: trial {number}, {shown}\n\n  {best_line(study)}")  # type: ignore[arg-type]

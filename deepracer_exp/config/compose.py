@@ -19,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from deepracer_exp.errors import BadInput, nearest
 
 from . import custom_files
+from .contradictions import check_together
 from .custom_files import Beneath, beneath, read_custom_files
 from .evaluation import EvaluateConfig
 from .experiment import Experiment
@@ -193,7 +194,7 @@ def validate(mapping: dict[str, Any]) -> Experiment:
         BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
     """
     experiment = typed(mapping, Experiment)
-    _check_together(experiment)
+    check_together(experiment)
     return experiment
 
 
@@ -362,58 +363,3 @@ def _lookup(mapping: Any, path: list[str]) -> Any:
 def _short(value: Any) -> str:
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _check_together(experiment: Experiment) -> None:
-    """Refuse values that are each accepted but contradict one another."""
-    algorithm, collector = experiment.algorithm, experiment.collector
-    if (algorithm.frames_per_iteration is None) == (algorithm.episodes_per_iteration is None):
-        raise BadInput(
-            f"algorithm.frames_per_iteration={algorithm.frames_per_iteration} and "
-            f"algorithm.episodes_per_iteration={algorithm.episodes_per_iteration}: set exactly one, the other null"
-        )
-    frames = algorithm.frames_per_iteration
-    if frames is not None and algorithm.batch_size > frames:
-        raise BadInput(
-            f"algorithm.batch_size={algorithm.batch_size} is larger than "
-            f"algorithm.frames_per_iteration={frames}: a minibatch cannot hold more steps than an iteration"
-        )
-    if frames is not None and frames < collector.cars:
-        raise BadInput(
-            f"algorithm.frames_per_iteration={frames} is smaller than collector.cars={collector.cars}: "
-            "each car takes at least one step an iteration"
-        )
-    if collector.mode == "in_process" and collector.processes not in (None, 1):
-        raise BadInput(
-            f"collector.processes={collector.processes} with collector.mode=in_process: "
-            "choose collector=sync or collector=async for several processes"
-        )
-    if collector.mode == "ray" and collector.processes is None:
-        raise BadInput(
-            "collector.processes=null with collector=ray: a cluster grows and shrinks; give the number of processes"
-        )
-    limit_s, hang_s = experiment.reward.time_limit_s, collector.hang_timeout_s
-    if collector.mode != "in_process" and limit_s >= hang_s:
-        raise BadInput(
-            f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}: a worker waiting for "
-            "its reward function would be taken for one that hangs"
-        )
-    delay, still = experiment.randomization.action_delay_steps[1], experiment.episode.immobilized_steps
-    if still and delay + 1 >= still:
-        raise BadInput(
-            f"randomization.action_delay_steps reaches {delay} with episode.immobilized_steps={still}: a car whose "
-            f"commands come so late counts as standing before it moves; accepted there: up to {max(0, still - 2)}"
-        )
-    for name, track in experiment.tracks.items():
-        key = f"track.{name}" if isinstance(experiment.track, dict) else "track"
-        if not isinstance(track.width_m, float) and len(track.width_m) != len(track.knots):
-            raise BadInput(
-                f"{key}.width_m has {len(track.width_m)} values and {key}.knots {len(track.knots)}: "
-                "give one width, or one per knot"
-            )
-    cars = collector.cars * (collector.processes or 1)
-    if cars < len(experiment.tracks):
-        raise BadInput(
-            f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted "
-            f"there: at least {-(-len(experiment.tracks) // (collector.processes or 1))}"
-        )

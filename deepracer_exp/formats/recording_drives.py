@@ -216,8 +216,3 @@ def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
 
 def _rises(key: Ints) -> bool:
     return bool((key[1:] > key[:-1]).all())
-
-
-def first_row(table: pa.Table) -> tuple[int, int]:
-    """Return episode and step of the first row."""
-    return int(table["episode"][0].as_py()), int(table["steps"][0].as_py())

@@ -21,6 +21,7 @@ from .log_folder import LOG, LogFile, LogFolder, Place, natural, place_of
 from .metrics_json import MetricsJson, read_metrics_json
 from .model_metadata import ModelMetadata, read_model_metadata
 from .recording import TRAINING, LogProblem
+from .rolled_logs import piece_of
 from .sim_trace_csv import read_trace_csv
 from .step_tables import StepTables
 from .training_log import MARKER, TrainingLog, read_training_log
@@ -133,10 +134,8 @@ class _Held:
         for trace in parts.traces:
             self._put((1, trace.place, trace.number or 0), trace.file, trace.steps)
         for file, log in parts.logs:
-            # Before CSVs, which have more digits; of a rolled log the highest number is the oldest piece.
-            stem, _, number = file.name.rpartition(".")
-            age = -int(number) if number.isdigit() else 1
-            name = stem if number.isdigit() else file.name
+            # Before CSVs, which have more digits.
+            name, age = piece_of(file.name)
             self._put((0, place_of((*file.parts[:-1], name)), age), file, log.steps)
         while self._rows > step_tables.MOST_STEPS:
             _, first = self._next[0]

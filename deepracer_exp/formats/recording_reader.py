@@ -30,7 +30,6 @@ from .recording_drives import (
     Drives,
     Rows,
     concatenated,
-    first_row,
     in_degrees,
     iterations_of,
     number_episodes,
@@ -39,7 +38,7 @@ from .recording_drives import (
     steps_of,
 )
 from .recording_parts import Parts, TraceFile, read_parts
-from .step_tables import StepTables
+from .rolled_logs import join_rolled
 from .training_log import TrainingLog, Update
 
 _KINDS = (TRAINING, "evaluation", "leaderboard")
@@ -77,7 +76,7 @@ class _Assembly:
         self.problems = list(parts.problems)
         # Of several files of settings the one nearest to the top counts, files before logs.
         self.settings = _uppermost(parts.hyperparameters) or {}
-        self.logs = _rolled(parts.logs)
+        self.logs = join_rolled(parts.logs)
         self.drives = [*self._drives_of_csv()]
         self.roots: dict[int, tuple[str, ...]] = {}
         self.copies: dict[tuple[str, ...], Drives] = {}
@@ -381,38 +380,6 @@ def _iterations(updates: Sequence[Update]) -> list[int]:
         else:
             found.append(max(-1 if update.told is None else update.told, found[-1] + 1))
     return found
-
-
-def _rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[LogFile], TrainingLog]]:
-    """Put the pieces of rolled logs together, the earliest first: by their episodes, or else by their numbers."""
-    groups: dict[tuple[str, ...], list[tuple[LogFile, TrainingLog]]] = {}
-    for file, log in logs:
-        stem, _, number = file.name.rpartition(".")
-        name = stem if number.isdigit() else file.name
-        groups.setdefault((*file.parts[:-1], name), []).append((file, log))
-    joined = []
-    for pieces in groups.values():
-        pieces.sort(key=_time_of_piece)
-        whole = TrainingLog(
-            steps=StepTables.joined([log.steps for _, log in pieces]),
-            updates=[update for _, log in pieces for update in log.updates],
-            evaluated_after=[count for _, log in pieces for count in log.evaluated_after],
-            iteration_of={key: value for _, log in pieces for key, value in log.iteration_of.items()},
-            hyperparameters=next((log.hyperparameters for _, log in pieces if log.hyperparameters), None),
-            world=next((log.world for _, log in pieces if log.world), None),
-        )
-        joined.append(([file for file, _ in pieces], whole))
-    return joined
-
-
-def _time_of_piece(piece: tuple[LogFile, TrainingLog]) -> tuple[int, int, int]:
-    file, log = piece
-    number = file.name.rpartition(".")[2]
-    # The highest number is the oldest piece; that without one is being written.
-    age = -int(number) if number.isdigit() else 1
-    if log.steps.rows:
-        return (*first_row(log.steps.whole), age)
-    return (next(iter(log.iteration_of), -1), 0, age)
 
 
 def _uppermost(found: Sequence[tuple[LogFile, Any]]) -> Any:

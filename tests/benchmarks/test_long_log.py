@@ -1,14 +1,17 @@
 """A long log made of a short one is read as one long training."""
 
+import pytest
+
 from benchmarks.long_log import write_long_log
 from deepracer_exp.formats.recording_reader import read_recording
 from tests.formats import made_up_logs as made
 
 
-def test_every_turn_is_driven_later_and_in_episodes_of_its_own(tmp_path):
+@pytest.mark.parametrize("fields", [15, 17])
+def test_every_turn_is_driven_later_and_in_episodes_of_its_own(tmp_path, fields):
     short, long = tmp_path / "short.log", tmp_path / "long.log"
     rows = made.drives([0, 1, 2])
-    short.write_text(made.log_text(rows) + made.trainer_text(2))
+    short.write_text(made.log_text(rows, fields) + made.trainer_text(2))
     steps = write_long_log(short, long, int(3.5 * short.stat().st_size))
     assert steps == 4 * len(rows)
     recording = read_recording(long)

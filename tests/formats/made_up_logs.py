@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.formats.recording import Recording
+
 COMMON = (
     *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done"),
     *("all_wheels_on_track", "progress", "closest_waypoint", "track_len", "tstamp"),
@@ -27,6 +29,9 @@ METADATA = {
     "sensor": ["FRONT_FACING_CAMERA"],
     "version": "4",
 }
+ROWS = {"drfc_single": 36, "drfc_workers": 72, "drfc_upload": 0, "console": 36, "droa": 36}
+EVALUATIONS = {"drfc_single": 1, "drfc_workers": 0, "drfc_upload": 1, "console": 2, "droa": 1}
+"""Of each layout: steps of the training, and number of evaluations."""
 
 
 def drives(episodes: Sequence[int], seed: int = 0, steps: int = 6) -> pd.DataFrame:
@@ -239,3 +244,8 @@ def write_archive(files: dict[str, str], path: Path) -> Path:
             member.size = len(raw)
             archive.addfile(member, io.BytesIO(raw))
     return path
+
+
+def training(recording: Recording) -> pd.DataFrame:
+    """Return the steps of the training."""
+    return recording.steps[recording.steps["stream"] == "training"]
