@@ -63,7 +63,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     runs_dir = _runs_dir(request)
     config = request.entry.sweep
     protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
-    request = _without_rules(request)
+    request = _without_rules(request, overrides)
     parent = _parent(request, runs_dir, known)
     space = SearchSpace.from_request(request, _check(request, parent, runs_dir))
     build_sampler(config, space)
@@ -248,12 +248,29 @@ def _known(request: SweepRequest, must_be_there: bool, runs_dir: Path) -> Study 
     return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))
 
 
-def _without_rules(request: SweepRequest) -> SweepRequest:
-    """Let trials end by their stopping rule only where the pruner `entropy` is asked for."""
-    told = {line.partition("=")[0].lstrip("+~").partition(".")[0] for line in (*request.base, *request.space)}
-    if "entropy" in request.entry.sweep.pruners or "stopping" in told:
+def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequest:
+    """Let trials end by a stopping rule only where the pruner `entropy` is asked for, or a rule beside the pruners.
+
+    Args:
+        request: what is asked for.
+        overrides: of it; where they choose the pruners, the rule that a ready-made sweep has with its own is not meant.
+    """
+    if "entropy" in request.entry.sweep.pruners:
         return request
-    return replace(request, base=(*request.base, "stopping=none"))
+    chosen = any(_key(line) == "sweep.pruners" for line in overrides)
+    told = overrides if chosen else (*request.base, *request.space)
+    if "stopping" in map(_group, told):
+        return request
+    base = [line for line in request.base if _group(line) != "stopping"]
+    return replace(request, base=(*base, "stopping=none"))
+
+
+def _key(line: str) -> str:
+    return line.partition("=")[0].lstrip("+~")
+
+
+def _group(line: str) -> str:
+    return _key(line).partition(".")[0]
 
 
 def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple[str, ...]:

@@ -1,12 +1,14 @@
 """Files that are never half there."""
 
 import contextlib
+import uuid
 from pathlib import Path
 
 
 def write_whole(path: Path, text: str) -> Path:
-    """Write a file whole or not at all."""
-    aside = path.with_name(f".{path.name}.tmp")
+    """Write a file whole or not at all; of several processes that write it at once, the last one has written it."""
+    # Each in a file of its own: what another process moved into place would be missing here.
+    aside = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
         aside.write_text(text, encoding="utf-8")
         return aside.replace(path)

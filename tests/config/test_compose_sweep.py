@@ -101,7 +101,7 @@ def test_the_command_line_takes_the_place_of_what_a_ready_made_sweep_searches():
 
 def test_the_command_line_takes_the_place_of_what_a_ready_made_sweep_fixes():
     request = compose_sweep(["sweep=lr_entropy", "budget.env_steps=10000,20000", "collector=sync"])
-    assert request.base == ("collector=sync",)
+    assert request.base == ("stopping=impatient", "collector=sync")
     assert request.space["budget.env_steps"] == "10000,20000"
 
 
