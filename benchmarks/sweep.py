@@ -3,14 +3,15 @@
     python -m benchmarks.sweep [--trials 60] [--workers 2] [--reuse DIR] [--json FILE] [OVERRIDE...]
 
 1. `deepracer-exp sweep sweep=lr_entropy track=reinvent_base` really runs, with its defaults (MLflow included).
-2. Its trials are trained once more without pruning, in the same order: the same overrides and seeds, the whole budget.
+2. Its trials are trained once more without pruning, in the same order: the same overrides and seeds, the whole budget;
+   but for those that had used their budget, which are whole already.
 3. Median and Hyperband, as `sweep.pruners=[median]` and `[hyperband]` set them up, are replayed on these whole runs.
 4. The winner of each drives fresh laps that have chosen nobody (`benchmarks.fresh`): of these are all lap times told.
 
 Why replaying is exact. Collection in the trial's own process is deterministic, so that a pruned training is the
 beginning of the whole one. This is checked on each trial of the real sweep: its rows of metrics.jsonl must be those of
-the whole run up to its end, what it told Optuna what the whole run tells, and a trial that used its budget must be
-worth the same; else the benchmark fails. A pruner knows nothing of a trial but the values that it reports
+the whole run up to its end, what it told Optuna what the whole run tells, and one that is whole already must be worth
+the same again; else the benchmark fails. A pruner knows nothing of a trial but the values that it reports
 (`sweeps.score`) and their steps; they are read from the rows of the whole run and told to a fresh study in memory, one
 by one, and where the pruner says so the trial ends. Which values are there to compare with depends on who is how far:
 workers are modelled as equally fast, a step and a trial taking as long as they took in the sweep on average. Two things
@@ -277,7 +278,8 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         for trial in trials
     }
     threads = LocalLauncher(config.workers).cores
-    wholes = at_once(
+    cut_short = [trial for trial in trials if trial.user_attrs["fate"] != "finished"]
+    trained = at_once(
         options.workers,
         [
             partial(
@@ -285,14 +287,15 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 folder / "full" / f"{trial.number:03d}",
                 full_overrides(trial.user_attrs["overrides"], threads),
             )
-            for trial in trials
+            for trial in cut_short
         ],
     )
+    fulls = places | {trial.number: whole for trial, whole in zip(cut_short, trained, strict=True)}
     courses = []
-    for trial, whole in zip(trials, wholes, strict=True):
+    for trial in trials:
+        whole = fulls[trial.number]
         courses.append(course_of(trial.number, whole, objective, protocol))
         hold_against(trial, places[trial.number], whole, courses[-1])
-    fulls = dict(zip(places, wholes, strict=True))
     ways, pace = contenders(
         trials, courses, config, noted["seconds"], (places, fulls), study.direction, request.study
     )
