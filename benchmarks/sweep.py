@@ -3,20 +3,20 @@
     python -m benchmarks.sweep [--trials 60] [--workers 2] [--reuse DIR] [--json FILE] [OVERRIDE...]
 
 1. `deepracer-exp sweep sweep=lr_entropy track=reinvent_base` really runs, with its defaults (MLflow included).
-2. Its trials are trained once more without pruning, in the same order: the same overrides and seeds, the whole budget;
-   but for those that had used their budget, which are whole already.
+2. Those of its trials that were ended before their time go on, without stopping rule and pruner, until they have used
+   their budget, in copies of their runs: the same trials without pruning, in the same order.
 3. Median and Hyperband, as `sweep.pruners=[median]` and `[hyperband]` set them up, are replayed on these whole runs.
 4. The winner of each drives fresh laps that have chosen nobody (`benchmarks.fresh`): of these are all lap times told.
 
-Why replaying is exact. Collection in the trial's own process is deterministic, so that a pruned training is the
-beginning of the whole one. This is checked on each trial of the real sweep: its rows of metrics.jsonl must be those of
-the whole run up to its end, what it told Optuna what the whole run tells, and one that is whole already must be worth
-the same again; else the benchmark fails. A pruner knows nothing of a trial but the values that it reports
-(`sweeps.score`) and their steps; they are read from the rows of the whole run and told to a fresh study in memory, one
-by one, and where the pruner says so the trial ends. Which values are there to compare with depends on who is how far:
-workers are modelled as equally fast, a step and a trial taking as long as they took in the sweep on average. Two things
-are not replayed: what the sampler would have drawn after another pruner's verdicts (all get the same trials), and time:
-rivals' `minutes` follow from the model, only the sweep's own are measured.
+Why replaying is exact. Collection in the trial's own process is deterministic, and a run that goes on is the run that
+was never interrupted, bit for bit (`benchmarks.resume` kills runs to show it), so that a pruned training is the
+beginning of the whole one. What each trial told Optuna must be what its whole run tells, and one that is whole
+already must be worth the same again; else the benchmark fails. A pruner knows nothing of a trial but the values that
+it reports (`sweeps.score`) and their steps; they are read from the rows of the whole run and told to a fresh study in
+memory, one by one, and where the pruner says so the trial ends. Which values are there to compare with depends on who
+is how far: workers are modelled as equally fast, a step and a trial taking as long as they took in the sweep on
+average. Two things are not replayed: what the sampler would have drawn after another pruner's verdicts (all get the
+same trials), and time: rivals' `minutes` follow from the model, only the sweep's own are measured.
 
 Winners are chosen as the sweep does it: of the `sweep.rerank` complete trials with the best values the one that does
 best on `sweep.rerank_laps` more laps. For the sweep itself this must come to the winner that it has told.
@@ -29,7 +29,7 @@ best on `sweep.rerank_laps` more laps. For the sweep itself this must come to th
   what was found when as many steps were driven as the more frugal one needed for all trials, and how much slower
   the sweep's winner is then (`lap_time_loss`, below zero: faster).
 
-`--reuse DIR` leaves everything in DIR (200 MB a trial, mostly traces), goes on with a sweep that was interrupted and
+`--reuse DIR` leaves everything in DIR (35 MB a trial, mostly traces), goes on with a sweep that was interrupted and
 takes the runs that it finds finished. `minutes` is the time of all starts of the sweep then; `starts` counts them.
 """
 
@@ -53,7 +53,6 @@ from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import Pruner, SweepConfig, compose_sweep
 from sweeps.best import best_trial, cost
-from sweeps.launch import LocalLauncher
 from sweeps.pruners import build_pruner
 from sweeps.rerank import fresh
 from sweeps.storage import open_storage
@@ -66,13 +65,12 @@ from .report import number, table, write_json
 from .stopping import lap_time_loss, percent
 from .sweep_runs import (
     course_of,
-    full_overrides,
-    full_run,
     hold_against,
     pace_of,
     refuse_others,
     score,
     started,
+    whole_run,
 )
 
 READY = ("sweep=lr_entropy", "track=reinvent_base")
@@ -277,25 +275,16 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         trial.number: folder / "runs" / request.study / Path(trial.user_attrs["run_dir"] or "").name
         for trial in trials
     }
-    threads = LocalLauncher(config.workers).cores
-    cut_short = [trial for trial in trials if trial.user_attrs["fate"] != "finished"]
-    trained = at_once(
+    cut_short = [trial.number for trial in trials if trial.user_attrs["fate"] not in ("finished", "failed")]
+    gone_on = at_once(
         options.workers,
-        [
-            partial(
-                full_run,
-                folder / "full" / f"{trial.number:03d}",
-                full_overrides(trial.user_attrs["overrides"], threads),
-            )
-            for trial in cut_short
-        ],
+        [partial(whole_run, places[number], folder / "whole" / f"{number:03d}") for number in cut_short],
     )
-    fulls = places | {trial.number: whole for trial, whole in zip(cut_short, trained, strict=True)}
+    fulls = places | dict(zip(cut_short, gone_on, strict=True))
     courses = []
     for trial in trials:
-        whole = fulls[trial.number]
-        courses.append(course_of(trial.number, whole, objective, protocol))
-        hold_against(trial, places[trial.number], whole, courses[-1])
+        courses.append(course_of(trial.number, fulls[trial.number], objective, protocol))
+        hold_against(trial, courses[-1])
     ways, pace = contenders(
         trials, courses, config, noted["seconds"], (places, fulls), study.direction, request.study
     )
@@ -380,7 +369,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sweep"
     )
     parser.add_argument("--trials", type=int, default=60, help="of the sweep")
-    parser.add_argument("--workers", type=int, default=2, help="of the sweep, and whole trainings at once")
+    parser.add_argument(
+        "--workers", type=int, default=2, help="of the sweep, and trainings that go on at once"
+    )
     parser.add_argument("--laps", type=int, default=TRIALS, help="that each winner drives anew")
     parser.add_argument(
         "--reuse", type=Path, metavar="DIR", help="keep everything here, and go on with what is there"

@@ -1,7 +1,8 @@
-"""The runs of a sweep, and the same trials trained in full."""
+"""The runs of a sweep, and the same trials trained to the end of their budget."""
 
 import contextlib
 import json
+import shutil
 import statistics
 import subprocess
 import time
@@ -9,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.evaluation import EvaluationConfig
@@ -18,14 +18,15 @@ from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.run import read_run
 from deepracer_exp.formats.run_files import read_config, read_object
+from deepracer_exp.tracking import tracking_file
+from deepracer_exp.training.training import SPENT
 from sweeps.score import value_on_the_way, values_of
 
-from .command import command_line, read_metrics, read_summary, train
+from .command import command_line, read_metrics, read_summary
 from .pruning_replay import Course, Pace
-from .same import Row, different_rows
 
-_OTHERWISE = ("stopping", "tracking", "report")
-"""Groups that the whole runs have otherwise than the trials; nothing of them changes what is learned."""
+_LEFT_BEHIND = ("trace", tracking_file.NAME)
+"""Of a trial's run: most of its bytes, and its run in MLflow."""
 _NOTED, _SCORES = "sweep_started.json", "scores.json"
 _NOTE_S = 5.0
 
@@ -78,63 +79,46 @@ def refuse_others(request: SweepRequest) -> None:
             )
 
 
-def full_overrides(told: Sequence[str], threads: int) -> list[str]:
-    """Return what a trial's whole run is told.
+def whole_run(run: Path, folder: Path) -> Path:
+    """Return a copy of a trial's run that has used its budget up; it goes on with whatever of it is in `folder`.
+
+    It may have failed on the way: trials do.
 
     Args:
-        told: the overrides of the trial.
-        threads: of the trial's worker.
-    """
-    keys = [override.partition("=")[0].lstrip("+~") for override in told]
-    kept = [one for one, key in zip(told, keys, strict=True) if key.partition(".")[0] not in _OTHERWISE]
-    own = [] if "collector.threads" in keys else [f"collector.threads={threads}"]
-    return [*kept, *own, "stopping=none", "tracking=off", "report=false"]
-
-
-def full_run(folder: Path, overrides: Sequence[str]) -> Path:
-    """Return the run of these overrides in `folder`; train if there is none. It may have failed: trials do."""
-    run = _ended(folder, overrides)
-    if run is not None:
-        return run
-    folder.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    try:
-        run = train(overrides, folder)
-    except SystemExit:
-        run = _ended(folder, overrides)
-        if run is None:
-            raise
-    print(f"{folder.name}: {read_summary(run)['status']} in {time.monotonic() - began:.0f} s", flush=True)
-    return run
-
-
-def _ended(folder: Path, overrides: Sequence[str]) -> Path | None:
-    for summary in sorted(folder.glob("runs/*/*/summary.json")):
-        told = yaml.safe_load((summary.parent / "overrides.yaml").read_text(encoding="utf-8"))
-        if told == list(overrides) and read_summary(summary.parent)["status"] in ("finished", "failed"):
-            return summary.parent
-    return None
-
-
-def refuse_another_beginning(trial: int, rows: Sequence[Row], full: Sequence[Row], fate: str) -> None:
-    """Hold a trial of the sweep against its whole run.
-
-    Args:
-        trial: its number.
-        rows: of its metrics.jsonl.
-        full: those of the whole run.
-        fate: how the trial ended.
+        run: that a stopping rule or a pruner has ended.
+        folder: for the copy.
 
     Raises:
-        SystemExit: it is not the beginning; with the whole budget, not the whole.
+        SystemExit: it cannot go on.
     """
-    found = different_rows(full if fate == "finished" else full[: len(rows)], rows)
-    if found is not None:
-        raise SystemExit(f"trial {trial} ({fate}): is not the beginning of its whole run: {found}")
+    copy = folder / "runs" / "whole" / run.name
+    if not copy.exists():
+        aside = folder / run.name
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.copytree(run, aside, symlinks=True, ignore=shutil.ignore_patterns(*_LEFT_BEHIND))
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        aside.rename(copy)
+    if _is_whole(copy):
+        return copy
+    began = time.monotonic()
+    line = command_line("resume", str(copy), "stopping=none", "tracking=off", "report=false")
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if not _is_whole(copy):
+        raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr}")
+    print(
+        f"{folder.name}: {read_summary(copy)['status']} after {time.monotonic() - began:.0f} s more",
+        flush=True,
+    )
+    return copy
 
 
-def hold_against(trial: FrozenTrial, run: Path, whole: Path, course: Course) -> None:
-    """Refuse a trial that is not the beginning of its whole run, or has told Optuna something else.
+def _is_whole(run: Path) -> bool:
+    summary = read_object(run / "summary.json")
+    return summary.get("status") == "failed" or str(summary.get("reason")).startswith(SPENT)
+
+
+def hold_against(trial: FrozenTrial, course: Course) -> None:
+    """Refuse a trial whose whole run tells something else than the trial has told Optuna.
 
     Raises:
         SystemExit: naming the trial and the difference.
@@ -142,7 +126,6 @@ def hold_against(trial: FrozenTrial, run: Path, whole: Path, course: Course) -> 
     fate = trial.user_attrs["fate"]
     if fate == "failed":
         return
-    refuse_another_beginning(trial.number, read_metrics(run), read_metrics(whole), fate)
     refuse_other_reports(trial, course)
     if fate == "finished" and trial.values[0] != course.value:
         raise SystemExit(

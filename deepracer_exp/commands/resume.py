@@ -9,7 +9,9 @@ _EPILOG = """\
   deepracer-exp resume RUN                                  RUN: a run's folder, its name or the beginning of it, or
                                                             MLflow's id
   deepracer-exp resume RUN budget.env_steps=5000000         what changes nothing of what is learned may be changed:
-                                                            budget, tracking, checkpoints.keep and time limits
+                                                            budget, stopping, tracking, checkpoints.keep and time
+                                                            limits
+  deepracer-exp resume RUN stopping=none                    a run that ended by its stopping rule uses its budget up
 
 The run goes on from its last checkpoint, in its own folder and in the same run of MLflow; what it wrote after that
 checkpoint is written anew. With collector=sync and collector=in_process the result is that of an uninterrupted run,

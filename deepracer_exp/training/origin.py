@@ -18,11 +18,14 @@ HARMLESS = (
     "checkpoints.keep",
     "collector.hang_timeout_s",
     "reward.time_limit_s",
+    "stopping",
     "tracking",
     "debug",
     "report",
 )
 """Keys, or their first parts, that change nothing of what a run learns. `runs_dir` is where the run is found."""
+_MEASURED_BY = "stopping.episodes"
+"""Of so many episodes is `lap_share`, in every row of metrics.jsonl."""
 
 
 def origin(run_dir: Path, setup: RaceSetup) -> dict[str, Any]:
@@ -59,6 +62,8 @@ def refuse_changes(
 
 
 def _is_harmless(key: str) -> bool:
+    if key == _MEASURED_BY:
+        return False
     return key == "runs_dir" or any(key == part or key.startswith(f"{part}.") for part in HARMLESS)
 
 

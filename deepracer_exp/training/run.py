@@ -170,7 +170,7 @@ def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Wat
     # The folder may have been moved with the one it lies in.
     composition.mapping["runs_dir"] = str(run_dir.parent.parent)
     experiment = validate(composition.mapping)
-    _refuse_ended(run_dir, experiment)
+    _refuse_ended(run_dir, experiment, composition.mapping["stopping"] != stored["stopping"])
     setup = read_files(experiment)
     kept = kept_checkpoints(run_dir / "checkpoints")
     # Killed before its first checkpoint, it begins anew; with checkpoints of which none is whole, never.
@@ -225,16 +225,18 @@ def _run(training: Training, interruption: Interruption) -> Outcome:
         raise
 
 
-def _refuse_ended(run_dir: Path, experiment: Experiment) -> None:
+def _refuse_ended(run_dir: Path, experiment: Experiment, by_another_rule: bool) -> None:
     """Refuse to go on with a run that is over: by its own stopping rule, or within a budget that is still spent."""
     summary = read_object(run_dir / "summary.json")
     status, reason = summary.get("status"), str(summary.get("reason"))
     if status is None or status in _AGAIN:
         return
     if not reason.startswith(SPENT):
+        if by_another_rule:
+            return
         raise RunEnded(
-            f"{run_dir}: has ended ({status}: {reason}); `deepracer-exp clone run={run_dir.name}` goes on from its "
-            "best checkpoint in a new run"
+            f"{run_dir}: has ended ({status}: {reason}); stopping=none lets it go on, `deepracer-exp clone "
+            f"run={run_dir.name}` begins a new run with its best checkpoint"
         )
     used = Budget(experiment.budget).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
     if used[1] >= 1:

@@ -10,8 +10,10 @@ from optuna.pruners import HyperbandPruner, MedianPruner, NopPruner
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from benchmarks import sweep, sweep_runs
+from benchmarks.command import read_metrics
 from benchmarks.pruning_replay import Course, Ended, Pace, found_within, makespan_s, replay, steps_until
-from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from benchmarks.same import different_rows
+from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import compose_sweep
 
 PACE = Pace(step_s=0.01, trial_s=5.0)
@@ -130,24 +132,6 @@ def test_the_winner_is_the_best_of_the_first_on_more_laps() -> None:
         sweep.winner_of([], "race_score", 3, drive)
 
 
-def test_a_trial_that_is_not_the_beginning_of_its_whole_run_is_refused() -> None:
-    full = [
-        {"iteration": number, "completion": number / 3, "wall_clock_s": number} for number in range(1, 10)
-    ]
-    slower = [row | {"wall_clock_s": 99.0} for row in full[:5]]
-    sweep_runs.refuse_another_beginning(7, slower, full, "converged")
-    sweep_runs.refuse_another_beginning(7, [*slower, *full[5:]], full, "finished")
-    for rows, fate, words in (
-        ([*slower[:4], slower[4] | {"completion": 1.7}], "collapsed", "row 5: completion"),
-        ([*full, full[-1]], "converged", "9 and 10 rows"),
-        (slower, "finished", "9 and 5 rows"),
-    ):
-        with pytest.raises(
-            SystemExit, match=f"trial 7 .{fate}.: is not the beginning of its whole run: {words}"
-        ):
-            sweep_runs.refuse_another_beginning(7, rows, full, fate)
-
-
 def test_a_trial_that_told_optuna_something_else_than_its_whole_run_is_refused() -> None:
     whole = course(0, [12.0, 10.0, 9.0, 8.0])
 
@@ -185,14 +169,20 @@ def test_a_whole_run_tells_what_the_sweep_would_report_at_each_evaluation(
     assert (found.number, found.env_steps, found.fate, found.value) == (3, 5 * 1024, "finished", 12.5)
 
 
-def test_the_whole_run_is_told_what_the_trial_was_told_save_for_what_ends_it() -> None:
-    told = ["collector=in_process", "stopping.converged.patience=40", "tracking=off", "algorithm.lr=0.001"]
-    overrides = sweep_runs.full_overrides(told, 2)
-    assert overrides[:2] == ["collector=in_process", "algorithm.lr=0.001"]
-    experiment, _ = compose_experiment(overrides)
-    assert (experiment.stopping.kind, experiment.collector.threads) == ("none", 2)
-    kept = sweep_runs.full_overrides([*told, "collector.threads=3"], 2)
-    assert compose_experiment(kept)[0].collector.threads == 3
+def test_a_trial_that_was_ended_before_its_time_uses_its_budget_up_in_a_copy(
+    trained: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = [f"stopping.{value}" for value in ("window=1", "warmup=2", "patience=2", "gain=1")]
+    budget = ("budget.iterations=6", "budget.env_steps=null", "episode.max_steps=60", "checkpoints.every=2")
+    run = trained(*budget, "stopping=plateau", *values).folder
+    assert len(read_metrics(run)) < 6
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    whole = sweep_runs.whole_run(run, tmp_path / "000")
+    assert different_rows(read_metrics(whole), read_metrics(trained(*budget).folder)) is None
+    assert "000: finished after" in capsys.readouterr().out
+    assert sweep_runs.whole_run(run, tmp_path / "000") == whole
+    assert capsys.readouterr().out == ""
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
 
 
 def test_the_sweep_of_the_benchmark_is_one_that_it_can_measure_and_others_are_refused() -> None:

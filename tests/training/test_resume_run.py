@@ -141,9 +141,36 @@ def test_a_run_killed_after_its_stopping_rule_had_decided_is_ended(trained, call
     assert rows(copy) == rows(stopped.folder)
 
 
+@pytest.fixture
+def stopped(trained, tmp_path):
+    """Return a copy of a run that its stopping rule ended after three of six iterations."""
+    values = [f"stopping.{value}" for value in ("window=1", "warmup=2", "patience=2", "gain=1")]
+    ended = trained(*OFTEN, "stopping=plateau", *values, "budget.env_steps=null", "budget.iterations=6")
+    assert (ended.summary["stopping"]["rule"], ended.summary["iteration"]) == ("plateau", 3)
+    copy = tmp_path / "runs" / "tiny" / ended.folder.name
+    shutil.copytree(ended.folder, copy, symlinks=True)
+    return copy
+
+
+def test_a_run_ended_by_its_stopping_rule_uses_its_budget_up_without_it(trained, stopped, call):
+    ended = call("resume", stopped.name, "stopping=none")
+    assert ended.code == 0, ended.stderr
+    assert_same_run(stopped, whole(trained))
+    summary = json.loads((stopped / "summary.json").read_text())
+    assert (summary["reason"], summary["stopping"]) == ("budget reached: iterations", None)
+
+
+def test_a_rule_that_has_seen_enough_ends_the_run_again(stopped, call):
+    before = rows(stopped)
+    assert call("resume", stopped.name, "stopping.warmup=1").code == 0
+    assert rows(stopped) == before
+    assert json.loads((stopped / "summary.json").read_text())["stopping"]["rule"] == "plateau"
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
+        (["stopping=reliable", "stopping.episodes=20"], ["stopping.episodes: \N{EN DASH} -> 20"]),
         (["algorithm.lr=1e-5"], ["algorithm.lr: 0.001 -> 1e-05", "deepracer-exp clone"]),
         (["track=Oval_track"], ["track.name", "Oval_track"]),
         (["algorithm.learning_rate=1"], ["algorithm.learning_rate: no such key"]),
