@@ -34,6 +34,7 @@ from .outcome import Outcome
 from .ray_cluster import check_collector
 from .run_folder import RunFolder
 from .signals import Interruption
+from .stopping import UNDECIDED
 from .training import SPENT, TIMES, Training
 from .watching import TakenOver, Watch
 
@@ -196,6 +197,9 @@ def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Wat
         folder.release()
         raise
     training.tell_again(rows)
+    if read_object(run_dir / "summary.json").get("stopping"):
+        for tag, value in UNDECIDED.items():
+            tracker.set_tag(tag, value)
     folder.rewind(iteration)
     training.checkpoints.rewind(iteration, None if state is None else (state["best"] or {}).get("iteration"))
     folder.write("config.yaml", redact(composition.yaml()))

@@ -24,6 +24,10 @@ EVALUATED = ("eval_completion", "held_out_completion")
 _STEPS = 1000  # laps are counted per so many control steps: iterations differ in length
 
 
+UNDECIDED = {"stopping.rule": "none", "stopping.hopeless": "false"}
+"""Tags of a run that goes on after a rule had ended it; the values by which it did stay beside them."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Decision:
     """Why a run should end."""

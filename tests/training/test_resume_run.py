@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 import yaml
+from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.formats.checkpoint_files import verify
@@ -15,6 +16,9 @@ from deepracer_exp.training.run_folder import RunFolder
 
 # Reached sooner than a lap: episodes end often.
 OFTEN = ("episode.max_steps=60", "checkpoints.every=2")
+
+# Ends a run after three iterations.
+SOON = ("stopping=plateau", *(f"stopping.{one}" for one in ("window=1", "warmup=2", "patience=2", "gain=1")))
 
 
 def rows(folder) -> list[dict]:
@@ -144,8 +148,7 @@ def test_a_run_killed_after_its_stopping_rule_had_decided_is_ended(trained, call
 @pytest.fixture
 def stopped(trained, tmp_path):
     """Return a copy of a run that its stopping rule ended after three of six iterations."""
-    values = [f"stopping.{value}" for value in ("window=1", "warmup=2", "patience=2", "gain=1")]
-    ended = trained(*OFTEN, "stopping=plateau", *values, "budget.env_steps=null", "budget.iterations=6")
+    ended = trained(*OFTEN, *SOON, "budget.env_steps=null", "budget.iterations=6")
     assert (ended.summary["stopping"]["rule"], ended.summary["iteration"]) == ("plateau", 3)
     copy = tmp_path / "runs" / "tiny" / ended.folder.name
     shutil.copytree(ended.folder, copy, symlinks=True)
@@ -158,6 +161,17 @@ def test_a_run_ended_by_its_stopping_rule_uses_its_budget_up_without_it(trained,
     assert_same_run(stopped, whole(trained))
     summary = json.loads((stopped / "summary.json").read_text())
     assert (summary["reason"], summary["stopping"]) == ("budget reached: iterations", None)
+
+
+def test_mlflow_does_not_name_a_rule_that_no_longer_ends_the_run(call, tmp_path):
+    quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN)
+    ended = call("train", *quick, *SOON, "budget.env_steps=null", "budget.iterations=4")
+    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
+    run_id = json.loads((ended.folder / "tracking.json").read_text())["run_id"]
+    assert client.get_run(run_id).data.tags["stopping.rule"] == "plateau"
+    assert call("resume", ended.folder.name, "stopping=none").code == 0
+    tags = client.get_run(run_id).data.tags
+    assert (tags["stopping.rule"], tags["end"]) == ("none", "finished: budget reached: iterations")
 
 
 def test_a_rule_that_has_seen_enough_ends_the_run_again(stopped, call):
