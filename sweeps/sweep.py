@@ -15,6 +15,7 @@ from rich.console import Console
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.running import TrackingConfig, TrackingOff
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest, compose_sweep
 from deepracer_exp.env.reward import RewardFunction
@@ -257,20 +258,12 @@ def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequ
     """
     if "entropy" in request.entry.sweep.pruners:
         return request
-    chosen = any(_key(line) == "sweep.pruners" for line in overrides)
+    chosen = any(key_of(line) == "sweep.pruners" for line in overrides)
     told = overrides if chosen else (*request.base, *request.space)
-    if "stopping" in map(_group, told):
+    if "stopping" in map(group_of, told):
         return request
-    base = [line for line in request.base if _group(line) != "stopping"]
+    base = [line for line in request.base if group_of(line) != "stopping"]
     return replace(request, base=(*base, "stopping=none"))
-
-
-def _key(line: str) -> str:
-    return line.partition("=")[0].lstrip("+~")
-
-
-def _group(line: str) -> str:
-    return _key(line).partition(".")[0]
 
 
 def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple[str, ...]:

@@ -113,3 +113,13 @@ def _in_quotes(value: str) -> str:
     # Backslashes count as themselves, except in front of a quote.
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
     return f"'{escaped}'"
+
+
+def key_of(line: str) -> str:
+    """Return the key or group that an override is of; nothing of it is parsed, so that its value may be anything."""
+    return line.partition("=")[0].strip().lstrip("+~")
+
+
+def group_of(line: str) -> str:
+    """Return the first part of an override's key."""
+    return key_of(line).partition(".")[0]

@@ -13,7 +13,7 @@ from .compose import Composition, compose_entry, typed
 from .dimension import dimension, plain_expression
 from .experiment import SafeName
 from .options import groups, options
-from .overrides import PLAIN_TEXT, parse_sweep
+from .overrides import PLAIN_TEXT, key_of, parse_sweep
 
 Objective = Literal["race_score", "lap_time", "completion"]
 Pruner = Literal["entropy", "median", "percentile", "hyperband", "wilcoxon"]
@@ -204,17 +204,13 @@ class _Plan:
         self.base = [line for line in self.base if parse_sweep(line).key_or_group != key]
 
 
-def _key(override: str) -> str:
-    return override.partition("=")[0].strip().lstrip("+~")
-
-
 def _is_of_the_sweep(override: str) -> bool:
-    key = _key(override)
+    key = key_of(override)
     return key in _OF_THE_SWEEP or key.startswith("sweep.")
 
 
 def _check_own(override: str) -> None:
-    if _key(override) in PLAIN_TEXT:
+    if key_of(override) in PLAIN_TEXT:
         return  # commas are its own
     parsed = parse_sweep(override)
     if parsed.is_sweep_override():

@@ -12,7 +12,7 @@ def write_whole(path: Path, text: str) -> Path:
     try:
         aside.write_text(text, encoding="utf-8")
         return aside.replace(path)
-    except OSError:
+    except BaseException:
         # A disk that takes no file may refuse to give one up as well.
         with contextlib.suppress(OSError):
             aside.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from rich.console import Console
 from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config.compose import Composition, validate
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import RaceSetup, build_setup
@@ -171,7 +172,7 @@ def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Wat
     # The folder may have been moved with the one it lies in.
     composition.mapping["runs_dir"] = str(run_dir.parent.parent)
     experiment = validate(composition.mapping)
-    _refuse_ended(run_dir, experiment, composition.mapping["stopping"] != stored["stopping"])
+    _refuse_ended(run_dir, experiment, "stopping" in map(group_of, overrides))
     setup = read_files(experiment)
     kept = kept_checkpoints(run_dir / "checkpoints")
     # Killed before its first checkpoint, it begins anew; with checkpoints of which none is whole, never.
@@ -229,14 +230,21 @@ def _run(training: Training, interruption: Interruption) -> Outcome:
         raise
 
 
-def _refuse_ended(run_dir: Path, experiment: Experiment, by_another_rule: bool) -> None:
-    """Refuse to go on with a run that is over: by its own stopping rule, or within a budget that is still spent."""
+def _refuse_ended(run_dir: Path, experiment: Experiment, rule_given: bool) -> None:
+    """Refuse to go on with a run that is over.
+
+    Args:
+        run_dir: its folder.
+        experiment: it is to go on with.
+        rule_given: whether it is to have another stopping rule. What ended it, a rule of its own or a comparison with
+            others, does not count then; a budget that is still spent does.
+    """
     summary = read_object(run_dir / "summary.json")
     status, reason = summary.get("status"), str(summary.get("reason"))
     if status is None or status in _AGAIN:
         return
     if not reason.startswith(SPENT):
-        if by_another_rule:
+        if rule_given:
             return
         raise RunEnded(
             f"{run_dir}: has ended ({status}: {reason}); stopping=none lets it go on, `deepracer-exp clone "

@@ -163,6 +163,20 @@ def test_a_run_ended_by_its_stopping_rule_uses_its_budget_up_without_it(trained,
     assert (summary["reason"], summary["stopping"]) == ("budget reached: iterations", None)
 
 
+def test_a_run_that_others_have_beaten_goes_on_if_it_is_told_which_rule_counts(trained, stopped, call):
+    summary = json.loads((stopped / "summary.json").read_text())
+    beaten = {"status": "hopeless", "reason": "median: 9.1 is worse", "stopping": None}
+    (stopped / "summary.json").write_text(json.dumps(summary | beaten))
+    config = yaml.safe_load((stopped / "config.yaml").read_text())
+    (stopped / "config.yaml").write_text(yaml.safe_dump(config | {"stopping": {"kind": "none"}}))
+    ended = call("resume", stopped.name)
+    assert ended.code == 2
+    assert "stopping=none lets it go on" in ended.complaint
+    ended = call("resume", stopped.name, "stopping=none")
+    assert ended.code == 0, ended.stderr
+    assert_same_run(stopped, whole(trained))
+
+
 def test_mlflow_does_not_name_a_rule_that_no_longer_ends_the_run(call, tmp_path):
     quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN)
     ended = call("train", *quick, *SOON, "budget.env_steps=null", "budget.iterations=4")
