@@ -113,7 +113,7 @@ def episode_ends_map(view: LogView) -> Chart | None:
     )
     return Chart(
         name="episode_ends_map",
-        title=f"Where {len(ends)} of {len(view.episodes)} episodes ended before the lap was complete",
+        title=f"Where {len(ends)} of {int(view.episodes['ended'].sum())} episodes ended before the lap was complete",
         caption=f"Each symbol is the last recorded place of an episode; the {_WORST} waypoints with most "
         "ends carry their number and count. A pile of ends behind a corner means that the car "
         "enters it too fast or turns in too late.",

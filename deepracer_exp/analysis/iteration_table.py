@@ -8,7 +8,7 @@ import pandas as pd
 from deepracer_exp.formats.recording import Recording
 
 ITERATION_COLUMNS: Mapping[str, str] = {
-    "iteration": "policy update, from 0",
+    "iteration": "policy update; the service counts from 0, our own runs from 1",
     "episodes": "that ended in it",
     "steps": "control steps driven for it",
     "complete": "episodes that completed the lap",

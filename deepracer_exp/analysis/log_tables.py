@@ -90,9 +90,12 @@ def settings(values: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def headline(view: LogView) -> str:
-    """Return in one sentence how much was driven, and how well."""
+    """Return in one sentence how much was driven, and how well; an episode cut off by the end is not counted."""
     laps = view.episodes["lap_time_s"].dropna()
-    parts = [count(len(view.steps), "control step"), count(len(view.episodes), "episode")]
+    parts = [
+        count(len(view.steps), "control step"),
+        count(int(view.episodes["ended"].sum()), "finished episode"),
+    ]
     parts.append(count(len(view.iterations), "iteration"))
     sentence = f"{parts[0]} in {parts[1]} and {parts[2]}"
     if not len(view.steps):

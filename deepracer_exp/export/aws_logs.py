@@ -349,10 +349,10 @@ def _notes(numbered: _Numbered, experiment: Experiment) -> tuple[str, ...]:
     ]
     if numbered.left_out:
         notes.append(f"{numbered.left_out:,} rows of episodes that had not ended are left out")
-    if numbered.first_iteration:
-        notes.append(
-            f"iteration 0 is the run's {numbered.first_iteration}, the first in which an episode ended"
-        )
+    notes.append(
+        f"iterations count from 0, as the service's: its iteration 0 is the run's {numbered.first_iteration}"
+        + ", the first in which an episode ended" * (numbered.first_iteration > 1)
+    )
     if len(experiment.tracks) > 1:
         names = ", ".join(experiment.tracks)
         notes.append(f"{names}: the service's trace has no column for the track; track_len tells them apart")

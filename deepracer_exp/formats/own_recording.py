@@ -184,13 +184,13 @@ def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapp
 def _metrics(
     folder: Path, problems: list[LogProblem], files: list[Path]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return updates and evaluations; the file counts iterations from 1, the trace from 0."""
+    """Return updates and evaluations."""
     file = folder / "metrics.jsonl"
     updates, evaluated = [], []
     for number, line in enumerate(_text(file, problems, files).splitlines(), start=1):
         try:
             row = json.loads(line)
-            iteration = int(row["iteration"]) - 1
+            iteration = int(row["iteration"])
             losses = {
                 name: _number(row.get(name)) for name in UPDATE_COLUMNS if name not in ("iteration", "epoch")
             }

@@ -14,7 +14,10 @@ TRAINING = "training"
 STEP_COLUMNS: Mapping[str, tuple[str, str]] = {
     "stream": ("category", "`training`, or the name of an evaluation or race"),
     "worker": ("int16", "process of the service that drove, from 0"),
-    "iteration": ("int32", "policy update that learned from the row, from 0"),
+    "iteration": (
+        "int32",
+        "policy update that learned from the row; the service counts from 0, our own runs from 1",
+    ),
     "episode": ("int32", "counted from 0 within the stream, unique in it over all workers"),
     "steps": ("int32", "control step of the episode; 1 is the prepare step where the generation writes one"),
     "X": ("float64", "m, front of the car"),
@@ -39,7 +42,7 @@ STEP_COLUMNS: Mapping[str, tuple[str, str]] = {
 }
 """Columns of `Recording.steps`: type and meaning with unit."""
 UPDATE_COLUMNS: Mapping[str, tuple[str, str]] = {
-    "iteration": ("int32", "policy update, from 0"),
+    "iteration": ("int32", "policy update, counted as in the steps"),
     "epoch": (
         "int32",
         "pass over the iteration's steps, from 0; of our own runs the mean is told, as epoch 0",
@@ -65,7 +68,7 @@ TOLD_COLUMNS: Mapping[str, tuple[str, str]] = {
 }
 """Columns of `Recording.told`: type and meaning with unit."""
 EVALUATED_COLUMNS: Mapping[str, tuple[str, str]] = {
-    "iteration": ("int32", "policy update after which the policy was evaluated, from 0"),
+    "iteration": ("int32", "policy update after which the policy was evaluated, counted as in the steps"),
     "completion": ("float64", "per cent of the lap, mean over the laps tried"),
     "held_out_completion": (
         "float64",

@@ -68,7 +68,7 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
     # Ours.
     ("car", pa.int32(), "number of the car over all processes"),
     ("track", _TRACK, "name of the course"),
-    ("iteration", pa.int32(), "policy update that learned from the row"),
+    ("iteration", pa.int32(), "policy update that learned from the row, from 1"),
     ("speed_mps", pa.float32(), "m/s measured"),
     ("yaw_rate_radps", pa.float32(), "rad/s measured, positive to the left"),
     ("offset_m", pa.float32(), "m from the centre line, positive to the left of the driving direction"),
@@ -101,7 +101,7 @@ def to_table(packed: NDArray[np.float64], iteration: int, tracks: Sequence[str])
 
     Args:
         packed: (n, len(PACKED_COLUMNS)).
-        iteration: policy update that learned from the rows.
+        iteration: policy update that learned from the rows, from 1.
         tracks: names of the experiment's courses.
 
     Raises:

@@ -112,9 +112,8 @@ class RunFolder:
         for name in ("summary.json", "report.html", "best_lap.png", "learning.png"):
             (self.path / name).unlink(missing_ok=True)
         for file in (self.path / "trace").glob("*"):
-            # Files of the trace are counted from 0.
             number = file.name.partition("-")[0]
-            if not number.isdigit() or int(number) >= iteration:
+            if not number.isdigit() or int(number) > iteration:
                 file.unlink()
         shutil.rmtree(self.path / FAULTS_DIR, ignore_errors=True)
 

@@ -353,7 +353,7 @@ class Training:
         if self._decision is not None and self._decision.rule == "reliable":
             self._reliable = self._moment()
         self.folder.append_metrics(self._row)
-        self._trace.write(self._iteration - 1, to_table(rows, self._iteration - 1, self._tracks))
+        self._trace.write(self._iteration, to_table(rows, self._iteration, self._tracks))
         self._tell(self._row)
         _, fraction = self._spent()
         wall_clock_s = self._row["wall_clock_s"]

@@ -44,7 +44,7 @@ def test_rows_of_an_episode_keep_their_own_iterations(trained):
     assert set(steps.groupby("episode")["steps"].diff().dropna()) == {1}
 
 
-def test_updates_and_evaluations_are_counted_from_0_like_the_trace(trained):
+def test_iterations_of_updates_evaluations_and_trace_are_those_of_the_metrics(trained):
     run = trained()
     recording = read_own_recording(run.folder)
     assert {name: str(kind) for name, kind in recording.updates.dtypes.items()} == {
@@ -53,13 +53,14 @@ def test_updates_and_evaluations_are_counted_from_0_like_the_trace(trained):
     assert (
         recording.updates["iteration"].tolist()
         == sorted(recording.steps["iteration"].unique())
-        == [0, 1, 2, 3]
+        == [row["iteration"] for row in run.metrics]
+        == [1, 2, 3, 4]
     )
     for name in ("policy_loss", "value_loss", "kl", "entropy", "lr"):
         assert recording.updates[name].tolist() == [row[name] for row in run.metrics]
     evaluated = [row for row in run.metrics if row["eval_completion"] is not None]
     assert list(recording.evaluated) == list(EVALUATED_COLUMNS)
-    assert recording.evaluated["iteration"].tolist() == [row["iteration"] - 1 for row in evaluated]
+    assert recording.evaluated["iteration"].tolist() == [row["iteration"] for row in evaluated]
     assert recording.evaluated["completion"].tolist() == [row["eval_completion"] for row in evaluated]
     assert list(recording.told) == list(TOLD_COLUMNS)
     assert recording.told.empty
@@ -90,10 +91,10 @@ def test_the_action_space_is_that_of_the_environment(trained, space):
 
 
 def test_a_torn_file_of_the_trace_is_left_out_and_told(folder):
-    torn = folder / "trace" / "00001-iteration.parquet"
+    torn = folder / "trace" / "00002-iteration.parquet"
     torn.write_bytes(torn.read_bytes()[:-100])
     recording = read_own_recording(folder)
-    assert set(recording.steps["iteration"]) == {0, 2, 3}
+    assert set(recording.steps["iteration"]) == {1, 3, 4}
     (problem,) = recording.problems
     assert problem.file == str(torn)
     assert problem.reason.startswith("left out: ")
@@ -101,10 +102,10 @@ def test_a_torn_file_of_the_trace_is_left_out_and_told(folder):
 
 
 def test_a_file_of_another_kind_among_the_trace_is_left_out_and_told(folder):
-    other = folder / "trace" / "00002-iteration.parquet"
+    other = folder / "trace" / "00003-iteration.parquet"
     pd.DataFrame({"episode": np.arange(10)}).to_parquet(other)
     recording = read_own_recording(folder)
-    assert set(recording.steps["iteration"]) == {0, 1, 3}
+    assert set(recording.steps["iteration"]) == {1, 2, 4}
     assert [problem.file for problem in recording.problems] == [str(other)]
 
 
@@ -112,7 +113,7 @@ def test_a_line_of_the_metrics_cut_off_by_a_kill_is_told(folder):
     file = folder / "metrics.jsonl"
     file.write_text(file.read_text()[:-40])
     recording = read_own_recording(folder)
-    assert recording.updates["iteration"].tolist() == [0, 1, 2]
+    assert recording.updates["iteration"].tolist() == [1, 2, 3]
     (problem,) = recording.problems
     assert (problem.file, problem.line) == (str(file), 4)
 

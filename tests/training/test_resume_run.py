@@ -83,7 +83,7 @@ def test_what_was_written_after_the_checkpoint_is_written_anew(trained, cut, cal
     run = cut()
     with (run / "metrics.jsonl").open("a") as metrics:
         metrics.write(json.dumps({"iteration": 4, "env_steps": 1}) + '\n{"iteration": 5, "en')
-    (run / "trace" / "00003-iteration.parquet").write_bytes(b"half")
+    (run / "trace" / "00004-iteration.parquet").write_bytes(b"half")
     (run / "checkpoints" / ".000004").mkdir()
     (run / "summary.json").unlink()
     assert call("resume", run.name, "budget.iterations=6").code == 0

@@ -49,7 +49,7 @@ def same_weights(one, other) -> bool:
 def assert_trace_tells_the_metrics(ended) -> None:
     """Recompute every iteration's row from the trace."""
     trace = read_trace(ended.folder / "trace")
-    metrics = pd.DataFrame(ended.metrics)
+    metrics = pd.DataFrame(ended.metrics, index=range(1, len(ended.metrics) + 1))
     assert len(trace) == ended.summary["env_steps"] == metrics.env_steps.iloc[-1]
     assert (trace.groupby("iteration").size().cumsum().to_numpy() == metrics.env_steps).all()
 
@@ -74,7 +74,7 @@ def assert_trace_tells_the_metrics(ended) -> None:
     ).all()
     for iteration, row in metrics.iterrows():
         part = ends[ends.iteration == iteration]
-        assert row.iteration == iteration + 1
+        assert row.iteration == iteration
         for name, column in (("mean_return", "episode_return"), ("completion", "progress")):
             value = row[name]
             assert (
@@ -184,7 +184,7 @@ def test_several_tracks_train_together_and_each_has_its_metrics(trained):
     trace = read_trace(ended.folder / "trace")
     ends = trace[trace.done]
     assert set(trace.track) == set(TRACKS)
-    for iteration, row in enumerate(ended.metrics):
+    for iteration, row in enumerate(ended.metrics, start=1):
         assert row["best_lap_time_s"] is row["mean_lap_time_s"] is None
         for name in TRACKS:
             here = ends[(ends.iteration == iteration) & (ends.track == name)]
