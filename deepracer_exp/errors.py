@@ -1,7 +1,11 @@
-"""The two ways a command ends badly, and their exit codes."""
+"""The two ways a command ends badly, their exit codes, and the boundary around what a user gave."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+_LONGEST_LINE = 4000
+"""Characters of a message; the longest lists of options have fewer."""
 
 
 class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise site
@@ -9,11 +13,62 @@ class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise sit
 
     exit_code = 2
 
+    def __init__(self, message: object) -> None:
+        super().__init__(_one_line(str(message)))
+
 
 class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise site
     """A run that had begun cannot go on: reward error, non-finite value, lost worker, full disk."""
 
     exit_code = 3
+
+
+@contextmanager
+def reading(what: object, accepted: str = "") -> Iterator[None]:
+    """Turn whatever goes wrong while a user's value or file is read, composed or built into `BadInput`.
+
+    Args:
+        what: the key with its value, or the file.
+        accepted: what would be, for the message.
+
+    Raises:
+        BadInput: one line with `what`, the reason and what would be accepted.
+    """
+    try:
+        yield
+    except (BadInput, RunFailed):
+        raise
+    except Exception as error:  # what a value or a file can bring about in a library has no end
+        hint = f"; accepted: {accepted}" if accepted else ""
+        raise BadInput(f"{what}: {_reason(error)}{hint}") from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    if isinstance(error, MemoryError):
+        return "needs more memory than there is"
+    if isinstance(error, UnicodeDecodeError):
+        return f"is not UTF-8 text (byte {error.start} is 0x{error.object[error.start]:02x})"
+    if isinstance(error, OSError) and error.strerror:
+        return f"cannot be read: {error.strerror}"
+    mark = getattr(error, "problem_mark", None)
+    if mark is not None:  # YAML's errors have several lines, most of which say where
+        return f"{getattr(error, 'problem', None)} in line {mark.line + 1}"
+    if type(error).__module__ != "builtins" or isinstance(error, ValueError | OSError):
+        return str(error) or type(error).__name__
+    return f"{type(error).__name__}: {error}"
+
+
+def _one_line(text: str) -> str:
+    """Return a text without line breaks and control characters, the middle left out of a very long one."""
+    line = "".join(
+        letter if letter.isprintable() else repr(letter)[1:-1] for letter in " ".join(text.split())
+    )
+    if len(line) <= _LONGEST_LINE:
+        return line
+    half = _LONGEST_LINE // 2
+    return f"{line[:half]} … {line[-half:]}"
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

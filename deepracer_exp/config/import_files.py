@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.user_file import read_bytes
 
 from .compose import Composition
 from .custom_files import CustomFiles
@@ -120,7 +121,7 @@ def _texts(files: CustomFiles, name: str, composition: Composition) -> dict[Path
         source = re.sub(r"\s+", " ", str(Path(files.paths[file]).resolve()))
         values = composition.mapping[group]
         if group == "reward":
-            texts[Path("conf/reward", f"{name}.py")] = _read(files.paths[file])
+            texts[Path("conf/reward", f"{name}.py")] = read_bytes(files.paths[file], "a Python file")
             text = _reward(source, name, values)
         elif group == "action_space":
             text = _action_space(source, values)
@@ -172,13 +173,6 @@ def _flow(value: Any) -> str:
     """Return a value as YAML on one line."""
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=float("inf"))
     return text.removesuffix("...\n").strip()
-
-
-def _read(path: str) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror}); accepted: a Python file") from error
 
 
 def _write_all(texts: Mapping[Path, str | bytes]) -> None:

@@ -8,7 +8,8 @@ from importlib import resources
 from pathlib import Path
 
 from deepracer_exp.config.driving import RewardConfig
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, nearest, reading
+from deepracer_exp.formats.user_file import read_bytes
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
     if config.file is None:
         name, path, data = config.name, *_zoo_file(config.name)
     else:
-        name, path, data = Path(config.file).stem, config.file, _read(config.file)
+        name, path, data = Path(config.file).stem, config.file, read_bytes(config.file, "a Python file")
     text = _decode(path, data)
     tree = _parse(path, text)
     _check_function(path, tree)
@@ -97,21 +98,9 @@ def _zoo_file(name: str) -> tuple[str, bytes]:
     return str(file), file.read_bytes()
 
 
-def _read(file: str) -> bytes:
-    try:
-        return Path(file).read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a null character in the path
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise BadInput(f"reward.file: {file!r} cannot be read: {reason}; a Python file is wanted") from error
-
-
 def _decode(path: str, data: bytes) -> str:
-    try:
+    with reading(path, "a Python file"):
         text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInput(
-            f"{path}: is not UTF-8 text (byte {error.start} is 0x{data[error.start]:02x})"
-        ) from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

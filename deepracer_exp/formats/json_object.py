@@ -8,8 +8,7 @@ from typing import Any
 
 from deepracer_exp.errors import BadInput, nearest
 
-MAX_BYTES = 2**20
-"""No settings file of DeepRacer comes near this; a larger one is another file."""
+from .user_file import read_json
 
 
 class JsonObject:
@@ -28,12 +27,7 @@ class JsonObject:
             BadInput: it cannot be read, is no plain file, too large, not JSON, or holds something else.
         """
         self.path = Path(path)
-        text = self._decoded(self._raw(kind) if raw is None else raw, kind)
-        try:
-            data = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            reason = " ".join(str(error).split())
-            raise BadInput(f"{self.path}: not JSON ({reason}); accepted: {kind}") from error
+        data = read_json(path, kind, raw)
         if not isinstance(data, dict):
             raise BadInput(f"{self.path}: holds a {type(data).__name__}; accepted: {accepted}")
         self.data: Mapping[str, Any] = data
@@ -85,26 +79,3 @@ class JsonObject:
         if number != int(number):
             raise self.bad(key, value, f"a whole number from {low} to {high}")
         return int(number)
-
-    def _raw(self, kind: str) -> bytes:
-        try:
-            # A pipe or a device would never end, or never begin.
-            if self.path.exists() and not self.path.is_file():
-                raise BadInput(f"{self.path}: is no file; accepted: {kind}")
-            with self.path.open("rb") as file:
-                raw = file.read(MAX_BYTES + 1)
-        except (OSError, ValueError) as error:  # ValueError: a null character in the path
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise BadInput(f"{self.path}: cannot be read ({reason}); accepted: {kind}") from error
-        return raw
-
-    def _decoded(self, raw: bytes, kind: str) -> str:
-        if len(raw) > MAX_BYTES:
-            raise BadInput(f"{self.path}: is larger than {MAX_BYTES // 2**20} MiB; accepted: {kind}")
-        try:
-            # Editors on Windows put a byte order mark before the JSON.
-            return raw.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise BadInput(
-                f"{self.path}: not JSON (byte {error.start} is no UTF-8); accepted: {kind}"
-            ) from error

@@ -7,6 +7,8 @@ import zlib
 from collections.abc import Iterator
 from typing import IO
 
+from .user_file import LOG_BYTES
+
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError)
 """How a file or a member of an archive refuses to be read on."""
 SIZE = 2**23
@@ -26,6 +28,7 @@ class Blocks:
         self.stream = stream
         self.size = SIZE
         self._torn = False
+        self._bytes = 0
         self.lines = 0
         """Lines before the block that is out."""
         self.refused: list[tuple[int | None, str]] = []
@@ -70,6 +73,10 @@ class Blocks:
         # In pieces: what a torn archive still gave before its end would be lost with the piece that fails.
         pieces, size = [], 0
         while size < self.size and not self._torn:
+            if self._bytes > LOG_BYTES:
+                self.refused.append((None, f"longer than {LOG_BYTES // 2**30} GiB; the rest is not read"))
+                self._torn = True
+                break
             try:
                 piece = self.stream.read(min(_PIECE, self.size - size))
             except READ_ERRORS as error:
@@ -81,4 +88,5 @@ class Blocks:
                 break
             pieces.append(piece)
             size += len(piece)
+            self._bytes += len(piece)
         return b"".join(pieces)

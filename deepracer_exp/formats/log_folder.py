@@ -16,6 +16,9 @@ from deepracer_exp.errors import BadInput
 
 from .log_blocks import READ_ERRORS
 from .recording import LogProblem, readable
+from .user_file import LOG_BYTES, open_user_file
+
+_ACCEPTED = "trace CSVs or logs of the service"
 
 _KIND = re.compile(r"(?:^|[-_.])(training|evaluation|leaderboard)(?=[-_.]|$)", re.IGNORECASE)
 _FOLDERS = {"training": "training", "evaluation": "evaluation", "leaderboard": "leaderboard"}
@@ -151,11 +154,11 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
                 _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
                 yield found
             else:
-                yield LogFolder([LogFile(path, path.resolve().parts[-3:], path.open, ("rb",))])
+                yield LogFolder(
+                    [LogFile(path, path.resolve().parts[-3:], open_user_file, (path, _ACCEPTED, LOG_BYTES))]
+                )
     except FileNotFoundError as error:
-        raise BadInput(
-            f"{path}: no such file or folder; accepted: trace CSVs or logs of the service"
-        ) from error
+        raise BadInput(f"{path}: no such file or folder; accepted: {_ACCEPTED}") from error
     except (*READ_ERRORS, ValueError) as error:
         if isinstance(error, BadInput):
             raise
@@ -182,7 +185,7 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
                 packed.append(entry)
             elif entry.is_file():
                 parts = (*above, *entry.relative_to(root).parts)
-                found.files.append(LogFile(entry, parts, entry.open, ("rb",)))
+                found.files.append(LogFile(entry, parts, open_user_file, (entry, _ACCEPTED, LOG_BYTES)))
     found.files.sort(key=lambda file: file.order)
     archives = opened.enter_context(contextlib.closing(_Archives()))
     for path in sorted(packed):
@@ -260,7 +263,7 @@ def _unpack(
     if inside and not any(map(_tells, members.files)):
         found.problems += members.problems
         found.files.append(
-            LogFile(path, (*beside, path.name), path.open, ("rb",))
+            LogFile(path, (*beside, path.name), open_user_file, (path, _ACCEPTED, LOG_BYTES))
         )  # a model for the car, perhaps
         return
     found.apart = False

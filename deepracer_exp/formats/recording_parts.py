@@ -9,13 +9,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
-import yaml
-
 from deepracer_exp.errors import BadInput
 
 from . import step_tables
 from .hyperparameters import Hyperparameters, read_hyperparameters
-from .json_object import MAX_BYTES
 from .log_blocks import READ_ERRORS
 from .log_folder import LOG, LogFile, LogFolder, Place, natural, place_of
 from .metrics_json import MetricsJson, read_metrics_json
@@ -25,6 +22,7 @@ from .rolled_logs import piece_of
 from .sim_trace_csv import read_trace_csv
 from .step_tables import StepTables
 from .training_log import MARKER, TrainingLog, read_training_log
+from .user_file import SETTINGS_BYTES, read_yaml
 
 Result = TypeVar("Result")
 
@@ -196,11 +194,11 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         return _read_csv(parts, file)
     if _METADATA.fullmatch(name):
         with file.open() as stream:
-            parts.metadata.append((file, read_model_metadata(file.path, stream.read(MAX_BYTES + 1))))
+            parts.metadata.append((file, read_model_metadata(file.path, stream.read(SETTINGS_BYTES + 1))))
         return True
     if _HYPERPARAMETERS.fullmatch(name):
         with file.open() as stream:
-            known = read_hyperparameters(file.path, stream.read(MAX_BYTES + 1))
+            known = read_hyperparameters(file.path, stream.read(SETTINGS_BYTES + 1))
         parts.hyperparameters.append((file, told_hyperparameters(known)))
         return True
     if name.endswith(".json") and not _BESIDE.fullmatch(name):
@@ -211,12 +209,12 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         return True
     if name.startswith("reward_function") and name.endswith(".py"):
         with file.open() as stream:
-            parts.reward.append((file, stream.read(MAX_BYTES).decode("utf-8", "replace")))
+            parts.reward.append((file, stream.read(SETTINGS_BYTES).decode("utf-8", "replace")))
         return True
     params = _PARAMS.fullmatch(name)
     if params is not None:
         with file.open() as stream:
-            world = _world(stream.read(MAX_BYTES))
+            world = _world(file, stream.read(SETTINGS_BYTES + 1))
         if world:
             parts.worlds[params[1]] = world
         return True
@@ -269,12 +267,9 @@ def told_hyperparameters(known: Hyperparameters) -> dict[str, Any]:
     return {key: getattr(known, key) for key in known.given if hasattr(known, key)}
 
 
-def _world(raw: bytes) -> str:
+def _world(file: LogFile, raw: bytes) -> str:
     """Return the course that a job's parameters name, the first of several."""
-    try:
-        data = yaml.safe_load(raw)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise BadInput(f"not YAML ({' '.join(str(error).split())})") from error
+    data = read_yaml(file.path, "a job's parameters", raw=raw)
     world = data.get("WORLD_NAME") if isinstance(data, Mapping) else None
     world = world[0] if isinstance(world, list) and world else world
     return world if isinstance(world, str) else ""

@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, nearest, reading
+
+from .user_file import ROUTE_BYTES, open_user_file, read_yaml
 
 REPEAT_M = 1e-9
 """A centre point closer than this to the one before it repeats it."""
@@ -42,14 +43,12 @@ def read_route(path: str | Path) -> np.ndarray:
     Raises:
         BadInput: The file cannot be read, or does not hold such rows.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            rows = np.lib.format.read_array(file, allow_pickle=False)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    except (ValueError, MemoryError) as error:  # MemoryError: a torn header that claims terabytes
-        raise BadInput(f"{path}: not a NumPy array file; accepted is a .npy with {ROUTE_ROWS}") from error
+    accepted = f"a .npy with {ROUTE_ROWS}"
+    with (
+        open_user_file(path, accepted, ROUTE_BYTES) as file,
+        reading(f"{path}: not a NumPy array file", accepted),
+    ):
+        rows = np.lib.format.read_array(file, allow_pickle=False)
     if rows.dtype.kind not in "fiu":
         raise BadInput(f"{path}: holds {rows.dtype.name} values; accepted are {ROUTE_ROWS}")
     try:
@@ -105,17 +104,7 @@ def read_knots(path: str | Path) -> Knots:
         BadInput: The file cannot be read, a key is unknown or missing, or a value has the wrong type.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        content = yaml.safe_load(text)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    except UnicodeDecodeError as error:
-        raise BadInput(f"{path}: not UTF-8 text; accepted is a YAML file of knots") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        raise BadInput(f"{path}: not YAML{where}; accepted is a file with the keys {_keys()}") from error
+    content = read_yaml(path, f"a file with the keys {_keys()}")
     if not isinstance(content, dict):
         raise BadInput(f"{path}: no keys found; accepted are {_keys()}")
     for key in content:
@@ -156,11 +145,6 @@ def _widths(path: Path, value: Any) -> np.ndarray:
 def _is_coordinate(value: Any) -> bool:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return number and math.isfinite(value) and abs(value) <= FARTHEST_M
-
-
-def _unreadable(path: Path, error: OSError) -> BadInput:
-    reason = error.strerror or "cannot be read"
-    return BadInput(f"{path}: {reason}; accepted is a route (.npy) or a YAML of knots")
 
 
 def _keys() -> str:

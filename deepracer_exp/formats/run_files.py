@@ -5,12 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
+from deepracer_exp.errors import BadInput, reading
 
-from deepracer_exp.errors import BadInput
-
-# The one in C takes a seventh of the time, and an experiment has hundreds of runs.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+from .user_file import RECORD_BYTES, read_text, read_yaml
 
 
 @dataclass(frozen=True)
@@ -65,13 +62,7 @@ def read_config(path: Path) -> dict[str, Any]:
         BadInput: it cannot be read or holds no values.
     """
     file = path / "config.yaml"
-    loader = _LOADER(_text(file))
-    try:
-        mapping = loader.get_single_data()
-    except yaml.YAMLError as error:
-        raise BadInput(f"{file}: is not valid YAML: {' '.join(str(error).split())}") from error
-    finally:
-        loader.dispose()
+    mapping = read_yaml(file, "what a run writes there")
     if not isinstance(mapping, dict):
         raise BadInput(f"{file}: holds no values; a run writes its experiment there")
     return {str(key): value for key, value in mapping.items()}
@@ -109,19 +100,12 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise BadInput(f"{path}: is not UTF-8 text") from error
+    return read_text(path, "what a run writes there", RECORD_BYTES)
 
 
 def _object(path: Path, text: str, where: str = "") -> dict[str, Any]:
-    try:
+    with reading(f"{path}{where}: is not valid JSON"):
         value = json.loads(text)
-    except ValueError as error:
-        raise BadInput(f"{path}{where}: is not valid JSON: {error}") from error
     if not isinstance(value, dict):
         raise BadInput(f"{path}{where}: {text[:40]!r} is no JSON object")
     return value

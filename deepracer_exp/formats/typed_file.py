@@ -1,11 +1,14 @@
 """JSON files whose keys and types are those of a dataclass."""
 
+import os
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.errors import BadInput
+
+from .user_file import read_bytes
 
 Content = TypeVar("Content")
 
@@ -21,13 +24,12 @@ def read_typed(file: Path, adapter: TypeAdapter[Content], writer: str) -> Conten
     Raises:
         BadInput: the file cannot be read or holds something else.
     """
-    try:
-        return adapter.validate_json(file.read_bytes(), strict=True)
-    except FileNotFoundError:
+    if not os.path.lexists(file):
         return None
-    except OSError as error:
-        raise BadInput(f"{file}: cannot be read: {error.strerror}") from error
+    raw = read_bytes(file, f"what {writer} writes there")
+    try:
+        return adapter.validate_json(raw, strict=True)
     except ValidationError as error:
         finding = error.errors(include_url=False)[0]
         where = "".join(f" {part}:" for part in finding["loc"])
-        raise BadInput(f"{file}:{where} {finding['msg']}; wanted is what {writer} writes there") from error
+        raise BadInput(f"{file}:{where} {finding['msg']}; accepted: what {writer} writes there") from error

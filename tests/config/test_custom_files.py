@@ -308,7 +308,7 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(custom_files, files, w
 def test_a_folder_in_place_of_a_file_is_refused(custom_files):
     folder = custom_files(hyperparameters=None)
     (folder / "hyperparameters.json").mkdir()
-    assert "hyperparameters.json: is no file" in refusal(folder)
+    assert "hyperparameters.json: is a folder" in refusal(folder)
 
 
 def test_a_link_to_nowhere_is_refused(custom_files):

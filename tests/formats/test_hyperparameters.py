@@ -153,9 +153,9 @@ def test_a_huge_file_is_refused_without_being_read_whole(tmp_path):
 
 def test_what_is_no_plain_file_is_refused(tmp_path):
     refusal(tmp_path / "missing.json")
-    assert "is no file" in refusal(tmp_path)
+    assert "is a folder" in refusal(tmp_path)
     os.mkfifo(tmp_path / "pipe")
-    assert "is no file" in refusal(tmp_path / "pipe")
+    assert "is a pipe" in refusal(tmp_path / "pipe")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

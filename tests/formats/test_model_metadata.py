@@ -183,7 +183,7 @@ def test_a_file_that_is_no_json_object_is_named_in_one_line(tmp_path: Path, cont
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
     for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(BadInput, match="cannot be read"):
+        with pytest.raises(BadInput, match="accepted: a model_metadata"):
             read_model_metadata(path)
 
 

@@ -88,7 +88,7 @@ def test_an_archive_or_a_folder_is_no_route(tmp_path):
     (tmp_path / "a.npz").rename(tmp_path / "a.npy")
     with pytest.raises(BadInput, match="not a NumPy array file"):
         read_route(tmp_path / "a.npy")
-    with pytest.raises(BadInput, match="directory"):
+    with pytest.raises(BadInput, match="folder"):
         read_route(tmp_path)
 
 
@@ -104,7 +104,7 @@ def test_knots_alone_with_a_width_make_a_closed_course(tmp_path):
     [
         ("", "no keys"),
         ("- 1", "no keys"),
-        ("knots: [", "not YAML in line"),
+        ("knots: [", "not YAML: .* in line 2"),
         (SQUARE, "width_m is missing"),
         ("width_m: 1", "knots is missing"),
         (SQUARE + "width: 1", r"unknown key 'width' \(did you mean width_m\?\)"),

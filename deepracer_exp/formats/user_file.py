@@ -1,0 +1,147 @@
+"""Files that a user gave, all read here: regular files alone, and none larger than its kind can be."""
+
+import json
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import yaml
+
+from deepracer_exp.errors import BadInput, reading
+
+Content = TypeVar("Content")
+
+SETTINGS_BYTES = 2**20
+"""Of a file that people write: YAML, JSON, a reward function. None comes near it; a larger one is another file."""
+ROUTE_BYTES = 2**21
+"""Of a route: more than 40,000 rows, a hundred times the longest of the service."""
+RECORD_BYTES = 2**30
+"""Of a file that a training writes; metrics.jsonl has about 1 KB an iteration."""
+LOG_BYTES = 2**32
+"""Of a log or an archive, and of a file packed in it; the largest known logs have hundreds of megabytes."""
+
+_MOST_VALUES = 100_000
+_DEEPEST = 50
+
+# The parser in C takes a seventh of the time, and an experiment has hundreds of runs.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes]:
+    """Open a file for reading.
+
+    Args:
+        path: of the file.
+        accepted: what would be, for messages.
+        most_bytes: that a file of its kind can have.
+
+    Raises:
+        BadInput: it is not there, no regular file (a pipe or a device never ends), larger, or cannot be read.
+    """
+    with reading(path, accepted):
+        found = Path(path).stat()
+        if not stat.S_ISREG(found.st_mode):
+            kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no file")
+            raise BadInput(f"{path}: is {kind}; accepted: {accepted}")
+        _check_size(path, found.st_size, accepted, most_bytes)
+        return Path(path).open("rb")
+
+
+def read_bytes(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> bytes:
+    """Return what a file holds; arguments and errors as of `open_user_file`."""
+    with open_user_file(path, accepted, most_bytes) as file, reading(path, accepted):
+        raw = file.read(most_bytes + 1)
+    _check_size(path, len(raw), accepted, most_bytes)
+    return raw
+
+
+def read_text(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> str:
+    """Return the text of a file in UTF-8; arguments and errors as of `open_user_file`."""
+    raw = read_bytes(path, accepted, most_bytes)
+    with reading(path, accepted):
+        # Editors on Windows put a byte order mark at the beginning.
+        return raw.decode("utf-8-sig")
+
+
+def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
+    """Return what a JSON file holds.
+
+    Args:
+        path: of the file.
+        accepted: what would be, for messages.
+        raw: its bytes where they are known: of a member of an archive, or taken out of a log.
+
+    Raises:
+        BadInput: it cannot be read, is too large, or not JSON.
+    """
+    raw = read_bytes(path, accepted) if raw is None else raw
+    _check_size(path, len(raw), accepted, SETTINGS_BYTES)
+    with reading(f"{path}: not JSON", accepted):
+        return json.loads(raw.decode("utf-8-sig"))
+
+
+def read_yaml(
+    path: str | Path, accepted: str, load: Callable[[str], Content] | None = None, raw: bytes | None = None
+) -> Content | Any:
+    """Return what a YAML file holds, as plain values.
+
+    Args:
+        path: of the file.
+        accepted: what would be, for messages.
+        load: turns the text into something else than plain values.
+        raw: its bytes where they are known.
+
+    Raises:
+        BadInput: it cannot be read, is too large, not YAML, holds itself, or has more values, aliases counted each
+            time, or more levels than a file that somebody wrote.
+    """
+    raw = read_bytes(path, accepted) if raw is None else raw
+    _check_size(path, len(raw), accepted, SETTINGS_BYTES)
+    with reading(f"{path}: not YAML", accepted):
+        text = raw.decode("utf-8-sig")
+        _check_structure(text)
+        return yaml.load(text, _LOADER) if load is None else load(text)
+
+
+def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> None:
+    if size > most_bytes:
+        raise BadInput(f"{path}: is larger than {most_bytes // 2**20} MiB; accepted: {accepted}")
+
+
+def _check_structure(text: str) -> None:
+    """Refuse what would not come to an end: a few lines of aliases can stand for billions of values."""
+    known: dict[str, tuple[int, int]] = {}
+    open_nodes: list[list[Any]] = [[None, 0, 0]]  # anchor, values and levels of each that is open
+    for event in yaml.parse(text, _LOADER):
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append([event.anchor, 1, 0])
+            if len(open_nodes) > _DEEPEST:
+                raise ValueError(f"more than {_DEEPEST} levels of lists and mappings")
+            continue
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, values, levels = open_nodes.pop()
+            levels += 1
+        elif isinstance(event, yaml.ScalarEvent):
+            anchor, values, levels = event.anchor, 1, 0
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in known:
+                raise ValueError(f"alias *{event.anchor} of something that is not complete or not there")
+            anchor, (values, levels) = None, known[event.anchor]
+        else:
+            continue
+        if anchor is not None:
+            known[anchor] = values, levels
+        parent = open_nodes[-1]
+        parent[1] += values
+        parent[2] = max(parent[2], levels)
+        if parent[1] > _MOST_VALUES or len(open_nodes) + parent[2] > _DEEPEST:
+            raise ValueError(f"more than {_MOST_VALUES:,} values or {_DEEPEST} levels")
