@@ -11,7 +11,7 @@ from deepracer_exp.errors import BadInput, nearest, reading
 from .user_file import ROUTE_BYTES, open_user_file, read_yaml
 
 REPEAT_M = 1e-9
-"""A centre point closer than this to the one before it repeats it."""
+"""A point closer than this to the one before it repeats it."""
 FARTHEST_M = 10_000.0
 """Coordinates beyond this are not metres."""
 KNOT_KEYS = ("knots", "width_m", "closed", "title")
@@ -30,8 +30,8 @@ class Knots(NamedTuple):
 def read_route(path: str | Path) -> np.ndarray:
     """Read a route file.
 
-    Rows whose centre repeats the one before are dropped, as deepracer-simapp does since 2025
-    (track_geom); the last row stays, since it says whether the course is closed.
+    Rows whose centre repeats the one before stay: they count in the service's waypoint numbers, as every
+    recording of such a course shows.
 
     Args:
         path: A `.npy` file of shape (n, 6).
@@ -58,7 +58,7 @@ def read_route(path: str | Path) -> np.ndarray:
 
 
 def checked_rows(rows: np.ndarray) -> np.ndarray:
-    """Return route rows as float64 without repeated centre points.
+    """Return route rows as float64.
 
     Args:
         rows: Numbers of shape (n, 6).
@@ -74,24 +74,18 @@ def checked_rows(rows: np.ndarray) -> np.ndarray:
         row, column = np.argwhere(wrong)[0]
         value = f"row {row}, column {column} is {rows[row, column]:g}"
         raise BadInput(f"{value}; accepted are numbers within +-{FARTHEST_M:g} m")
-    rows = _without_repeats(rows)
     closed = bool(len(rows) and (rows[0] == rows[-1]).all())
     needed = 4 if closed else 3
-    if len(rows) < needed:
+    distinct = int(is_first_of_equals(rows[:, :2]).sum())
+    if distinct < needed:
         kind = "closed course with its closing row" if closed else "course"
-        raise BadInput(f"{len(rows)} distinct rows; accepted are at least {needed} for a {kind}")
+        raise BadInput(f"{distinct} distinct rows; accepted are at least {needed} for a {kind}")
     return rows
 
 
-def _without_repeats(rows: np.ndarray) -> np.ndarray:
-    step_m = np.linalg.norm(np.diff(rows[:, :2], axis=0), axis=1)
-    keep = np.ones(len(rows), bool)
-    keep[1:] = step_m >= REPEAT_M
-    if len(rows) > 2 and not keep[-1]:
-        # The closing row must equal the first to the last bit: drop the row it repeats instead.
-        keep[np.flatnonzero(keep)[-1]] = False
-        keep[-1] = True
-    return rows[keep]
+def is_first_of_equals(points: np.ndarray) -> np.ndarray:
+    """Tell for points (n, 2) in metres whether each differs from the one before it (bool); the first does."""
+    return np.linalg.norm(np.diff(points, axis=0, prepend=np.inf), axis=1) >= REPEAT_M
 
 
 def read_knots(path: str | Path) -> Knots:

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from deepracer_exp.formats.routes import is_first_of_equals
+
 CELL_M = 0.1
 """Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""
 MOST_CELLS = 400_000
@@ -40,6 +42,10 @@ class Segments(NamedTuple):
     """The same as a share of the whole line, 0 to 1."""
     heading_rad: np.ndarray
     """Direction of each segment."""
+    point: np.ndarray
+    """Which of the line's points each vertex is; of points that repeat each other, the first."""
+    points: np.ndarray
+    """How many points each line was given with, repeats included."""
     at: np.ndarray
     segments: np.ndarray
     total_m: np.ndarray
@@ -63,11 +69,11 @@ def build_segments(vertices: np.ndarray) -> Segments:
     """Index a polyline.
 
     Args:
-        vertices: Points (n + 1, 2) in metres; the first is repeated at the end of a closed line. Segments
-            of no length are left out.
+        vertices: Points (n + 1, 2) in metres; the first is repeated at the end of a closed line. Points that
+            repeat the one before make no segment; `Segments.point` keeps their numbers.
     """
-    moved = np.r_[True, (np.diff(vertices, axis=0) != 0).any(axis=1)]
-    x, y = np.ascontiguousarray(vertices[moved].T)
+    point = np.flatnonzero(is_first_of_equals(vertices))
+    x, y = np.ascontiguousarray(vertices[point].T)
     dx, dy = np.diff(x), np.diff(y)
     # sqrt of the sum of squares, as GEOS measures, so that sums agree to the last bit.
     length_m = np.sqrt(dx * dx + dy * dy)
@@ -93,6 +99,8 @@ def build_segments(vertices: np.ndarray) -> Segments:
         start_m=start_m,
         share=share,
         heading_rad=np.r_[np.arctan2(dy, dx), beyond],
+        point=point,
+        points=np.array([len(vertices)]),
         at=np.array([0]),
         segments=np.array([len(length_m)]),
         total_m=start_m[-1:],

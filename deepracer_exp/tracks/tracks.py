@@ -137,8 +137,8 @@ def _project(s, which, points):  # type: ignore[no-untyped-def]
             ahead += 1
         while ahead > begin and s.share[ahead - 1] > ndist[i]:
             ahead -= 1
-        previous[i] = (ahead if ahead > begin else end) - 1 - begin
-        following[i] = ahead - begin if ahead < end else 0
+        following[i] = s.point[ahead] if ahead < end else 0
+        previous[i] = (following[i] if begin < ahead < end else s.points[line]) - 1
     return ndist, distance_m, offset_m, previous, following, center, heading_rad
 
 

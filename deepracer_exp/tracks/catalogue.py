@@ -1,0 +1,91 @@
+"""The service's worlds as courses, and which of them a recording was driven on."""
+
+import zipfile
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.formats.worlds import FILE, ROUTES, UNITS_PER_M, find_world, worlds
+
+from .track import PLAIN_FLOOR, Track
+
+NEAR_M = 1.0
+"""How far a car is from its closest waypoint at most, as the mean over a recording: roads are up to 2 m wide."""
+
+
+class Recognised(NamedTuple):
+    """A world that a recording fits."""
+
+    name: str
+    reversed: bool
+    distance_m: float
+    """Mean distance between the recorded places and the waypoints recorded as closest."""
+
+
+@cache
+def world_rows(name: str) -> np.ndarray:
+    """Return a world's route rows (n, 6) float64, read-only: centre x, y, inner x, y, outer x, y in metres."""
+    first = 0
+    for world in worlds().values():
+        if world.name == name:
+            break
+        first += world.rows
+    rows = _units()[first : first + worlds()[name].rows] / UNITS_PER_M
+    rows.flags.writeable = False
+    return rows
+
+
+@cache
+def world_track(name: str, reversed: bool = False) -> Track:
+    """Return a world's course on a plain floor.
+
+    Args:
+        name: its name in the service in any case of letters, or its official name.
+        reversed: Drive against the order of its waypoints.
+
+    Raises:
+        BadInput: there is no such world.
+    """
+    found = find_world(name)
+    if found is None:
+        raise BadInput(
+            f"{name}: no such world{nearest(name, worlds())}; `deepracer-exp tracks` lists all {len(worlds())}"
+        )
+    return Track.from_route(
+        world_rows(found), found, title=worlds()[found].title, reversed=reversed, floor=PLAIN_FLOOR
+    )
+
+
+def recognise(points: np.ndarray, closest_waypoint: np.ndarray) -> list[Recognised]:
+    """Return the worlds that fit a recording, the best first; of equal ones the first of the catalogue.
+
+    Every world numbers its waypoints in its own way: the one driven on has each recorded waypoint beside the place
+    where it was recorded.
+
+    Args:
+        points: recorded places (n, 2) in metres; a few hundred from all around the lap tell worlds apart.
+        closest_waypoint: the waypoint recorded with each (n,).
+    """
+    found = []
+    last = int(closest_waypoint.max())
+    for world in worlds().values():
+        if last < world.rows:
+            waypoints = world_rows(world.name)[:, :2]
+            for reversed, line in ((False, waypoints), (True, waypoints[::-1])):
+                away_m = np.linalg.norm(points - line[closest_waypoint], axis=1)
+                found.append(Recognised(world.name, reversed, float(away_m.mean())))
+    near = [one for one in found if one.distance_m < NEAR_M]
+    return sorted(near, key=lambda one: round(one.distance_m, 6))
+
+
+@cache
+def _units() -> np.ndarray:
+    """Return the rows of all worlds (rows, 6) int64 in units of 0.1 mm."""
+    with zipfile.ZipFile(FILE) as file, file.open(ROUTES) as member:
+        bends = np.lib.format.read_array(member, allow_pickle=False)
+    ends = np.cumsum([world.rows for world in worlds().values()])
+    # Each world is stored as its second differences.
+    parts = np.split(bends.astype(np.int64), ends[:-1])
+    return np.concatenate([part.cumsum(axis=0).cumsum(axis=0) for part in parts])

@@ -1,0 +1,111 @@
+"""The worlds of the service, held against its own route files and against what it recorded."""
+
+import numpy as np
+import pytest
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.recording_reader import read_recording
+from deepracer_exp.formats.routes import is_first_of_equals, read_route
+from deepracer_exp.formats.worlds import find_world, leaders, worlds
+from deepracer_exp.tracks.catalogue import recognise, world_rows, world_track
+
+# The world each recording says it was driven on.
+RECORDINGS = {
+    "race_pace/console_v5_baseline.tar.gz": "2022_reinvent_champ_ccw",
+    "race_pace/console_v5_one_bot_ppo.tar.gz": "2022_reinvent_champ_ccw",
+    "race_pace/console_v5_reinvent_base.log.gz": "reinvent_base",
+    "race_pace/console_v5_v2.tar.gz": "Spain_track",
+    "race_pace/console_v5_v3.tar.gz": "Spain_track",
+    "race_pace/drfc_v5_2022_june_pro.log.gz": "2022_june_pro",
+    "race_pace/drfc_v5_FS_June2020.log.gz": "FS_June2020",
+    "race_pace/droa_v6_continuous.tar.gz": "reInvent2019_wide_cw",
+    "race_pace/droa_v6_training.tar.gz": "Spain_track",
+    "console_training/sim-trace": "reinvent_base",
+}
+
+
+@pytest.fixture(params=RECORDINGS)
+def recorded(request, reference):
+    """Return a world, the places recorded on it and the closest waypoint recorded with each."""
+    steps = read_recording(reference / request.param).steps
+    places = steps[["X", "Y"]].to_numpy(np.float64)
+    return RECORDINGS[request.param], places, steps["closest_waypoint"].to_numpy(np.intp)
+
+
+def test_recorded_closest_waypoints_are_those_of_the_world(recorded):
+    name, places, recorded_waypoint = recorded
+    track = world_track(name)
+    found = track.project(places)
+    behind_m, ahead_m = (
+        np.linalg.norm(places - track.waypoints[index], axis=1) for index in (found.previous, found.next)
+    )
+    nearer = np.where(behind_m <= ahead_m, found.previous, found.next)
+    assert np.mean(nearer != recorded_waypoint) <= 0.007
+
+
+def test_a_recording_is_recognised_by_its_waypoint_numbers(recorded):
+    name, places, recorded_waypoint = recorded
+    few = slice(None, None, max(1, len(places) // 300))
+    best = recognise(places[few], recorded_waypoint[few])[0]
+    assert (best.name, best.reversed) == (name, False)
+
+
+def test_places_of_no_world_are_not_recognised():
+    line = world_track("Oval_track").waypoints
+    assert not recognise(line + 7.0, np.arange(len(line)))
+
+
+@pytest.mark.parametrize("name", worlds())
+def test_every_world_makes_a_course_with_all_its_rows(name):
+    rows, track = world_rows(name), world_track(name)
+    assert len(rows) == worlds()[name].rows
+    np.testing.assert_array_equal(track.waypoints, rows[:, :2])
+    assert track.closed == (name != "Straight_track")
+    found = track.project(track.waypoints)
+    assert np.isfinite(found.heading_rad).all()
+    assert (np.diff(found.ndist[:-1]) >= 0).all()
+    # A waypoint is behind itself; of waypoints that repeat each other, it is the last.
+    repeats_next = np.r_[~is_first_of_equals(track.waypoints)[1:], False]
+    number = np.arange(len(rows) - 1)
+    np.testing.assert_array_equal(found.previous[:-1], (number + repeats_next[:-1]))
+
+
+def test_59_worlds_have_a_waypoint_twice():
+    assert sum(not is_first_of_equals(world_rows(name)[:, :2]).all() for name in worlds()) == 59
+
+
+@pytest.mark.parametrize(
+    "name", ["Bowtie_track", "Oval_track", "Spain_track", "Straight_track", "reinvent_base"]
+)
+def test_a_world_has_the_coordinates_of_its_route_file(reference, name):
+    route = read_route(reference / f"routes/{name}.npy")
+    np.testing.assert_allclose(world_rows(name), route, rtol=0, atol=0.5001e-4)
+
+
+def test_variants_stand_beside_the_world_they_are_of():
+    families = [world.family for world in worlds().values()]
+    assert (len(families), len(leaders())) == (127, 63)
+    assert sorted(families) == families
+    assert leaders()[-3:] == ("reinvent_base", "thunder_hill_open", "thunder_hill_pro")
+
+
+@pytest.mark.parametrize(
+    ("called", "name"),
+    [
+        ("reinvent_base", "reinvent_base"),
+        ("REINVENT_BASE", "reinvent_base"),
+        ("arn:aws:deepracer:us-east-1::track/Spain_track", "Spain_track"),
+        ("re:Invent 2018", "reinvent_base"),
+        ("2022 re:Invent Championship", "2022_reinvent_champ_ccw"),
+        ("European Seaside Circuit - Buildings", "Monaco_building"),
+        ("moon", None),
+        ("", None),
+    ],
+)
+def test_a_world_goes_by_its_name_and_by_its_official_one(called, name):
+    assert find_world(called) == name
+
+
+def test_an_unknown_world_is_refused_in_one_line():
+    with pytest.raises(BadInput, match=r"^Oval: no such world \(did you mean Oval_track\?\); .* all 127$"):
+        world_track("Oval")
