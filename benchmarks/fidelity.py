@@ -40,6 +40,7 @@ def measure(car: CarConfig, recorded: pd.DataFrame, only_held_out: bool, threads
     formula = None
     for length, steps in LENGTHS.items():
         windows = cut_windows(recorded, car.front_point_m, steps)
+        figures[f"{length}_windows_left_out"] = windows.left_out
         known = chosen = windows
         if only_held_out:
             held = held_out(windows.iteration)
@@ -90,7 +91,10 @@ def show(figures: dict[str, Any]) -> str:
         for length in LENGTHS
         for part in ("all", "under_way", "standing")
     ]
-    return table(head, rows)
+    left_out = ", ".join(
+        f"{figures[f'{length}_windows_left_out']} of {length.replace('_', ' ')}" for length in LENGTHS
+    )
+    return f"{table(head, rows)}\nleft out, since the car was paused or put elsewhere: windows {left_out}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

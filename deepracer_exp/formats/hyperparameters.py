@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from deepracer_exp.errors import BadInput
+
 from .json_object import JsonObject
 
 LOSS_TYPES = ("huber", "mean squared error")
@@ -73,7 +75,9 @@ class Hyperparameters:
         return tuple(outside)
 
 
-def read_hyperparameters(path: str | Path, raw: bytes | None = None) -> Hyperparameters:
+def read_hyperparameters(
+    path: str | Path, raw: bytes | None = None, refused: list[str] | None = None
+) -> Hyperparameters:
     """Read a hyperparameters.json.
 
     Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
@@ -81,6 +85,7 @@ def read_hyperparameters(path: str | Path, raw: bytes | None = None) -> Hyperpar
     Args:
         path: the file.
         raw: what it holds, where that is known.
+        refused: takes what is wrong with single keys, which then have the service's defaults; None: refuse them.
 
     Raises:
         BadInput: the file cannot be read or holds something the service's trainer could not use; one line with
@@ -90,14 +95,22 @@ def read_hyperparameters(path: str | Path, raw: bytes | None = None) -> Hyperpar
     """
     json = JsonObject(path, "a hyperparameters.json", "a JSON object with batch_size, lr, ...", raw)
     values: dict[str, int | float | str] = {}
+    given = []
     for key, value in json.data.items():
-        if key in _WHOLE:
-            values[key] = json.whole(key, value, *_WHOLE[key])
-        elif key in _NUMBERS:
-            values[key] = json.number(key, value, *_NUMBERS[key])
-        elif key in _WORDS:
-            values[key] = json.choice(key, value, _WORDS[key])
-    return Hyperparameters(**values, given=tuple(json.data))  # type: ignore[arg-type]
+        try:
+            if key in _WHOLE:
+                values[key] = json.whole(key, value, *_WHOLE[key])
+            elif key in _NUMBERS:
+                values[key] = json.number(key, value, *_NUMBERS[key])
+            elif key in _WORDS:
+                values[key] = json.choice(key, value, _WORDS[key])
+        except BadInput as error:
+            if refused is None:
+                raise
+            refused.append(str(error).removeprefix(f"{path}: "))
+        else:
+            given.append(key)
+    return Hyperparameters(**values, given=tuple(given))  # type: ignore[arg-type]
 
 
 def hyperparameters_text(values: Hyperparameters) -> str:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from deepracer_exp.errors import BadInput
 
 from . import step_tables
-from .hyperparameters import Hyperparameters, read_hyperparameters
+from .hyperparameters import read_hyperparameters
 from .log_blocks import READ_ERRORS
 from .log_folder import LOG, LogFile, LogFolder, Place, natural, place_of
 from .metrics_json import MetricsJson, read_metrics_json
@@ -198,8 +198,7 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         return True
     if _HYPERPARAMETERS.fullmatch(name):
         with file.open() as stream:
-            known = read_hyperparameters(file.path, stream.read(SETTINGS_BYTES + 1))
-        parts.hyperparameters.append((file, told_hyperparameters(known)))
+            _read_hyperparameters(parts, file, stream.read(SETTINGS_BYTES + 1))
         return True
     if name.endswith(".json") and not _BESIDE.fullmatch(name):
         with file.open() as stream:
@@ -253,18 +252,18 @@ def _read_log(parts: Parts, file: LogFile) -> bool:
         except BadInput as error:
             parts.refuse(file, [(None, f"action space: {str(error).removeprefix(f'{file.path}: ')}")])
     if log.hyperparameters is not None:
-        try:
-            raw = json.dumps(log.hyperparameters).encode()
-            known = read_hyperparameters(file.path, raw)
-            parts.hyperparameters.append((file, told_hyperparameters(known)))
-        except BadInput as error:
-            parts.refuse(file, [(None, f"hyperparameters: {str(error).removeprefix(f'{file.path}: ')}")])
+        _read_hyperparameters(parts, file, json.dumps(log.hyperparameters).encode())
     return True
 
 
-def told_hyperparameters(known: Hyperparameters) -> dict[str, Any]:
-    """Return the values that a file gives itself."""
-    return {key: getattr(known, key) for key in known.given if hasattr(known, key)}
+def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
+    """Add the values that a file gives itself; one that cannot be used is listed, the others stay."""
+    refused: list[str] = []
+    known = read_hyperparameters(file.path, raw, refused)
+    parts.hyperparameters.append(
+        (file, {key: getattr(known, key) for key in known.given if hasattr(known, key)})
+    )
+    parts.refuse(file, [(None, f"hyperparameters: {reason}") for reason in refused])
 
 
 def _world(file: LogFile, raw: bytes) -> str:

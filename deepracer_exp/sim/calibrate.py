@@ -49,21 +49,27 @@ class Parameter(NamedTuple):
     step: float
     """A change that is felt: of the value, or of its logarithm."""
     logarithmic: bool
+    low: float
+    """What a car of this size can have at least."""
+    high: float
+    """And at most."""
 
 
 PARAMETERS = (
-    Parameter("tyre_friction", 0.2, True),
-    Parameter("front_slip_time_s", 0.2, True),
-    Parameter("rear_slip_time_s", 0.2, True),
-    Parameter("drive_radius_m", 0.2, True),
-    Parameter("front_motor_gain_nms", 0.2, True),
-    Parameter("rear_motor_gain_nms", 0.2, True),
-    Parameter("motor_torque_nm", 0.2, True),
-    Parameter("servo_damping_nms", 0.2, True),
-    Parameter("servo_kick", 0.05, False),
-    Parameter("steering_trim_deg", 1.0, False),
+    Parameter("tyre_friction", 0.2, True, 0.1, 1.5),
+    Parameter("front_slip_time_s", 0.2, True, 0.0267, 1.0),
+    Parameter("rear_slip_time_s", 0.2, True, 0.0267, 1.0),
+    Parameter("drive_radius_m", 0.2, True, 0.02, 0.05),
+    Parameter("front_motor_gain_nms", 0.2, True, 1e-4, 1.0),
+    Parameter("rear_motor_gain_nms", 0.2, True, 1e-4, 1.0),
+    Parameter("motor_torque_nm", 0.2, True, 0.01, 2.0),
+    Parameter("servo_damping_nms", 0.2, True, 0.02, 4.0),
+    Parameter("servo_kick", 0.05, False, 0.0, 0.95),
+    Parameter("steering_trim_deg", 1.0, False, -5.0, 5.0),
 )
-"""Masses, inertias and lengths are the URDF's."""
+"""Masses, inertias and lengths are the URDF's. Bounds: rubber grips with 0.1 (wet ice) to 1.5 (a racing tyre); slip
+takes two physics steps or more; the wheels' radius is 0.036 m; the servo's time constant, damping over its gain of 2,
+is 0.01 to 2 s."""
 
 
 def held_out(iteration: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -154,6 +160,20 @@ def table(before: CarConfig, after: CarConfig, parameters: Sequence[Parameter]) 
     return _lines([("parameter", "before", "after"), *rows])
 
 
+def unphysical(car: CarConfig, parameters: Sequence[Parameter]) -> list[str]:
+    """Return a line for each fitted value that no car of this size has."""
+    found = []
+    for p in parameters:
+        value = float(getattr(car, p.key))
+        if not p.low <= value <= p.high:
+            side, bound = ("below", p.low) if value < p.low else ("above", p.high)
+            found.append(
+                f"unphysical: {p.key} {value:.4g} is {side} {bound:g}; the recordings do not determine it, or show "
+                "what this model of the car cannot do"
+            )
+    return found
+
+
 def error_table(before: CarConfig, after: CarConfig, recorded: Sequence[Windows]) -> str:
     """Return the median errors at the ends of windows of several lengths, on both parts of the recordings."""
     rows: list[tuple[str, ...]] = [("error (m), median", "windows", "before", "after")]
@@ -210,6 +230,10 @@ def run(options: argparse.Namespace) -> None:
         print(problem, file=sys.stderr)
     recorded = recording.steps
     windows, long = (cut_windows(recorded, car.front_point_m, steps) for steps in (FIT_STEPS, REPORT_STEPS))
+    if windows.left_out:
+        print(
+            f"{windows.left_out} windows of a second are left out: the car was paused or put elsewhere in them"
+        )
     held = held_out(windows.iteration)
     for part, count in (("to fit to", (~held).sum()), ("to hold out", held.sum())):
         if count < _LEAST_WINDOWS:
@@ -225,6 +249,8 @@ def run(options: argparse.Namespace) -> None:
         car, sample, PARAMETERS, options.evaluations, lambda cost: print(f"cost {cost:.2f}", flush=True)
     )
     print(f"\n{table(car, fitted, PARAMETERS)}\n\n{error_table(car, fitted, (windows, long))}")
+    for line in unphysical(fitted, PARAMETERS):
+        print(line)
     if options.output is not None:
         write_car(fitted, options.car, PARAMETERS, options.output)
         print(f"\nwritten: {options.output}")

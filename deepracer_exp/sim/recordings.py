@@ -13,8 +13,8 @@ WARM_UP_STEPS = 15
 """Recorded steps before a window, from which a model learns how the car moves: 1 s at 15 Hz."""
 _FIRST_MOVING_ROW = 1
 """Row 0 of an episode is the prepare step: the car stands until the action of row 1 is sent."""
-_JUMP_M = 0.5
-"""Neighbouring rows are further apart than this only where the car was put elsewhere: 7.5 m/s."""
+_JUMP_M, _JUMP_RAD = 0.5, 1.0
+"""Neighbouring rows are further apart than this only where the car was put elsewhere: 7.5 m/s, 15 rad/s."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class Windows:
     episode before: putting the car down does not turn its wheels straight."""
     iteration: NDArray[np.int64]
     """The iteration that a window is from, (M,)."""
+    left_out: int = 0
+    """Windows that were cut away because the car was paused or put elsewhere during them or their warm-up."""
 
     @property
     def steps(self) -> int:
@@ -74,7 +76,8 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
         steps: control steps to predict.
 
     Returns:
-        The windows in the order of the recording, without those during which the car was paused or put elsewhere.
+        The windows in the order of the recording, without those in which, warm-up included, the car was paused or put
+        elsewhere; `left_out` counts them.
     """
     yaw = np.deg2rad(recorded["yaw"].to_numpy(np.float64))
     x = recorded["X"].to_numpy(np.float64) - front_point_m * np.cos(yaw)
@@ -82,11 +85,13 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
     speed = recorded["throttle"].to_numpy(np.float64)
     steering = np.deg2rad(recorded["steer"].to_numpy(np.float64))
     # From row t to t + 1 the car was not free: it was paused, or put elsewhere.
-    broken = np.hypot(np.diff(x), np.diff(y)) > _JUMP_M
+    turned = np.remainder(np.diff(yaw) + np.pi, 2.0 * np.pi) - np.pi
+    broken = (np.hypot(np.diff(x), np.diff(y)) > _JUMP_M) | (np.abs(turned) > _JUMP_RAD)
     broken |= (recorded["episode_status"] == "pause").to_numpy()[1:]
     rows: list[Ids] = []
     first: list[int] = []
     standing: list[bool] = []
+    left_out = 0
     end_of_last, last_car = np.zeros(0, np.intp), None
     for (stream, worker, _, _), places in recorded.groupby(
         ["stream", "worker", "iteration", "episode"], sort=False, observed=True
@@ -94,26 +99,28 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
         car = stream, worker
         for at in range(_FIRST_MOVING_ROW, len(places) - steps, WARM_UP_STEPS):
             ahead = places[at : at + steps + 1]
-            if broken[ahead[:-1]].any():
-                continue
             stands = at == _FIRST_MOVING_ROW
             if stands:
                 before = end_of_last if car == last_car else end_of_last[:0]
             else:
                 before = places[max(_FIRST_MOVING_ROW, at - WARM_UP_STEPS) : at]
-                before = before[int(np.max(np.flatnonzero(broken[before]) + 1, initial=0)) :]
+            # From the end of one episode to the start of the next the car is put down, which the replay does too.
+            free = np.concatenate([before[:-1] if stands else before, ahead[:-1]])
+            if broken[free].any():
+                left_out += 1
+                continue
             missing = WARM_UP_STEPS - len(before)
             known = np.concatenate([before, ahead])
             rows.append(np.concatenate([np.full(missing, known[0]), known]))
             first.append(missing)
             standing.append(stands)
-        end_of_last, last_car = places[-WARM_UP_STEPS:], car
+        end_of_last, last_car = places[_FIRST_MOVING_ROW:][-WARM_UP_STEPS:], car
     at_rows = np.array(rows, np.intp).reshape(len(rows), WARM_UP_STEPS + 1 + steps)
-    turned = np.unwrap(yaw[at_rows], axis=1)
     return Windows(
-        pose=np.stack([x[at_rows], y[at_rows], turned], axis=-1),
+        pose=np.stack([x[at_rows], y[at_rows], np.unwrap(yaw[at_rows], axis=1)], axis=-1),
         action=np.stack([speed, steering], axis=-1)[at_rows[:, :-1]],
         first=np.array(first, np.intp),
         standing=np.array(standing, bool),
         iteration=recorded["iteration"].to_numpy(np.int64)[at_rows[:, -1]],
+        left_out=left_out,
     )

@@ -1,5 +1,6 @@
 """Folders and archives of every layout are read as the same table."""
 
+import json
 import os
 from pathlib import Path
 
@@ -71,6 +72,19 @@ def test_settings_are_found_in_every_layout_that_has_them(place, layout):
     if layout in ("drfc_single", "console", "droa"):
         assert recording.track == "Oval_track"
         assert set(made.training(recording)["track"]) == {"Oval_track"}
+
+
+@pytest.mark.parametrize("name", ["ip/hyperparameters.json", "sagemaker.log"])
+def test_one_hyperparameter_of_another_kind_is_listed_and_the_others_stay(tmp_path, name):
+    known = {**made.HYPERPARAMETERS, "exploration_type": "additive_noise", "sac_alpha": 0.3}
+    files = made.training_csvs("training-simtrace")
+    files[name] = json.dumps(known)
+    if name.endswith(".log"):
+        files[name] = f"Using the following hyper-parameters\n{json.dumps(known, indent=2)}\n"
+    recording = read_recording(made.write_folder(files, tmp_path))
+    assert recording.hyperparameters == {**made.HYPERPARAMETERS, "sac_alpha": 0.3}
+    (problem,) = recording.problems
+    assert 'exploration_type: "additive_noise"; accepted: categorical, e-greedy' in problem.reason
 
 
 @pytest.mark.parametrize("layout", ["console", "droa"])

@@ -87,8 +87,37 @@ def test_no_window_goes_over_a_place_where_the_car_was_put_elsewhere_or_paused(r
     moved.loc[20:, "X"] += 5.0
     assert len(cut_windows(moved, CAR.front_point_m, 15)) == 1
     paused = one.copy()
-    paused.loc[5, "episode_status"] = "pause"
+    paused.loc[20, "episode_status"] = "pause"
     assert len(cut_windows(paused, CAR.front_point_m, 15)) == 1
+
+
+def test_no_warm_up_goes_over_a_place_where_the_car_was_put_elsewhere_and_what_is_left_out_is_counted(
+    recorded,
+):
+    two = recorded[(recorded["worker"] == 0) & (recorded["iteration"] < 2)].reset_index(drop=True)
+    assert cut_windows(two, CAR.front_point_m, 15).left_out == 0
+    # The end of the first episode is the warm-up of the second one's start.
+    moved = two.copy()
+    moved.loc[30:34, "X"] += 5.0
+    windows = cut_windows(moved, CAR.front_point_m, 15)
+    assert (len(windows), windows.left_out) == (2, 2)
+    assert windows.standing.tolist() == [True, False]
+    # A car may be put elsewhere after the prepare step of an episode that is shorter than a warm-up.
+    short = pd.concat([two[:8], two[35:]], ignore_index=True)
+    short.loc[0, ["X", "yaw"]] += [3.0, 170.0]
+    windows = cut_windows(short, CAR.front_point_m, 15)
+    assert (len(windows), windows.left_out) == (2, 0)
+    steps_m = np.hypot(*np.diff(windows.pose[0, windows.first[0] : WARM_UP_STEPS, :2], axis=0).T)
+    assert steps_m.max() < 0.5
+    turned = two.copy()
+    turned.loc[10:, "yaw"] += 120.0
+    assert cut_windows(turned, CAR.front_point_m, 15).left_out == 2
+
+
+def test_a_fitted_value_that_no_car_has_is_named_with_the_bound_it_breaks():
+    assert calibrate.unphysical(CAR, calibrate.PARAMETERS) == []
+    (line,) = calibrate.unphysical(dataclasses.replace(CAR, tyre_friction=9.04), calibrate.PARAMETERS)
+    assert line.startswith("unphysical: tyre_friction 9.04 is above 1.5;")
 
 
 def test_a_car_predicts_its_own_recording(recorded):
