@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from deepracer_exp import __version__
+from deepracer_exp.addresses import redact, without_passwords
 from deepracer_exp.commands import (
     analyze,
     checkpoints,
@@ -73,7 +74,9 @@ The results are also written into the run's folder, evaluations/TIME.json.
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130/143 interrupted."""
     parser = _parser()
-    args, rest = parser.parse_known_args(arguments)
+    if arguments is None:
+        sys.argv[1:] = without_passwords(sys.argv[1:])  # which the run's folder keeps
+    args, rest = parser.parse_known_args(None if arguments is None else without_passwords(list(arguments)))
     if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:  # argparse takes no positional arguments after an option between them
@@ -351,8 +354,8 @@ def _ui(args: argparse.Namespace) -> int:
 
 def _fail(error: Exception, code: int, args: argparse.Namespace) -> int:
     if getattr(args, "debug", False) or "debug=true" in getattr(args, "overrides", ()):
-        traceback.print_exception(error)
-    print(f"deepracer-exp: {error}", file=sys.stderr)
+        print(redact("".join(traceback.format_exception(error))), end="", file=sys.stderr)
+    print(f"deepracer-exp: {redact(str(error))}", file=sys.stderr)
     return code
 
 

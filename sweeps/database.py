@@ -11,8 +11,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
 
+from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.tracking.store import redact
 
 _KINDS = ("sqlite", "postgresql", "mysql")
 _ACCEPTED = (
@@ -35,7 +35,7 @@ class Database:
     url: sa.URL = field(repr=False)
     """With its password, if it has one."""
     shown: str
-    """The setting it came from, as a message may show it: without user and password."""
+    """The setting it came from, as a message may show it: without password."""
 
     @property
     def kind(self) -> str:
@@ -110,11 +110,11 @@ def resolve_database(url: str | None, runs_dir: Path) -> Database:
     if url is None:
         return _of_file(runs_dir / "sweeps.db", f"runs_dir={runs_dir}")
     try:
-        parsed = sa.make_url(url)
+        parsed = sa.make_url(with_password(url))
     except (ArgumentError, ValueError):
         # Where it has no form, nobody knows which part of it is the password.
         raise BadInput(f"sweep.storage: not the URL of a database; {_ACCEPTED}") from None
-    shown = f"sweep.storage={redact(str(parsed))}"
+    shown = f"sweep.storage={without_passwords(url)}"
     kind = parsed.get_backend_name()
     if kind not in _KINDS:
         raise BadInput(f"{shown}: no database for sweeps{nearest(kind, _KINDS)}; {_ACCEPTED}")

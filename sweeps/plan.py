@@ -1,8 +1,10 @@
 """What a worker is told when it begins."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from deepracer_exp.addresses import taken_out
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.tracking.store import Store
@@ -29,6 +31,8 @@ class Plan:
     """How many a trial has on its way, None where that depends on the trial."""
     cores: int
     """For each worker."""
+    addresses: Mapping[str, str] = field(default_factory=taken_out, repr=False)
+    """Of servers and databases, as they were given, by what the others of this plan know of them."""
 
     @property
     def folder(self) -> Path:

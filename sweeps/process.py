@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
+from deepracer_exp.addresses import take_over
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.training.signals import Interruption
 
@@ -54,6 +55,7 @@ def main(plan: "Plan", token: str, log: str) -> None:
         token: of the worker's name.
         log: file that takes what is said.
     """
+    take_over(plan.addresses)
     # A session of its own: Ctrl-C in the terminal is for the driver, which tells its workers.
     os.setsid()
     with open(log, "a", buffering=1, encoding="utf-8") as file:

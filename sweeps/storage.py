@@ -15,8 +15,9 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay
 from tenacity.wait import wait_exponential_jitter
 
+from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.tracking.store import one_line, redact
+from deepracer_exp.tracking.store import one_line
 
 from .database import Database, resolve_database
 
@@ -39,7 +40,7 @@ class Storage:
     """Optuna's view of it."""
     engine: sa.Engine = field(repr=False)
     url: str
-    """Without user and password."""
+    """Without password."""
 
 
 def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> Storage:
@@ -57,10 +58,7 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> St
     try:
         optuna = _waiting(lambda: _open(database), patience_s)
     except (DBAPIError, StorageInternalError) as error:
-        reason = _reason(error)
-        if database.url.password:
-            reason = reason.replace(str(database.url.password), "***")
-        raise BadInput(f"{database.shown}: {reason}") from None
+        raise BadInput(f"{database.shown}: {_reason(error)}") from None
     return Storage(optuna, optuna.engine, redact(str(database.url)))
 
 

@@ -62,7 +62,6 @@ def _sweep(args: argparse.Namespace) -> int:
             "--runs-dir and --storage are of report and best; write runs_dir=DIR or sweep.storage=URL"
         )
     from deepracer_exp.config.sweep import compose_sweep
-    from deepracer_exp.tracking.store import redact
     from sweeps.process import PRELOADED
 
     from .starting import start_workers_early
@@ -75,7 +74,7 @@ def _sweep(args: argparse.Namespace) -> int:
         _, request, _ = whole_request(args.overrides)
         # What the command line says of the training stands where a ready-made sweep has it.
         request.composition.mapping["sweep"] |= {"train": list(request.base), "space": dict(request.space)}
-        print(redact(request.composition.yaml()), end="")
+        print(request.composition.yaml(), end="")
         return 0
     print("starting", file=sys.stderr, flush=True)
     start_workers_early(request.entry.sweep.executor.kind == "local", PRELOADED)
@@ -91,7 +90,7 @@ def _sweep(args: argparse.Namespace) -> int:
         study, folder, code = sweep(args.overrides, Console(stderr=True))
     if code:
         where = [one for one in args.overrides if one.startswith(("runs_dir=", "sweep.storage="))]
-        line = redact(shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where]))
+        line = shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where])
         print(f"\ninterrupted; `{line}` goes on", file=sys.stderr)
         return code
     if complete_trials(study):

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
+from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput, nearest
 
 from . import custom_files
@@ -114,6 +115,7 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     Raises:
         BadInput: an override cannot be parsed or names something unknown, or a file cannot be used.
     """
+    overrides = without_passwords(list(overrides))
     given = [parse_single(override) for override in overrides]
     own = [override for override in given if override.key_or_group != custom_files.KEY]
     for override in own:
@@ -149,7 +151,8 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     return Composition(
         overrides=tuple(overrides),
         choices={group: option for group, option in choices.items() if group in groups(entry)},
-        mapping={str(key): value for key, value in mapping.items()},
+        # An option file of the user may hold an address, too.
+        mapping={str(key): without_passwords(value) for key, value in mapping.items()},
         names=files.names,
         notes=files.notes,
     )

@@ -5,8 +5,6 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from .store import redact
-
 Scalar = str | int | float | bool | None
 
 LONGEST_PARAM = 250
@@ -29,11 +27,11 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Scalar]:
 
 
 def param_text(value: Scalar) -> str:
-    """Return `value` as YAML writes it, without passwords of uris, shortened to `LONGEST_PARAM` characters.
+    """Return `value` as YAML writes it, shortened to `LONGEST_PARAM` characters.
 
     A shortened value ends in a hash of the whole, so that two that differ behind the cut look different.
     """
-    text = json.dumps(value) if value is None or isinstance(value, bool) else redact(str(value))
+    text = json.dumps(value) if value is None or isinstance(value, bool) else str(value)
     if len(text) <= LONGEST_PARAM:
         return text
     mark = f"… sha256:{hashlib.sha256(text.encode()).hexdigest()[:12]}"

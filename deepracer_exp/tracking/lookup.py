@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
 
-from .store import redact, resolve_store
+from .store import one_line, resolve_store
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -61,15 +61,13 @@ def asked(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowClient]
             f"{what}: {runs_dir} has no mlflow.db to look it up in; give tracking_uri or a run's folder"
         )
     store = resolve_store(uri, runs_dir)
-    # Three seconds of import that nothing else needs; the module before it switches retries and telemetry off.
-    from . import mlflow_run as _settings  # noqa: F401, I001
-    from mlflow import MlflowClient
+    # Three seconds of import that nothing else needs.
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 
+    from .mlflow_run import client_of
+
     try:
-        # The registry of models could be elsewhere (MLFLOW_REGISTRY_URI), its runs could not.
-        yield MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
+        yield client_of(store)
     except (MlflowException, SQLAlchemyError, OSError) as error:
-        reason = redact(" ".join(str(error).split()))[:200]
-        raise BadInput(f"{what}: {store.shown}: {reason}") from error
+        raise BadInput(f"{what}: {store.shown}: {one_line(error)}") from error

@@ -24,6 +24,8 @@ from .tracking_file import Told
 # minutes after a server is back, and a request may hang for its whole 120 s: the recorder retries itself.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
+# It would print the address of each run that ends, with its password.
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 # Nobody else's business, and a machine without network would try for the whole run.
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
@@ -41,6 +43,9 @@ from sqlalchemy.exc import SQLAlchemyError
 # of the live view. Each failure is raised as well, and the recorder reports it, once and redacted.
 for _name in ("mlflow", "alembic"):
     logging.getLogger(_name).setLevel(logging.CRITICAL)
+
+_USER, _PASSWORD = "MLFLOW_TRACKING_USERNAME", "MLFLOW_TRACKING_PASSWORD"
+_GIVEN = {name: os.environ.get(name) for name in (_USER, _PASSWORD)}
 
 _WORTH_RETRYING = (408, 425, 429)
 
@@ -68,6 +73,20 @@ def _told_apart() -> Iterator[None]:
         raise StoreUnavailableError(str(error)) from error
 
 
+def client_of(store: Store) -> MlflowClient:
+    """Return a client of a store; user and password are those of the store that a client was made for last.
+
+    MLflow reads both from the environment at each request. In the address they would stand in all its messages.
+    """
+    for name, own in ((_USER, store.user), (_PASSWORD, store.password)):
+        if (value := own or _GIVEN[name]) is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    # The registry of models could be elsewhere (MLFLOW_REGISTRY_URI), its runs could not.
+    return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
+
+
 class MLflowRun:
     """A run and the calls that fill it.
 
@@ -93,7 +112,7 @@ class MLflowRun:
         with _told_apart(), self._store.creation_lock():
             if (file := self._store.sqlite_file) is not None and not file.exists():
                 _create_whole(file)
-            self._client = MlflowClient(tracking_uri=self._store.uri)
+            self._client = client_of(self._store)
 
     def create(self, told: Told, *, again: bool) -> None:
         """Create the run; with `again`, look first whether an earlier try created it unheard."""

@@ -2,25 +2,18 @@
 
 import fcntl
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
+from deepracer_exp.addresses import redact, with_password, without_passwords
 from deepracer_exp.errors import BadInput, nearest
 
 _SERVERS = ("http", "https")
 _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SQLITE_PREFIX = "sqlite:///"
-_USER_INFO = re.compile(r"(?<=://)[^/\s]*@")
-_SECRET_PARAMETER = re.compile(r"([?&](?:password|passwd|pwd|token|secret)=)[^&\s]+", re.IGNORECASE)
-
-
-def redact(text: str) -> str:
-    """Return `text` with the user:password@ and the password parameters of every uri in it replaced."""
-    return _SECRET_PARAMETER.sub(r"\1***", _USER_INFO.sub("***@", text))
 
 
 def one_line(error: Exception) -> str:
@@ -32,18 +25,19 @@ def one_line(error: Exception) -> str:
 class Store:
     """An MLflow tracking store that a run can be recorded in."""
 
-    uri: str
-    """With its password, if it has one: for MLflow only, never for a log."""
+    uri: str = field(repr=False)
+    """A database's with its password, if it has one: for MLflow only, never for a log."""
     artifact_location: str | None
     """Where new experiments keep their files; None: the server decides."""
-
-    def __repr__(self) -> str:
-        return f"Store({self.shown!r})"
+    user: str | None = None
+    """Of a server."""
+    password: str | None = field(default=None, repr=False)
+    """Of a server; None: what MLFLOW_TRACKING_PASSWORD says."""
 
     @property
     def shown(self) -> str:
-        """The uri without user and password."""
-        return redact(self.uri)
+        """The uri without password."""
+        return without_passwords(self.uri)
 
     @property
     def is_server(self) -> bool:
@@ -83,7 +77,7 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
         file = runs_dir.absolute() / "mlflow.db"
         _check_sqlite_file(file, f"runs_dir={runs_dir}")
         return Store(f"{_SQLITE_PREFIX}{file}", artifacts)
-    shown = f"tracking.uri={redact(uri)}"
+    uri, shown = with_password(uri), f"tracking.uri={without_passwords(uri)}"
     scheme, colon, _ = uri.partition("://")
     base = scheme.partition("+")[0]
     known = (*_DATABASES, *_SERVERS)
@@ -95,13 +89,17 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
     if base == "sqlite":
         return Store(_check_sqlite_uri(uri, shown), artifacts)
     try:
-        host, _ = urlsplit(uri).hostname, urlsplit(uri).port
-    except ValueError as error:
-        raise BadInput(f"{shown}: {error}; accepted: {scheme}://host:port/...") from None
+        parts = urlsplit(uri)
+        host, _ = parts.hostname, parts.port
+    except ValueError:  # which may quote a piece of the password
+        raise BadInput(f"{shown}: no host and port can be read; accepted: {scheme}://host:port/...") from None
     # A database may be reached through a local socket, named by parameters instead of a host.
     if base in _SERVERS and not host:
         raise BadInput(f"{shown}: no host; accepted: {scheme}://host:port")
-    return Store(uri, None if base in _SERVERS else artifacts)
+    if base not in _SERVERS:
+        return Store(uri, artifacts)
+    user, password = (value and unquote(value) for value in (parts.username, parts.password))
+    return Store(without_passwords(uri), None, user, password)
 
 
 def _check_sqlite_uri(uri: str, shown: str) -> str:

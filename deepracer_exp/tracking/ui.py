@@ -16,6 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any
 
+from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .names import VIEW
@@ -166,7 +167,7 @@ def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO
             time.sleep(0.2)
     output.seek(0)
     lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]
-    raise RunFailed(f"MLflow's server did not start at {url}: {lines[-1]}")
+    raise RunFailed(f"MLflow's server did not start at {url}: {redact(lines[-1])}")
 
 
 def _end_group(server: subprocess.Popen[bytes]) -> None:

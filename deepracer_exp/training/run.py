@@ -24,7 +24,6 @@ from deepracer_exp.formats.run_files import read_config, read_object
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.names import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.recorder import open_tracker
-from deepracer_exp.tracking.store import redact
 
 from .alerts import Alerts
 from .budget import Budget, refuse_spent
@@ -203,7 +202,7 @@ def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Wat
             tracker.set_tag(tag, value)
     folder.rewind(iteration)
     training.checkpoints.rewind(iteration, None if state is None else (state["best"] or {}).get("iteration"))
-    folder.write("config.yaml", redact(composition.yaml()))
+    folder.write("config.yaml", composition.yaml())
     logger.info("goes on after iteration %d", iteration)
     for why in _not_the_same(experiment, setup):
         logger.warning("the result will not be that of an uninterrupted run: %s", why)

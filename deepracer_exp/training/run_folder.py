@@ -21,7 +21,6 @@ from deepracer_exp.env.reward_source import RewardSource, source_with_constants
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.run_files import read_metrics
 from deepracer_exp.formats.whole_file import write_whole
-from deepracer_exp.tracking.store import redact
 
 from .faults import FAULTS_DIR
 
@@ -75,9 +74,9 @@ class RunFolder:
             seed: of the run.
             names: what a racer calls its choices.
         """
-        self.write("config.yaml", redact(composition.yaml()))
+        self.write("config.yaml", composition.yaml())
         overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
-        self.write("overrides.yaml", redact(overrides) or "[]\n")
+        self.write("overrides.yaml", overrides or "[]\n")
         self.write("reward_function.py", source_with_constants(reward))
         commit = git_commit()
         provenance = {
@@ -91,7 +90,7 @@ class RunFolder:
                 "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
             },
             "reward": {"name": reward.name, "path": str(reward.path), "sha256": reward.sha256},
-            "command": [redact(argument) for argument in sys.argv[1:]],
+            "command": sys.argv[1:],
         }
         self.write("provenance.json", json.dumps(provenance, indent=2) + "\n")
         return commit
