@@ -1,21 +1,22 @@
 """Which courses a recording was driven on."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
+import shapely
 from pydantic import TypeAdapter, ValidationError
 
-from deepracer_exp.config import options
 from deepracer_exp.config.track import TrackConfig
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.formats.recording import LogProblem, Recording
+from deepracer_exp.formats.routes import read_knots, read_route
 from deepracer_exp.formats.run_files import read_config
+from deepracer_exp.formats.worlds import find_world, worlds
+from deepracer_exp.tracks.catalogue import recognise, world_rows, world_track
 from deepracer_exp.tracks.track import Track
 
 _SAMPLE = 2000
@@ -26,6 +27,12 @@ _INSIDE = 0.95
 """Share of the rows that must be on or just beside the road."""
 _BESIDE_M = 0.3
 """How far beside the road a car still gets before its episode ends."""
+_SAME_NUMBERS = 0.9
+"""Share of the rows whose waypoint must be one of the two around them; the rest is rounding."""
+_LEAST_WAYPOINTS = 20
+_ESTIMATE_NEAR = 0.1
+"""Share by which an estimated centre line may be longer or shorter than the logged length."""
+_HALF_CAR_M = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +48,8 @@ class Courses:
 def find_courses(recording: Recording) -> Courses:
     """Find the course of each name in a recording's `steps.track`.
 
-    A run of ours has its courses in its config.yaml. Other names are looked up in the catalogue; a name that is
-    unknown or not told is found by the course's length and by where the car drove.
+    A run of ours has its courses in its config.yaml. Other names are looked up among the service's worlds; one that is
+    unknown, not told, or not where the car drove is found by waypoint numbers, length and places.
     """
     own, problems = _own_courses(recording)
     tracks: dict[str, Track] = {}
@@ -52,35 +59,43 @@ def find_courses(recording: Recording) -> Courses:
         if not len(rows):
             continue
         sample = recording.steps.iloc[rows[:: max(1, len(rows) // _SAMPLE)]]
-        head = recording.steps.iloc[rows[: 10 * _SAMPLE]]
         told = str(name) or recording.track or ""
-        config = own.get(told) or _known(told) or _driven_on(sample)
-        if config is None:
+        config, world = own.get(told), None if told in own else _driven_on(told, sample)
+        if config is None and world is None:
             problems.append(LogProblem(recording.name, None, _unknown(told, sample)))
             continue
         try:
-            track = Track.from_config(config, reversed=False)
-            tracks[str(name)] = Track.from_config(config, reversed=True) if _backwards(track, head) else track
+            both = [
+                Track.from_config(config, reversed=back)
+                if config is not None
+                else world_track(str(world), back)
+                for back in (False, True)
+            ]
+            tracks[str(name)] = directed(both[0], both[1], recording.steps.iloc[rows])
         except BadInput as error:
             problems.append(LogProblem(recording.name, None, str(error)))
     return Courses(tracks=tracks, problems=tuple(problems))
 
 
 def catalogue_track(name: str, reversed: bool = False) -> Track:
-    """Return a course of the catalogue, or of a route file (.npy) or a YAML of knots.
+    """Return a world of the service, or the course of a route file (.npy) or a YAML of knots.
 
     Raises:
         BadInput: there is no such course.
     """
-    if name.endswith((".npy", ".yaml", ".yml")):
-        template = next(config for one in options.options("track") if (config := _known(one)) is not None)
-        return Track.from_config(replace(template, file=name), reversed=reversed)
-    config = _known(name)
-    if config is None:
+    path = Path(name)
+    if path.suffix == ".npy":
+        return Track.from_route(read_route(path), path.stem, reversed=reversed)
+    if path.suffix in (".yaml", ".yml"):
+        course = read_knots(path)
+        shape = course.knots, course.width_m, course.closed
+        return Track.from_knots(*shape, path.stem, title=course.title, reversed=reversed)
+    if find_world(name) is None:
         raise BadInput(
-            f"track={name}: no such track; accepted: {', '.join(options.options('track'))}, or a file"
+            f"--track {name}: no such world{nearest(name, worlds())}; accepted: a name that `deepracer-exp tracks` "
+            "lists, or the file of a route (.npy) or of knots (.yaml)"
         )
-    return Track.from_config(config, reversed=reversed)
+    return world_track(name, reversed)
 
 
 def _own_courses(recording: Recording) -> tuple[dict[str, TrackConfig], list[LogProblem]]:
@@ -99,26 +114,6 @@ def _own_courses(recording: Recording) -> tuple[dict[str, TrackConfig], list[Log
     return {}, []
 
 
-def _known(name: str) -> TrackConfig | None:
-    """Return the course of the catalogue that has the name, in any case of letters."""
-    name = name.rsplit("/", 1)[-1].lower()
-    found = next((option for option in options.options("track") if option.lower() == name), None)
-    return None if found is None else _option(Path(options.find(f"track/{found}.yaml")))
-
-
-@cache
-def _option(path: Path) -> TrackConfig:
-    values: dict[str, Any] = {}
-    own = yaml.safe_load(path.read_text(encoding="utf-8"))
-    for base in own.pop("defaults", []):
-        if base != "_self_":
-            values |= yaml.safe_load((path.parent / f"{base}.yaml").read_text(encoding="utf-8"))
-    for key, value in own.items():
-        both = isinstance(value, dict) and isinstance(values.get(key), dict)
-        values[key] = values[key] | value if both else value
-    return _typed(values, str(path))
-
-
 def _typed(values: Mapping[str, Any], source: str) -> TrackConfig:
     try:
         return TypeAdapter(TrackConfig).validate_python(dict(values))
@@ -130,43 +125,118 @@ def _typed(values: Mapping[str, Any], source: str) -> TrackConfig:
         ) from None
 
 
-def _driven_on(sample: pd.DataFrame) -> TrackConfig | None:
-    """Return the course of the catalogue on which the rows lie, None where they lie on none."""
+def _driven_on(told: str, sample: pd.DataFrame) -> str | None:
+    """Return the world on which the rows lie: the one told, one with the log's numbers, or one of that length."""
     points = sample[["X", "Y"]].to_numpy(np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
+    known = np.isfinite(points).all(axis=1) & (sample["closest_waypoint"].to_numpy() >= 0)
+    points, waypoint = points[known], sample["closest_waypoint"].to_numpy(np.intp)[known]
+    if not len(points):
+        return None
     length_m = float(sample["track_len"].median())
-    best: tuple[float, TrackConfig] | None = None
-    for name in options.options("track"):
-        config = _known(name)
-        if config is None or not len(points):
+    named = find_world(told)
+    numbered = [one.name for one in recognise(points, waypoint)]
+    # Courses of one shape differ in their floors only; the first one stands for all.
+    for name in dict.fromkeys([*([named] if named else []), *numbered, *worlds()]):
+        steps_m = np.linalg.norm(np.diff(world_rows(name)[:, :2], axis=0), axis=1)
+        if abs(steps_m.sum() - length_m) > _LENGTH_NEAR * length_m:
             continue
-        track = Track.from_config(config, reversed=False)
-        if abs(track.length_m - length_m) > _LENGTH_NEAR * track.length_m:
-            continue
+        track = world_track(name)
         off_m = np.abs(track.project(points).offset_m)
         if np.mean(off_m < track.width_max_m / 2 + _BESIDE_M) >= _INSIDE:
-            middle = float(np.median(off_m))
-            # Courses of one shape differ in their floors only; the first one, by name, stands for all.
-            if best is None or middle < best[0] - 1e-9:
-                best = middle, config
-    return None if best is None else best[1]
+            return name
+    return None
 
 
-def _backwards(track: Track, head: pd.DataFrame) -> bool:
-    """Tell whether progress grows against the order of the waypoints in most episodes."""
-    head = head.sort_values("episode", kind="stable")
+def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
+    """Return the course with the log's waypoint numbers, so that a page has one numbering.
+
+    A route that was sampled in another way has other numbers: then the waypoints are put where the log has them.
+
+    Args:
+        course: what was driven on, in driving direction.
+        steps: rows with `X`, `Y` and `closest_waypoint`.
+    """
+    sample = steps.iloc[:: max(1, len(steps) // (10 * _SAMPLE))]
+    waypoint = sample["closest_waypoint"].to_numpy(np.intp)
+    found = course.project(sample[["X", "Y"]].to_numpy(np.float64))
+    if np.mean((waypoint == found.previous) | (waypoint == found.next)) >= _SAME_NUMBERS:
+        return course
+    # The first row of a closed course is at 0 and at 1: places are means on the circle.
+    circle = pd.DataFrame({"x": np.cos(2 * np.pi * found.ndist), "y": np.sin(2 * np.pi * found.ndist)})
+    mean = circle.groupby(waypoint).mean()
+    known = mean.index.to_numpy()
+    place = np.unwrap(np.arctan2(mean["y"], mean["x"]) / (2 * np.pi), period=1.0)
+    if len(known) < 2 or (np.diff(place) <= 0).any() or place[-1] - place[0] >= 1.0:
+        return course
+    numbers = np.arange(known[-1] + 1)
+    pace = (place[-1] - place[0]) / (known[-1] - known[0])
+    placed = np.interp(numbers, known, place) + pace * np.minimum(numbers - known[0], 0)
+    # Beyond the highest number in the log nobody drove: the course's own waypoints do.
+    rest = np.arange(placed[-1] + pace, placed[0] + 1.0 - 0.5 * pace, pace)
+    at = np.concatenate([placed, rest])
+    own = _waypoint_positions(course)
+    borders = (course.inner[:, 0], course.inner[:, 1], course.outer[:, 0], course.outer[:, 1])
+    rows = np.column_stack([course.points_at(at % 1.0), *(np.interp(at % 1.0, own, one) for one in borders)])
+    rows = np.vstack([rows, rows[:1]]) if course.closed else rows
+    return Track.from_route(rows, course.name, title=course.title, floor=course.floor)
+
+
+def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
+    """Return a course of the recorded positions, for drawing; None where the car never came all around.
+
+    Its centre line is the middle of the places at which each waypoint was the closest, its width what the car used
+    with all wheels on the road.
+    """
+    rows = steps[(steps["closest_waypoint"] >= 0) & (steps["episode_status"] != "prepare")]
+    middle = rows.groupby("closest_waypoint")[["X", "Y"]].median()
+    known = middle.index.to_numpy()
+    length_m = float(rows["track_len"].median()) if len(rows) else 0.0
+    if len(known) < _LEAST_WAYPOINTS or len(known) < _INSIDE * (known[-1] + 1):
+        return None
+    numbers = np.arange(known[-1] + 1)
+    center = np.column_stack([np.interp(numbers, known, middle[axis]) for axis in ("X", "Y")])
+    ring = np.vstack([center, center[:1]])
+    steps_m = np.linalg.norm(np.diff(ring, axis=0), axis=1)
+    if abs(steps_m.sum() - length_m) > _ESTIMATE_NEAR * length_m or steps_m[-1] > 10 * np.median(steps_m):
+        return None
+    ahead = np.roll(center, -1, axis=0) - np.roll(center, 1, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    on_road = rows[rows["all_wheels_on_track"].to_numpy(bool)]
+    at = on_road["closest_waypoint"].to_numpy(np.intp)
+    aside = ((on_road[["X", "Y"]].to_numpy(np.float64) - center[at]) * left[at]).sum(axis=1)
+    half_m = float(np.quantile(np.abs(aside), 0.98)) + _HALF_CAR_M if len(aside) else 2 * _HALF_CAR_M
+    counter_clockwise = shapely.is_ccw(shapely.LinearRing(ring))
+    side = left if counter_clockwise else -left
+    route = np.column_stack([center, center + half_m * side, center - half_m * side])
+    try:
+        return Track.from_route(
+            np.vstack([route, route[:1]]), name, title=f"{name or 'unknown'} (drawn from recorded positions)"
+        )
+    except BadInput:
+        return None
+
+
+def _waypoint_positions(course: Track) -> np.ndarray:
+    steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
+    return np.r_[0.0, np.cumsum(steps_m)] / course.length_m
+
+
+def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
+    """Return the direction of a course in which progress grows in most of the first rows."""
+    head = steps.iloc[: 10 * _SAMPLE].sort_values("episode", kind="stable")
     points = head[["X", "Y"]].to_numpy(np.float64)
-    gone = np.diff(track.project(points).ndist)
-    gone = (gone + 0.5) % 1.0 - 0.5 if track.closed else gone
+    gone = np.diff(forward.project(points).ndist)
+    gone = (gone + 0.5) % 1.0 - 0.5 if forward.closed else gone
     gained = np.diff(head["progress"].to_numpy(np.float64))
     same = head["episode"].to_numpy()[1:] == head["episode"].to_numpy()[:-1]
     looked_at = same & (np.abs(gained) < 20.0) & np.isfinite(gone)
-    return float(np.sum((gone * gained)[looked_at])) < 0.0
+    return backward if float(np.sum((gone * gained)[looked_at])) < 0.0 else forward
 
 
 def _unknown(name: str, rows: pd.DataFrame) -> str:
     who = f"track {name!r} is" if name else "the name of the track is not told, and it is"
     return (
-        f"{who} none of the catalogue ({float(rows['track_len'].median()):.3f} m long); "
-        "what needs its shape is left out"
+        f"{who} none of the service's {len(worlds())} worlds ({float(rows['track_len'].median()):.3f} m long); "
+        "`--track ROUTE` takes the file of its route (.npy)"
     )

@@ -12,7 +12,7 @@ from deepracer_exp.tracks.track import Track
 
 from .episode_table import episode_table, first_rows
 from .iteration_table import iteration_table
-from .log_course import catalogue_track, find_courses
+from .log_course import catalogue_track, directed, estimated_course, find_courses, numbered_as_logged
 from .step_columns import add_derived
 
 DISCOUNT = 0.99
@@ -76,11 +76,12 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     if track is not None and track not in logged and len(logged) > 1:
         raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {', '.join(logged)}")
     courses = find_courses(recording)
-    course = courses.tracks.get(name)
-    if track is not None and track not in logged:
-        backwards = course.reversed if course is not None else False
-        course = catalogue_track(track, reversed=backwards)
     here = (names == name).to_numpy()
+    course, problems = courses.tracks.get(name), courses.problems
+    if track is not None and track not in logged:
+        course, problems = directed(catalogue_track(track), catalogue_track(track, True), steps[here]), ()
+    driven_on = steps[here]
+    course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
     trained, first = _ordered(steps, here & training)
     driven, evaluation_first = _ordered(steps, here & ~training)
@@ -99,7 +100,7 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         iterations=iteration_table(recording, trained, episodes),
         evaluations=driven,
         evaluation_episodes=evaluation_episodes.assign(stream=streams),
-        problems=(*recording.problems, *courses.problems),
+        problems=(*recording.problems, *problems),
         discount=discount,
     )
 

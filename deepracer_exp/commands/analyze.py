@@ -42,7 +42,9 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     )
     analyze.add_argument("--target", metavar="S", help="lap time in seconds whose chance is told")
     analyze.add_argument(
-        "--track", metavar="NAME", help="of several courses, or where the log does not tell it"
+        "--track",
+        metavar="NAME | ROUTE",
+        help="of several courses, or the route (.npy) of an unknown one",
     )
     analyze.add_argument(
         "--out", metavar="FILE", help="page to write (default: report.html of a run, else NAME-analysis.html)"

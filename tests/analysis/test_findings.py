@@ -236,7 +236,7 @@ def test_a_race_without_training_is_judged_by_its_laps() -> None:
 
 def test_without_a_course_only_what_needs_its_shape_is_left_out() -> None:
     recording = laps_of((3, 4, 2.0)).recording
-    steps = recording.steps.assign(X=recording.steps["X"] + 50.0, track="nowhere")
+    steps = recording.steps.assign(X=recording.steps["X"] + 50.0, track="nowhere", closest_waypoint=0)
     view = prepare(replace(recording, steps=steps))
     assert view.course is None
     assert "nowhere" in str(view.problems[0])

@@ -9,11 +9,12 @@ import pytest
 
 from deepracer_exp.analysis.log_course import catalogue_track, find_courses
 from deepracer_exp.analysis.log_view import prepare
-from deepracer_exp.config.options import options
+from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import Recording
+from deepracer_exp.tracks.catalogue import world_rows
 
-from .made_up import Drive, made_up_recording
+from .made_up import Drive, made_up_course, made_up_recording
 
 
 def renamed(recording: Recording, name: str) -> Recording:
@@ -46,20 +47,56 @@ def test_a_course_driven_against_its_waypoints_is_turned_around() -> None:
     assert view.steps["skew_deg"].abs().max() < 10.0
 
 
-def test_a_course_that_is_nowhere_known_is_left_out_with_a_reason() -> None:
-    recording = renamed(made_up_recording([Drive()]), "moon")
-    found = find_courses(replace(recording, steps=recording.steps.assign(X=recording.steps["X"] + 100.0)))
+def elsewhere(recording: Recording) -> Recording:
+    """Return the recording 100 m away from every world, of a name that none has."""
+    moon = renamed(recording, "moon")
+    return replace(moon, steps=moon.steps.assign(X=moon.steps["X"] + 100.0))
+
+
+def test_a_course_that_is_nowhere_known_is_named_with_the_option_that_takes_its_route() -> None:
+    found = find_courses(elsewhere(made_up_recording([Drive()])))
     assert not found.tracks
-    assert "'moon' is none of the catalogue (17.695 m long)" in str(found.problems[0])
+    (problem,) = found.problems
+    assert "'moon' is none of the service's 127 worlds (17.709 m long)" in problem.reason
+    assert "`--track ROUTE` takes the file of its route (.npy)" in problem.reason
 
 
-def test_an_unknown_course_still_has_lap_positions_from_progress() -> None:
-    recording = renamed(made_up_recording([Drive(start=0.25)]), "moon")
-    view = prepare(replace(recording, steps=recording.steps.assign(X=recording.steps["X"] + 100.0)))
-    expected = (0.25 + view.steps["progress"] / 100.0) % 1.0
-    apart = np.abs(view.steps["lap_position"] - expected)
-    assert np.minimum(apart, 1.0 - apart).max() < 0.02
-    assert view.steps["offset_m"].isna().all()
+def test_an_unknown_course_is_drawn_from_the_recorded_positions() -> None:
+    around = elsewhere(made_up_recording([Drive(offset_m=side) for side in (-0.2, 0.0, 0.2)]))
+    view, known = prepare(around), made_up_course()
+    assert view.course is not None
+    assert "drawn from recorded positions" in view.course.title
+    assert view.course.length_m == pytest.approx(known.length_m, rel=0.05)
+    off_m = view.course.project(known.waypoints + np.array([100.0, 0.0])).offset_m
+    assert np.abs(off_m).max() < 0.1
+    # Half of the road is not: the car must have come all around.
+    half = elsewhere(made_up_recording([Drive(until=0.5)]))
+    assert prepare(half).course is None
+
+
+def test_a_route_given_by_hand_takes_the_place_of_an_unknown_course(tmp_path: Path) -> None:
+    route = world_rows("reinvent_base") + np.array([100.0, 0.0] * 3)
+    np.save(tmp_path / "moon_route.npy", route)
+    view = prepare(elsewhere(made_up_recording([Drive()])), str(tmp_path / "moon_route.npy"))
+    assert view.course is not None
+    assert (view.course.name, view.problems) == ("moon_route", ())
+    assert view.steps["offset_m"].abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_page_has_the_waypoint_numbers_of_its_log_wherever_it_has_any(every: int) -> None:
+    recording = made_up_recording([Drive(start=0.3), Drive()])
+    last = len(made_up_course().waypoints) - 1
+    steps = recording.steps.assign(closest_waypoint=recording.steps["closest_waypoint"] // every)
+    view = prepare(replace(recording, steps=steps))
+    assert view.course is not None
+    assert len(view.course.waypoints) == pytest.approx(last / every + 1, abs=2)
+    found = view.course.project(steps[["X", "Y"]].to_numpy())
+    logged = steps["closest_waypoint"].to_numpy()
+    near = (np.abs(logged - found.previous) <= 1) | (np.abs(logged - found.next) <= 1)
+    assert near.mean() > 0.95
+    assert max(part.last_waypoint for part in sectors_of(view.course).parts) <= logged.max() + 1
+    assert view.course.length_m == pytest.approx(made_up_course().length_m, rel=0.03)
 
 
 def test_of_several_courses_the_most_driven_one_is_shown_unless_another_is_asked_for() -> None:
@@ -84,11 +121,8 @@ def test_a_run_of_ours_has_its_courses_in_its_configuration(tmp_path: Path) -> N
     assert find_courses(recording).tracks["mine"].name == "mine"
 
 
-def test_every_course_of_the_catalogue_can_be_built() -> None:
-    for name in options("track"):
-        assert catalogue_track(name).name == name
-
-
 def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(BadInput, match=r"track=moon: no such track; accepted: .*reinvent_base"):
-        catalogue_track("moon")
+    with pytest.raises(
+        BadInput, match=r"--track reinvnt_base: no such world \(did you mean reinvent_base\?\)"
+    ):
+        catalogue_track("reinvnt_base")
