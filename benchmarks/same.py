@@ -12,6 +12,7 @@ import pandas as pd
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.tracking.names import BEST, metric_name
 from deepracer_exp.training.run import TIMES
 
 Row = Mapping[str, Any]
@@ -58,8 +59,9 @@ def different_points(rows: Sequence[Row], history: History) -> str | None:
     for row in rows:
         for key, value in row.items():
             if key != "env_steps" and value is not None and math.isfinite(value):
-                wanted.setdefault(key, []).append((row["env_steps"], float(value)))
-    for key in {**wanted, **history}:
+                wanted.setdefault(metric_name(key), []).append((row["env_steps"], float(value)))
+    # What the run came to at its end is no row's.
+    for key in {key for key in {**wanted, **history} if not key.startswith(BEST)}:
         expected, found = (_points(key, of.get(key, ())) for of in (wanted, history))
         if expected != found:
             lacking, more = (sorted(points)[:3] for points in (expected - found, found - expected))
@@ -68,7 +70,7 @@ def different_points(rows: Sequence[Row], history: History) -> str | None:
 
 
 def _points(key: str, points: Sequence[tuple[int, float]]) -> "Counter[Any]":
-    return Counter(step for step, _ in points) if key in TIMES else Counter(points)
+    return Counter(step for step, _ in points) if key in map(metric_name, TIMES) else Counter(points)
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -35,9 +35,13 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 
 def _promote(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import typed
+    from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.evaluation import checkpoint_name
+    from deepracer_exp.env.observation import feature_names
     from deepracer_exp.errors import BadInput
     from deepracer_exp.evaluation.references import resolve
+    from deepracer_exp.formats.run_files import read_config
     from deepracer_exp.tracking.registry import check_alias, check_model, promote
 
     check_alias("--alias", args.alias)
@@ -49,11 +53,13 @@ def _promote(args: argparse.Namespace) -> int:
         raise BadInput(f"--checkpoint {args.checkpoint}: {error}") from None
     runs_dir = Path(args.runs_dir)
     run = resolve(args.run, runs_dir, args.tracking_uri)
+    observation = typed(read_config(run.path).get("observation", {}), ObservationConfig)
     registered = promote(
         run.path,
         given or run.checkpoint or "best",
         args.model or run.path.resolve().parent.name,
         args.alias,
+        feature_names(observation),
         args.tracking_uri,
         runs_dir,
     )

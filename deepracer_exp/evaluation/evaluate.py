@@ -1,5 +1,6 @@
 """The command that puts a stored policy to the test."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -7,11 +8,14 @@ import torch
 from rich.console import Console
 
 from deepracer_exp.config.evaluation import EvaluateConfig
+from deepracer_exp.config.running import TrackingOff
+from deepracer_exp.tracking.delivery import deliver_evaluation
+from deepracer_exp.tracking.names import evaluate_metric, track_labels
 
 from .checkpoint import read_checkpoint
 from .evaluator import Evaluator
 from .report import table, write_json
-from .result import Evaluation
+from .result import USUAL, Evaluation
 from .run import read_run
 
 if TYPE_CHECKING:
@@ -52,7 +56,27 @@ def evaluate(
     if film is not None:
         film.write(evaluation, told)
         out.print(f"  video    {film.file}", soft_wrap=True, highlight=False)
+    tracking = run.experiment.tracking
+    uri = config.tracking_uri or (None if isinstance(tracking, TrackingOff) else tracking.uri)
+    files = {file: "evaluations"} | ({} if film is None else {film.file: "films"})
+    metrics = _metrics(evaluation, trained_on)
+    deliver_evaluation(run.path, uri, Path(config.runs_dir), stored.counters["env_steps"], metrics, files)
     return evaluation
+
+
+def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, float | None]:
+    """Return the results as metrics of the run, each track's under its name unless it is the run's only one."""
+    names = evaluation.tracks
+    labels = [None] if names == list(trained_on) and len(names) == 1 else track_labels(names)
+    found: dict[str, float | None] = {evaluate_metric("eval_race_score_s", None): evaluation.race_score_s}
+    for group in evaluation.groups:
+        label = labels[names.index(group.track)]
+        if group.condition == USUAL:
+            found[evaluate_metric("eval_lap_time_s", label)] = group.mean_lap_time_s
+            found[evaluate_metric("eval_completion", label)] = group.completion
+        else:
+            found[evaluate_metric("held_out_completion", label)] = group.completion
+    return found
 
 
 def _film(evaluator: Evaluator, file: Path, view: "View") -> "Film":

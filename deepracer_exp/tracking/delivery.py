@@ -1,14 +1,16 @@
 """What a run could not record while it went on, recorded from its folder."""
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.formats.run_files import read_metrics, read_object
+from deepracer_exp.formats.run_files import read_metrics, read_object, read_run_id
 
+from .lookup import has_store
 from .names import END_TAG
-from .points import now_ms, points_of
+from .points import now_ms, points_at, points_of
 from .store import one_line, resolve_store
 from .tracking_file import NAME, Status, Told, TrackingFile
 
@@ -57,6 +59,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             [point for row in rows for point in points_of(row, row["env_steps"], file.told.start_ms)]
         )
         _log_files(run, run_dir, file.told)
+        run.conclude(file.told, summary)
         run.set_tags({END_TAG: f"{summary['status']}: {summary['reason']}"})
         run.end(file.told.status or ENDS.get(summary["status"], "KILLED"), file.told.end_ms or now_ms())
     except StoreRefusedError as error:
@@ -67,6 +70,41 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             f" {one_line(error)}"
         ) from error
     return written
+
+
+def deliver_evaluation(
+    run_dir: Path,
+    uri: str | None,
+    runs_dir: Path,
+    env_steps: int,
+    metrics: Mapping[str, float | None],
+    files: Mapping[Path, str],
+) -> None:
+    """Record in MLflow what an evaluation of one of a run's checkpoints found; what goes wrong is logged.
+
+    Args:
+        run_dir: the run's folder; a run that is not recorded is left so.
+        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
+        runs_dir: where runs are.
+        env_steps: of the checkpoint.
+        metrics: by their names in MLflow.
+        files: and the folder that each gets there.
+    """
+    run_id = read_run_id(run_dir)
+    if run_id is None or not has_store(uri, runs_dir):
+        return
+    store = resolve_store(uri, runs_dir)
+    from .mlflow_run import MLflowRun, StoreRefusedError, StoreUnavailableError
+
+    run = MLflowRun(store)
+    run.run_id = run_id
+    try:
+        run.connect()
+        run.log_metrics(points_at(metrics, env_steps, now_ms()))
+        for file, folder in files.items():
+            run.log_artifact(file, folder)
+    except (StoreRefusedError, StoreUnavailableError) as error:
+        _log.warning("MLflow (%s) does not have this evaluation: %s", store.shown, one_line(error))
 
 
 def _log_files(run: "MLflowRun", run_dir: Path, told: Told) -> None:

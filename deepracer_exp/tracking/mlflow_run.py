@@ -13,9 +13,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
-from .names import END_TAG, EXPERIMENT_TAGS, PARENT
-from .points import Point
+from .names import BEST, END_TAG, EXPERIMENT_TAGS, PARENT, best_metrics
+from .notes import NOTE, OURS, experiment_note, result_note
+from .points import Point, points_at
 from .registry import pages
 from .store import Store
 from .tracking_file import Told
@@ -208,6 +210,35 @@ class MLflowRun:
             ):
                 if but not in run.data.tags and PARENT not in run.data.tags:
                     self._client.set_tag(run.info.run_id, PARENT, self.run_id)
+
+    def conclude(self, told: Told, summary: Mapping[str, Any]) -> None:
+        """Record what came of the run: its best checkpoint, in its description and in that of its experiment.
+
+        A description that somebody has edited stays as it is.
+        """
+        if best := summary.get("best"):
+            self.log_metrics(
+                points_at(best_metrics(summary), best["env_steps"], told.end_ms or told.start_ms)
+            )
+        with _told_apart():
+            run = self._client.get_run(self.run_id)
+            begun, now = told.tags.get(NOTE, ""), run.data.tags.get(NOTE, "")
+            if now.endswith(begun):
+                note = result_note(summary, run.info.run_id, told.files)
+                self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
+            self._describe_experiment(run.info.experiment_id)
+
+    def _describe_experiment(self, experiment_id: str) -> None:
+        tags = self._client.get_experiment(experiment_id).tags
+        score = f"metrics.`{BEST}score_s`"
+        found = self._client.search_runs(
+            [experiment_id], f"{score} > 0", max_results=1, order_by=[f"{score} ASC"]
+        )
+        if found and tags.get(NOTE, OURS).startswith(OURS):
+            (run,) = found
+            best = {key: value for key, value in run.data.metrics.items() if key.startswith(BEST)}
+            note = experiment_note(run.info.run_name, run.info.run_id, experiment_id, best)
+            self._client.set_experiment_tag(experiment_id, NOTE, note)
 
     def log_artifact(self, path: Path, folder: str | None) -> None:
         """Copy a file, or all that lies in a folder, to the run's files under `folder`."""

@@ -8,38 +8,96 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.config.overrides import key_of
 from deepracer_exp.formats.lineage_file import Lineage
 
 from .flatten import Scalar, flatten
 
-METRICS: Mapping[str, str] = {
-    "completion": "per cent of the lap driven per finished episode, mean",
-    "lap_share": "share of the last episodes that completed the lap (0 to 1), of several tracks the lowest",
-    "best_lap_time_s": "fastest lap so far",
-    "mean_lap_time_s": "mean time of the iteration's completed laps",
-    "laps": "laps completed so far",
-    "eval_completion": "per cent of the lap driven in the evaluation, mean",
-    "held_out_completion": "the same on conditions that were not trained on",
-    "eval_lap_time_s": "mean time of the evaluation's complete laps",
-    "eval_race_score_s": "seconds per complete lap of the evaluation on all its conditions, failed laps included",
-    "mean_return": "sum of rewards per finished episode, mean",
-    "entropy": "entropy of the policy",
-    "kl": "change of the policy in this iteration (KL divergence)",
-    "policy_loss": "clipped policy loss",
-    "value_loss": "loss of the value network",
-    "lr": "learning rate",
-    "episodes": "episodes finished so far",
-    "env_steps_per_s": "control steps per second of wall time",
-    "iteration": "training iteration",
+METRICS: Mapping[str, tuple[str, str]] = {
+    "eval_race_score_s": (
+        "race/score_s",
+        "seconds per complete lap of the evaluation on all its conditions, failed laps included",
+    ),
+    "eval_lap_time_s": ("race/lap_time_s", "mean time of the evaluation's complete laps"),
+    "eval_completion": ("race/completion", "per cent of the lap driven in the evaluation, mean"),
+    "held_out_completion": (
+        "race/held_out_completion",
+        "the same on conditions that were not trained on",
+    ),
+    "completion": ("train/completion", "per cent of the lap driven per finished episode, mean"),
+    "lap_share": (
+        "train/lap_share",
+        "share of the last episodes that completed the lap (0 to 1), of several tracks the lowest",
+    ),
+    "best_lap_time_s": ("train/best_lap_time_s", "fastest lap so far, with actions drawn at random"),
+    "mean_lap_time_s": ("train/mean_lap_time_s", "mean time of the iteration's completed laps"),
+    "laps": ("train/laps", "laps completed so far"),
+    "mean_return": ("train/mean_return", "sum of rewards per finished episode, mean"),
+    "episodes": ("train/episodes", "episodes finished so far"),
+    "iteration": ("train/iteration", "training iteration"),
+    "entropy": ("update/entropy", "entropy of the policy"),
+    "kl": ("update/kl", "change of the policy in this iteration (KL divergence)"),
+    "policy_loss": ("update/policy_loss", "clipped policy loss"),
+    "value_loss": ("update/value_loss", "loss of the value network"),
+    "lr": ("update/lr", "learning rate"),
+    "clip_fraction": ("update/clip_fraction", "share of samples whose step was clipped"),
+    "explained_variance": ("update/explained_variance", "of the returns, by the value network"),
+    "grad_norm": ("update/grad_norm", "of the gradient before it is clipped"),
+    "env_steps_per_s": ("time/env_steps_per_s", "control steps per second of wall time"),
+    "collect_s": ("time/collect_s", "seconds of driving in this iteration"),
+    "update_s": ("time/update_s", "seconds of learning in this iteration"),
+    "wall_clock_s": ("time/wall_clock_s", "seconds since the run began"),
 }
-"""Metrics of an iteration and what they mean; recorded against env steps.
+"""Columns of metrics.jsonl: what MLflow calls them and what they mean; recorded against env steps.
 
-The order counts: the comparison of runs opens with the metric that was recorded first.
+MLflow's pages make a section of what stands before the last slash and sort the sections by their names: race, time,
+train, update. Within `race` the order of recording counts: the comparison of runs opens with the first metric.
 """
 
+BEST = "race/best/"
+"""Prefix of the evaluation of the best checkpoint, recorded when the run ends."""
+
 TRACK_METRICS = ("completion", "lap_share", "best_lap_time_s", "mean_lap_time_s")
-"""Metrics that a run on several tracks has of each: `completion/Oval_track`. The UI shows what stands before the
-slash as one section, so that the tracks stand beside one another."""
+"""Metrics that a run on several tracks has of each: column `completion/Oval_track`, in MLflow
+`train/completion/Oval_track`, so that the tracks stand beside one another in one section."""
+
+
+def metric_names(row: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Return a row of metrics.jsonl under the names that MLflow has for its columns, in the order of METRICS.
+
+    Columns that METRICS does not know are called `train/COLUMN` and stand last.
+    """
+    rank = {column: place for place, column in enumerate(METRICS)}
+    named = sorted(row.items(), key=lambda item: rank.get(item[0].partition("/")[0], len(rank)))
+    return {metric_name(column): value for column, value in named}
+
+
+def best_metrics(summary: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the evaluation of a run's best checkpoint, from its summary, as metrics of the run."""
+    best = summary.get("best") or {}
+    return {
+        BEST + METRICS[column][0].removeprefix("race/"): value
+        for column, value in best.items()
+        if column in METRICS and METRICS[column][0].startswith("race/")
+    }
+
+
+def evaluate_metric(column: str, track: str | None) -> str:
+    """Return what MLflow calls a result of `deepracer-exp evaluate`.
+
+    Args:
+        column: that the same result has in metrics.jsonl.
+        track: its label; None on the run's own, or for all tracks together.
+    """
+    name = f"race/evaluate/{METRICS[column][0].removeprefix('race/')}"
+    return name if track is None else f"{name}/{track}"
+
+
+def metric_name(column: str) -> str:
+    """Return what MLflow calls a column of metrics.jsonl."""
+    own, slash, track = column.partition("/")
+    return (METRICS[own][0] if own in METRICS else f"train/{own}") + slash + track
+
 
 PARENT = "mlflow.parentRunId"
 """Tag of a run that stands below another one in the UI."""
@@ -56,11 +114,8 @@ VIEW = "racing"
 
 _COLUMNS = (
     "attributes.Duration",
-    "metrics.`eval_lap_time_s`",
-    "metrics.`eval_completion`",
-    "metrics.`best_lap_time_s`",
-    "metrics.`completion`",
-    "metrics.`lap_share`",
+    *(f"metrics.`{BEST}{name}`" for name in ("score_s", "lap_time_s", "completion")),
+    *(f"metrics.`{METRICS[column][0]}`" for column in ("eval_completion", "best_lap_time_s", "completion")),
     "params.`reward`",
     "params.`network`",
     "params.`action_space`",
@@ -83,7 +138,7 @@ def _view(columns: Sequence[str]) -> dict[str, str]:
 
 
 EXPERIMENT_TAGS: Mapping[str, str] = {
-    # Shows runs: MLflow's UI takes an experiment of unknown kind for chats of a language model.
+    # A training; MLflow takes an experiment of unknown kind for chats of a language model.
     "mlflow.experimentKind": "custom_model_development",
     # Without it the runs table has no metric and no parameter until somebody chooses its columns.
     **_view(_COLUMNS),
@@ -93,11 +148,11 @@ EXPERIMENT_TAGS: Mapping[str, str] = {
 
 def trial_metrics(values: Mapping[str, float | None]) -> dict[str, float | None]:
     """Return what a trial's best checkpoint came to, by objective, under names that no metric of a training has."""
-    return {_trial_metric(name): None if value is None else round(value, 3) for name, value in values.items()}
+    return {_trial_metric(name): value for name, value in values.items()}
 
 
 def _trial_metric(objective: str) -> str:
-    return f"trial_{objective}" if objective == "completion" else f"trial_{objective}_s"
+    return f"trial/{objective}" if objective == "completion" else f"trial/{objective}_s"
 
 
 def study_view(objectives: Sequence[str], searched: Sequence[str]) -> dict[str, str]:
@@ -114,12 +169,6 @@ def study_view(objectives: Sequence[str], searched: Sequence[str]) -> dict[str, 
         f"tags.`{END_TAG}`",
     ]
     return _view(columns)
-
-
-def in_order(metrics: Mapping[str, float | None]) -> list[tuple[str, float | None]]:
-    """Return the items of `metrics` in the order of METRICS, unknown ones last."""
-    rank = {key: place for place, key in enumerate(METRICS)}
-    return sorted(metrics.items(), key=lambda item: rank.get(item[0], len(rank)))
 
 
 def track_labels(names: Sequence[str]) -> list[str]:
@@ -162,9 +211,31 @@ def lineage_tags(lineage: Lineage) -> dict[str, str]:
     return tags if lineage.parent_run_id is None else {**tags, PARENT: lineage.parent_run_id}
 
 
-def run_params(names: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Return the names of the chosen options (track, reward, ...) beside every value of the experiment."""
-    return {**flatten(config), **names}
+_COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.constants", "budget.env_steps")
+"""Keys and groups that racers vary, which runs are compared by whatever their values."""
+
+
+def run_params(
+    choices: Mapping[str, str],
+    names: Mapping[str, str],
+    config: Mapping[str, Any],
+    overrides: Sequence[str],
+) -> dict[str, Scalar]:
+    """Return what runs are compared by; config.yaml, among the run's files, has every value.
+
+    Args:
+        choices: the option of each group.
+        names: what a racer calls some of them.
+        config: all values of the experiment.
+        overrides: that it was composed from; the values of their keys are compared, too.
+    """
+    compared = {*_COMPARED, *({*map(key_of, overrides)} - choices.keys())}
+    values = {
+        key: value
+        for key, value in flatten(config).items()
+        if any(f"{key}.".startswith(f"{one}.") for one in compared)
+    }
+    return {**values, **choices, **names}
 
 
 def run_tags(
@@ -176,10 +247,9 @@ def run_tags(
     `mlflow.note.content` is the description above the run.
     """
     choices = "\n".join(f"- {key}: `{value}`" for key, value in names.items())
-    metrics = "\n".join(f"- `{key}`: {meaning}" for key, meaning in METRICS.items())
-    metrics += (
-        f"\n\nWith several tracks also {', '.join(TRACK_METRICS)} of each, as `{TRACK_METRICS[0]}/TRACK`."
-    )
+    metrics = "\n".join(f"- `{name}`: {meaning}" for name, meaning in METRICS.values())
+    each = ", ".join(f"`{metric_name(f'{metric}/TRACK')}`" for metric in TRACK_METRICS)
+    metrics += f"\n\nWith several tracks also {each}."
     tags = {
         **names,
         "reward_sha256": reward_sha256,

@@ -1,10 +1,10 @@
-"""Metric points of an iteration."""
+"""Metric points of an iteration, and of a moment."""
 
 import math
 import time
 from collections.abc import Mapping
 
-from .names import in_order
+from .names import metric_names
 
 Point = tuple[str, float, int, int]
 """Key, value, time in ms, step."""
@@ -31,8 +31,19 @@ def points_of(row: Mapping[str, float | None], step: int, start_ms: int) -> tupl
     """
     clock_s = row.get(_CLOCK)
     time_ms = now_ms() if clock_s is None else start_ms + round(1000 * clock_s)
+    return points_at(metric_names({key: value for key, value in row.items() if key != _STEP}), step, time_ms)
+
+
+def points_at(metrics: Mapping[str, float | None], step: int, time_ms: int) -> tuple[Point, ...]:
+    """Return the points of metrics under their names in MLflow; None, NaN and infinite values are left out.
+
+    Args:
+        metrics: by name.
+        step: whatever they are counted by.
+        time_ms: since 1970.
+    """
     return tuple(
         (key, float(value), time_ms, step)
-        for key, value in in_order(row)
-        if value is not None and math.isfinite(value) and key != _STEP
+        for key, value in metrics.items()
+        if value is not None and math.isfinite(value)
     )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.config.running import TrackingConfig, TrackingOff
+from deepracer_exp.formats.run_files import read_object
 
 from .flatten import Scalar, param_text
 from .names import END_TAG
@@ -161,6 +162,8 @@ class MLflowTracker:
             with self._changed:
                 self._safe_step = math.inf
                 self._release()
+        if summary := read_object(self._file.folder / "summary.json"):
+            self._put(_Call("the result", lambda run, _: run.conclude(self._file.told, summary)))
         self._put(_Call(_END, lambda run, _: self._end(run, status, end_ms), vital=True))
         self._end_by = time.monotonic() + deadline_s
         self._finishing.set()

@@ -1,21 +1,26 @@
 """Checkpoints in MLflow's registry of models: put there under an alias, and found again by it."""
 
+import json
 import re
+import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.formats.checkpoint_files import HASHES, checkpoint_sha256, pin, verify
-from deepracer_exp.formats.run_files import read_run_id
+from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pin, verify
+from deepracer_exp.formats.run_files import read_metrics, read_run_id
 
 from .lookup import asked
+from .names import metric_names
+from .notes import PICTURE, REPORT, in_words, picture
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import LoggedModel
 
 _RUN_DIR, _CHECKPOINT, _SHA256 = "run_dir", "checkpoint", "sha256"
 """Tags of a version."""
@@ -106,17 +111,21 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
     )
 
 
-def promote(run: Path, name: str, model: str, alias: str, uri: str | None, runs_dir: Path) -> Registered:
+def promote(
+    run: Path, name: str, model: str, alias: str, features: Sequence[str], uri: str | None, runs_dir: Path
+) -> Registered:
     """Register a checkpoint as a version of a model, and give that version the alias.
 
-    The checkpoint's files go to the run's files in MLflow, unless they are there, and the checkpoint stays in the
-    run's folder from now on. A checkpoint that is a version already becomes none a second time.
+    The version is a logged model of MLflow: the checkpoint's files, the run's report and picture, a signature, and the
+    evaluation of the checkpoint as metrics. The checkpoint stays in the run's folder from now on. A checkpoint that is
+    a version already becomes none a second time.
 
     Args:
         run: its folder.
         name: of the checkpoint: `best`, `last` or the number of an iteration.
         model: made where there is none of this name.
         alias: taken from the version that has it.
+        features: names of the numbers that the policy observes.
         uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
         runs_dir: where runs are.
 
@@ -145,18 +154,92 @@ def promote(run: Path, name: str, model: str, alias: str, uri: str | None, runs_
         raise BadInput(f"{what}: was deleted in MLflow (run {run_id}); restore it there")
     pin(run / "checkpoints", folder.name, f"registered as {model}")
     with asked(what, uri, runs_dir) as client:
-        place = f"checkpoints/{folder.name}"
-        if not _is_there(client, run_id, place, folder):
-            client.log_artifacts(run_id, str(folder), place)
         if not any(found.name == model for found in _models(client)):
-            client.create_registered_model(model)
+            client.create_registered_model(
+                model, description=f"Policies of `deepracer-exp`, experiment `{model}`."
+            )
         versions = pages(client.search_model_versions, filter_string=f"name = '{model}'")
         version = next((found for found in versions if found.tags.items() >= tags.items()), None)
         if version is None:
-            source = f"{recorded.info.artifact_uri}/{place}"
-            version = client.create_model_version(model, source, run_id, tags)
+            metrics = _evaluated(run, folder)
+            logged = _log_model(
+                client, recorded.info.experiment_id, run_id, run, folder, tags, features, metrics
+            )
+            shown = (
+                f"Checkpoint {int(folder.name)} of `{run.name}`: {in_words(metrics)}.\n\n{picture(run_id)}"
+            )
+            version = _version_of(client, logged.model_id, model, run_id, tags, shown)
         client.set_registered_model_alias(model, alias, version.version)
         return _registered(what, version, alias)
+
+
+def _evaluated(run: Path, checkpoint: Path) -> dict[str, float]:
+    """Return what a checkpoint came to in the evaluation after its iteration, by MLflow's names of the metrics."""
+    file = run / "metrics.jsonl"
+    rows = read_metrics(file) if file.exists() else []
+    (row,) = [row for row in rows if row["iteration"] == int(checkpoint.name)] or [{}]
+    named = metric_names(row)
+    return {key: value for key, value in named.items() if key.startswith("race/") and value is not None}
+
+
+def _log_model(
+    client: "MlflowClient",
+    experiment_id: str,
+    run_id: str,
+    run: Path,
+    checkpoint: Path,
+    tags: Mapping[str, str],
+    features: Sequence[str],
+    metrics: Mapping[str, float],
+) -> "LoggedModel":
+    """Log a checkpoint as a model of MLflow, tensors and JSON as in the run's folder."""
+    import numpy as np
+    from mlflow.models import Model, ModelSignature
+    from mlflow.types import Schema, TensorSpec
+
+    name = f"{run.name}-{checkpoint.name}"
+    logged = client.create_logged_model(experiment_id, name, run_id, dict(tags), model_type="policy")
+    observation = TensorSpec(np.dtype(np.float32), (-1, len(features)), "observation")
+    command = TensorSpec(np.dtype(np.float32), (-1, 2), "command")
+    described = Model(
+        run_id=run_id,
+        model_id=logged.model_id,
+        signature=ModelSignature(Schema([observation]), Schema([command])),
+        flavors={"deepracer_exp": {"checkpoint": "checkpoint", "format": "torchrl.checkpoint"}},
+        metadata={"observation": list(features), "command": ["steering_deg", "speed_mps"]},
+    )
+    with tempfile.TemporaryDirectory() as aside:
+        described.save(str(Path(aside) / "MLmodel"))
+        for name in (PICTURE, REPORT):
+            if (run / name).exists():
+                shutil.copy(run / name, aside)
+        client.log_model_artifacts(logged.model_id, aside)
+    client.log_model_artifacts(logged.model_id, str(checkpoint), "checkpoint")
+    for key, value in metrics.items():
+        # The very point of the run, so that its curve has none twice.
+        known = [point for point in client.get_metric_history(run_id, key) if point.value == value]
+        moment = (known[-1].timestamp, known[-1].step) if known else (None, None)
+        client.log_metric(run_id, key, value, *moment, model_id=logged.model_id)
+    return client.finalize_logged_model(logged.model_id, "READY")
+
+
+def _version_of(
+    client: "MlflowClient", model_id: str, model: str, run_id: str, tags: Mapping[str, str], description: str
+) -> Any:
+    """Register a logged model as a version, so that MLflow's page of each shows the other."""
+    import mlflow
+
+    # A database looks the logged model up in the store that MLflow takes for the process's own.
+    mlflow.set_tracking_uri(client.tracking_uri)
+    try:
+        version = client.create_model_version(
+            model, f"models:/{model_id}", run_id, dict(tags), description=description, model_id=model_id
+        )
+    finally:
+        mlflow.set_tracking_uri(None)
+    versions = json.dumps([{"name": model, "version": version.version}])
+    client.set_logged_model_tags(model_id, {"mlflow.modelVersions": versions})
+    return version
 
 
 def registered_checkpoints(client: "MlflowClient") -> set[tuple[str, str]]:
@@ -192,28 +275,6 @@ def _folder(run: Path, name: str) -> Path:
             f"--checkpoint {name}: {folder} is not there; accepted: best, last or an iteration that is"
         )
     return folder.resolve()
-
-
-def _is_there(client: "MlflowClient", run_id: str, place: str, folder: Path) -> bool:
-    """Return whether the run's files have this very checkpoint, whole."""
-    wanted = {
-        f"{place}/{file.relative_to(folder).as_posix()}": file.stat().st_size
-        for file in folder.rglob("*")
-        if file.is_file()
-    }
-    if dict(_artifacts(client, run_id, place)) != wanted:
-        return False
-    with tempfile.TemporaryDirectory() as aside:
-        theirs = Path(client.download_artifacts(run_id, f"{place}/{HASHES}", aside))
-        return theirs.read_bytes() == (folder / HASHES).read_bytes()
-
-
-def _artifacts(client: "MlflowClient", run_id: str, place: str) -> Iterator[tuple[str, int]]:
-    for found in client.list_artifacts(run_id, place):
-        if found.is_dir:
-            yield from _artifacts(client, run_id, found.path)
-        else:
-            yield found.path, found.file_size
 
 
 def _models(client: "MlflowClient") -> Iterator[Any]:

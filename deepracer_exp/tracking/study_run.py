@@ -17,7 +17,7 @@ from deepracer_exp.config.running import TrackingConfig, TrackingOff
 
 from .flatten import param_text
 from .names import END_TAG, PARENT, study_view, trial_metrics
-from .points import now_ms, points_of
+from .points import now_ms, points_at
 from .store import Store, one_line, resolve_store
 from .tracking_file import Status, Told
 
@@ -196,14 +196,14 @@ class StudyRun:
             "completion": progress.completion,
         }
         metrics = trial_metrics({**metrics, **progress.best_values})
-        metrics |= {"trials_complete": progress.complete, "trials_pruned": progress.pruned}
-        metrics |= {"trials_failed": progress.failed, "sweep_env_steps": progress.env_steps}
+        metrics |= {"study/complete": progress.complete, "study/pruned": progress.pruned}
+        metrics |= {"study/failed": progress.failed, "study/env_steps": progress.env_steps}
         run.set_tags(tags)
         if self._is_late:
             self._adopt(run)
         # Not once a trial: at the end the best one may be another than before.
         if metrics != self._last_metrics:
-            run.log_metrics(points_of(metrics, progress.ended, self._told.start_ms))
+            run.log_metrics(points_at(metrics, progress.ended, now_ms()))
             self._last_metrics = metrics
         with self._changed:
             if self._progress is progress:
@@ -339,7 +339,7 @@ def end_trial_run(
     def end_run(run: "MLflowRun") -> None:
         run.connect()
         run.reopen(Told(run_id, "", study, 0, store.shown))
-        run.log_metrics(points_of(values, 0, now_ms()))
+        run.log_metrics(points_at(values, 0, now_ms()))
         run.set_tags({END_TAG: reason})
         run.end(status, now_ms())
 

@@ -1,6 +1,5 @@
 """MLflow's web page for the project's runs, on this machine only."""
 
-import json
 import os
 import signal
 import socket
@@ -10,16 +9,19 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any
+from typing import IO
 
 from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
 
+from .lookup import asked
 from .names import VIEW
+from .notes import WORKFLOW
+from .registry import pages
 from .store import Store, resolve_store
 
 _HOST = "127.0.0.1"
@@ -41,11 +43,11 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
     """
     store = existing_store(runs_dir, uri)
     if store.is_server:
-        announce(store.shown)
+        announce(runs_page(store.shown, uri, runs_dir))
         return
     with _ending_by_exception(), running_ui(store, port) as (url, server):
         try:
-            announce(runs_page(url))
+            announce(runs_page(url, uri, runs_dir))
             code = server.wait()
         except KeyboardInterrupt:
             return
@@ -118,32 +120,25 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
             _end_group(server)
 
 
-def runs_page(url: str) -> str:
-    """Return the address of the runs table that holds the newest run, with its racing columns."""
-    experiments = _ask(f"{url}/api/2.0/mlflow/experiments/search?max_results=1000")["experiments"]
-    newest = _ask(
-        f"{url}/api/2.0/mlflow/runs/search",
-        {
-            "experiment_ids": [experiment["experiment_id"] for experiment in experiments],
-            "max_results": 1,
-            "order_by": ["attributes.start_time DESC"],
-        },
-    ).get("runs")
-    # MLflow's UI opens for language models unless told otherwise.
+def runs_page(url: str, uri: str | None, runs_dir: Path) -> str:
+    """Return the address of the runs table that holds the newest run, with its racing columns.
+
+    Args:
+        url: of the pages.
+        uri: the store that they show, as in `tracking.uri`; None: the one in `runs_dir`.
+        runs_dir: where runs are.
+
+    Raises:
+        BadInput: the store does not answer.
+    """
+    with asked(f"ui of {url}", uri, runs_dir) as client:
+        known = {one.experiment_id: one for one in pages(client.search_experiments)}
+        newest = client.search_runs(list(known), max_results=1, order_by=["attributes.start_time DESC"])
     if not newest:
-        return f"{url}/#/experiments?workflowType=machine_learning"
-    experiment_id = newest[0]["info"]["experiment_id"]
-    page = f"{url}/#/experiments/{experiment_id}/runs?workflowType=machine_learning"
-    tags = next(each for each in experiments if each["experiment_id"] == experiment_id).get("tags", ())
-    has_view = any(tag["key"] == f"mlflow.sharedViewState.{VIEW}" for tag in tags)
-    return f"{page}&viewStateShareKey={VIEW}" if has_view else page
-
-
-def _ask(url: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(url, data, {"Content-Type": "application/json"})
-    with _DIRECTLY.open(request, timeout=_ANSWER_S) as answer:
-        return json.load(answer)
+        return f"{url}/#/experiments?{WORKFLOW}"
+    experiment = known[newest[0].info.experiment_id]
+    page = f"{url}/#/experiments/{experiment.experiment_id}/runs?{WORKFLOW}"
+    return f"{page}&viewStateShareKey={VIEW}" if f"mlflow.sharedViewState.{VIEW}" in experiment.tags else page
 
 
 def _is_free(port: int) -> bool:

@@ -157,7 +157,7 @@ def _begin(
     tracker.start(
         title,
         experiment.name,
-        run_params(names, composition.mapping),
+        run_params(composition.choices, names, composition.mapping, composition.overrides),
         tags,
         identity=folder.path / tracking_file.NAME,
     )

@@ -61,7 +61,7 @@ class Decision:
             "stopping.rule": self.rule,
             "stopping.hopeless": str(self.hopeless).lower(),
             **{
-                f"stopping.{kind}.{key}": str(value)
+                f"stopping.{kind}.{key}": f"{value:.4g}" if isinstance(value, float) else str(value)
                 for kind, found in numbers
                 for key, value in found.items()
             },

@@ -239,16 +239,16 @@ def test_a_point_twice_or_not_at_all_is_a_difference() -> None:
         {"env_steps": 20, "completion": 2.0, "best_lap_time_s": 9.0, "wall_clock_s": 0.2},
     ]
     history = {
-        "completion": [(20, 2.0), (10, 1.0)],
-        "best_lap_time_s": [(20, 9.0)],
-        "wall_clock_s": [(10, 0.1), (20, 0.7)],
+        "train/completion": [(20, 2.0), (10, 1.0)],
+        "train/best_lap_time_s": [(20, 9.0)],
+        "time/wall_clock_s": [(10, 0.1), (20, 0.7)],
     }
     assert different_points(rows, history) is None
     for key, points in (
-        ("completion", [(10, 1.0), (20, 2.0), (20, 2.0)]),
-        ("completion", [(10, 1.0)]),
-        ("completion", [(10, 1.0), (20, 2.5)]),
-        ("wall_clock_s", [(10, 0.1), (20, 0.2), (20, 0.3)]),
+        ("train/completion", [(10, 1.0), (20, 2.0), (20, 2.0)]),
+        ("train/completion", [(10, 1.0)]),
+        ("train/completion", [(10, 1.0), (20, 2.5)]),
+        ("time/wall_clock_s", [(10, 0.1), (20, 0.2), (20, 0.3)]),
         ("besides", [(10, 1.0)]),
     ):
         assert (different_points(rows, history | {key: points}) or "").startswith(f"{key}: ")

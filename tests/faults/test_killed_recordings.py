@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
+from deepracer_exp.tracking.names import metric_name
+
 
 def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
     kills = 5
@@ -25,7 +27,7 @@ def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == list(range(1, 161))
     for key in rows[0].keys() - {"env_steps"}:
-        history = client.get_metric_history(run.info.run_id, key)
+        history = client.get_metric_history(run.info.run_id, metric_name(key))
         assert [(p.step, p.value) for p in history] == [(row["env_steps"], row[key]) for row in rows], key
 
 

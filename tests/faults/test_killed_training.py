@@ -10,6 +10,7 @@ from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.formats.run_files import read_metrics
+from deepracer_exp.tracking.names import metric_name
 from deepracer_exp.training.run import TIMES
 
 ITERATIONS = 14
@@ -30,7 +31,7 @@ def points_of(where, runs_dir, folder) -> dict[str, list[tuple[int, float]]]:
     keys = client.get_run(run_id).data.metrics
     assert client.get_run(run_id).info.status == "FINISHED"
     found = {key: [(p.step, p.value) for p in client.get_metric_history(run_id, key)] for key in keys}
-    return {key: points for key, points in found.items() if key not in TIMES}
+    return {key: points for key, points in found.items() if key not in map(metric_name, TIMES)}
 
 
 def killed_after(start, arguments, ready) -> None:
@@ -52,7 +53,7 @@ def assert_as_if_nothing_had_happened(tmp_path, start):
     assert different_traces(one, other) is None
     points = points_of(tmp_path, "cut", other)
     assert points == points_of(tmp_path, "whole", one)
-    assert len(points["entropy"]) == len(set(points["entropy"])) == ITERATIONS
+    assert len(points["update/entropy"]) == len(set(points["update/entropy"])) == ITERATIONS
 
 
 def recorded(tmp_path) -> int:

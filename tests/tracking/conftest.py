@@ -108,6 +108,18 @@ def server(empty_database: Path, tmp_path: Path, free_port: int) -> Iterator[Ser
     server.kill()
 
 
+FEATURES = ("offset", "speed", "yaw_rate")
+"""Of a policy that is promoted."""
+
+
+OBSERVATION = {
+    "lookahead_m": [0.5, 1.0],
+    "lookahead_scale_m": 2.0,
+    "speed_scale_mps": 4.0,
+    "yaw_rate_scale_radps": 5.0,
+}
+
+
 class Season:
     """Run folders as trainings leave them, without the training."""
 
@@ -124,6 +136,7 @@ class Season:
             "car": {"name": "deepracer"},
             "name": experiment,
         }
+        values |= {"observation": OBSERVATION}
         values |= {"evaluation": {"trials": 8, "tracks": None}, "algorithm": {"lr": 0.001}}
         for iteration in (10, 20, 30):
             self.checkpoint(run, iteration)

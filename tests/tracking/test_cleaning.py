@@ -13,6 +13,8 @@ from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, remove,
 from deepracer_exp.tracking.overview import look_over
 from deepracer_exp.tracking.registry import promote
 
+from .conftest import FEATURES
+
 HOUR_S = 3600
 
 
@@ -57,7 +59,7 @@ def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp
 def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
     run = season.run("1")
     season.recorded(run, client)
-    promote(run, "10", "model", "champion", None, season.runs_dir)
+    promote(run, "10", "model", "champion", FEATURES, None, season.runs_dir)
     (run / "checkpoints" / "pinned.json").unlink()
     client.delete_registered_model_alias("model", "champion")
     assert listed(season, look_over(None, season.runs_dir)) == []
@@ -98,7 +100,7 @@ def test_a_deleted_run_that_is_needed_stays_and_the_reason_is_told(season, clien
     cloned, registered = season.run("1"), season.run("2")
     season.clone("3", cloned)
     ids = [season.recorded(run, client) for run in (cloned, registered)]
-    promote(registered, "best", "model", "champion", None, season.runs_dir)
+    promote(registered, "best", "model", "champion", FEATURES, None, season.runs_dir)
     for run_id in ids:
         client.delete_run(run_id)
     overview = look_over(None, season.runs_dir)

@@ -6,7 +6,7 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.tracking.delivery import deliver
+from deepracer_exp.tracking.delivery import deliver, deliver_evaluation
 from deepracer_exp.tracking.recorder import MLflowTracker
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracking_file import read_told
@@ -56,11 +56,11 @@ def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, sto
     assert run.data.params == {"seed": "1"}
     wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "hopeless: collapsed"}
     assert run.data.tags.items() >= wanted.items()
-    assert run.data.metrics.keys() == {"completion", "iteration", "wall_clock_s"}
+    assert run.data.metrics.keys() == {"train/completion", "train/iteration", "time/wall_clock_s"}
     files = {file.path for file in client.list_artifacts(run.info.run_id)}
     assert files == {"summary.json", "checkpoints"}
     assert deliver(moved, store.uri, tmp_path) == 0
-    history = client.get_metric_history(run.info.run_id, "completion")
+    history = client.get_metric_history(run.info.run_id, "train/completion")
     assert [(point.step, point.value) for point in history] == [(100, 1 / 3), (200, 2 / 3), (300, 1.0)]
     assert not [record for record in caplog.records if record.name.endswith("delivery")]
 
@@ -102,3 +102,21 @@ def test_a_run_that_has_not_ended_is_refused(run_dir, store, tmp_path):
     (run_dir / "summary.json").unlink()
     with pytest.raises(BadInput, match="has not ended"):
         deliver(run_dir, store.uri, tmp_path)
+
+
+def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, tmp_path, away, caplog):
+    deliver(run_dir, store.uri, tmp_path)
+    film = tmp_path / "lap.mp4"
+    film.write_bytes(b"film")
+    metrics = {"race/evaluate/lap_time_s": 8.765, "race/evaluate/score_s": None}
+    deliver_evaluation(run_dir, store.uri, tmp_path, 300, metrics, {film: "films"})
+    client = MlflowClient(tracking_uri=store.uri)
+    run_id = read_told(run_dir / "tracking.json").run_id
+    assert client.get_run(run_id).info.status == "FINISHED"
+    (point,) = client.get_metric_history(run_id, "race/evaluate/lap_time_s")
+    assert (point.step, point.value) == (300, 8.765)
+    assert [file.path for file in client.list_artifacts(run_id, "films")] == ["films/lap.mp4"]
+    caplog.clear()
+    deliver_evaluation(run_dir, away, tmp_path, 300, metrics, {film: "films"})
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "does not have this evaluation" in caplog.text

@@ -1,10 +1,24 @@
+from dataclasses import fields
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mlflow.utils.validation import _validate_metric_name
 
+from deepracer_exp.agents.ppo import UpdateMetrics
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
-from deepracer_exp.tracking.names import TRACK_METRICS, joined, track_labels, track_metric
+from deepracer_exp.tracking.names import (
+    BEST,
+    METRICS,
+    TRACK_METRICS,
+    joined,
+    metric_name,
+    run_params,
+    track_labels,
+    track_metric,
+)
+from deepracer_exp.training.examination import COLUMNS
 
 awkward = st.text(st.sampled_from("aAb_-.2/ :ß"), max_size=6)
 
@@ -38,3 +52,39 @@ def test_the_tracks_of_the_catalogue_keep_their_names():
 )
 def test_up_to_three_tracks_are_named_and_more_are_counted(names, label):
     assert joined(names) == label
+
+
+def test_every_column_has_a_name_of_its_own_in_a_section_and_race_is_the_first():
+    columns = [*COLUMNS, *(field.name for field in fields(UpdateMetrics)), *TRACK_METRICS]
+    assert set(columns) <= set(METRICS)
+    names = [metric_name(column) for column in METRICS]
+    assert len(set(names)) == len(names)
+    # MLflow's pages sort sections by their names; without a slash a metric stands in none.
+    sections = sorted({name.rpartition("/")[0] for name in [*names, f"{BEST}x"]})
+    assert sections == ["race", "race/best", "time", "train", "update"]
+    assert metric_name("lap_share/Oval_track") == "train/lap_share/Oval_track"
+    assert metric_name("of_tomorrow") == "train/of_tomorrow"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "more"),
+    [
+        ([], {}),
+        (
+            ["car.tyre_friction=0.5", "network=mlp", "seed=7"],
+            {"car.tyre_friction": 0.5, "network": "mlp", "seed": 7},
+        ),
+        (["reward.constants.X=2"], {"reward.constants.X": 2}),
+    ],
+)
+def test_parameters_are_what_was_chosen_and_what_racers_vary(overrides, more):
+    _, composition = compose_experiment(overrides)
+    params = run_params(
+        composition.choices, {"track": "my track"}, composition.mapping, composition.overrides
+    )
+    assert len(params) < 50
+    assert {"algorithm.lr", "network.hidden", "seed", "car", "stopping", "reward"} <= params.keys()
+    assert params["track"] == "my track"
+    assert params.items() >= more.items()
+    own = {"car.tyre_friction"} & more.keys()
+    assert {key for key in params if key.startswith(("car.", "track.", "episode.", "evaluation."))} == own

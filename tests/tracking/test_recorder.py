@@ -8,6 +8,7 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.names import metric_name
 from deepracer_exp.tracking.recorder import MLflowTracker
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.tracking_file import Told
@@ -15,7 +16,7 @@ from deepracer_exp.tracking.tracking_file import Told
 
 def history(store: Store, run_id: str | None, key: str) -> list[tuple[int, float]]:
     client = MlflowClient(tracking_uri=store.uri)
-    return sorted((point.step, point.value) for point in client.get_metric_history(run_id, key))
+    return sorted((point.step, point.value) for point in client.get_metric_history(run_id, metric_name(key)))
 
 
 def test_every_point_is_recorded_once_and_at_its_env_step(store, identity):
@@ -101,7 +102,7 @@ def test_repeating_a_call_changes_nothing(store):
     assert repeated.run_id == run.run_id
     for _ in range(2):
         run.log_params({"seed": "1"})
-        run.log_metrics([("kl", 0.5, 1000, 7), ("kl", 0.25, 2000, 8)])
+        run.log_metrics([("update/kl", 0.5, 1000, 7), ("update/kl", 0.25, 2000, 8)])
         run.end("FINISHED", 2345)
     assert history(store, run.run_id, "kl") == [(7, 0.5), (8, 0.25)]
 

@@ -9,6 +9,8 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.references import resolve
 from deepracer_exp.tracking.registry import promote
 
+from .conftest import FEATURES
+
 
 def refusal(run, season) -> str:
     with pytest.raises(BadInput) as refused:
@@ -98,7 +100,7 @@ def test_a_summary_that_is_none_is_named(season, text):
 def test_an_alias_leads_to_run_and_checkpoint(season, client):
     run = season.run("1")
     season.recorded(run, client)
-    promote(run, "10", "season", "champion", None, season.runs_dir)
+    promote(run, "10", "season", "champion", FEATURES, None, season.runs_dir)
     for given in ("champion", "season@champion"):
         found = resolve(given, season.runs_dir, None)
         assert (found.path, found.checkpoint, found.registered) == (run, "000010", "season@champion")
@@ -107,7 +109,7 @@ def test_an_alias_leads_to_run_and_checkpoint(season, client):
 
 def test_a_runs_name_goes_before_an_alias(season, client):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
     named = season.run("champion-of-all")
     assert resolve("champion", season.runs_dir, None).path == named
     assert resolve("season@champion", season.runs_dir, None).path == run
@@ -115,7 +117,7 @@ def test_a_runs_name_goes_before_an_alias(season, client):
 
 def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, tmp_path):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
     moved = tmp_path / "moved"
     season.runs_dir.rename(moved)
     assert resolve("champion", moved, None).path == moved / "season" / "1"
@@ -123,7 +125,7 @@ def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, t
 
 def test_a_checkpoint_that_is_not_the_registered_one_is_refused(season, client):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
     checkpoint = run / "checkpoints" / "000020"
     file = checkpoint / "agent" / "state.tdz"
     file.write_text("other weights")
@@ -158,7 +160,7 @@ UNKNOWN = {
 
 def test_what_no_model_is_called_by_is_refused(season, client):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
     for reference, words in UNKNOWN.items():
         assert words in refusal(reference, season), reference
 
@@ -166,7 +168,7 @@ def test_what_no_model_is_called_by_is_refused(season, client):
 def test_a_bare_alias_of_two_models_is_refused(season, client):
     season.recorded(run := season.run("1"), client)
     for model in ("a", "b"):
-        promote(run, "best", model, "champion", None, season.runs_dir)
+        promote(run, "best", model, "champion", FEATURES, None, season.runs_dir)
     text = refusal("champion", season)
     assert "2 models have this alias" in text
     assert "a@champion, b@champion" in text

@@ -5,23 +5,23 @@ from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
+from mlflow.models import Model
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.tracking.registry import is_alias, look_up, promote
 
+from .conftest import FEATURES
 
-def files(client, run_id, place=""):
-    found = client.list_artifacts(run_id, place)
-    return {one.path for one in found} | {
-        name for one in found if one.is_dir for name in files(client, run_id, one.path)
-    }
+
+def model_id(version) -> str:
+    return version.source.removeprefix("models:/")
 
 
 def check_promotion(season, client, uri):
     run = season.run("1")
     run_id = season.recorded(run, client)
-    first = promote(run, "best", "model", "champion", uri, season.runs_dir)
+    first = promote(run, "best", "model", "champion", FEATURES, uri, season.runs_dir)
     version = client.get_model_version_by_alias("model", "champion")
     assert version.run_id == run_id
     assert version.tags == {
@@ -29,10 +29,11 @@ def check_promotion(season, client, uri):
         "checkpoint": "000020",
         "sha256": checkpoint_sha256(run / "checkpoints" / "000020"),
     }
-    assert "checkpoints/000020/agent/state.tdz" in files(client, run_id)
+    kept = {file.path for file in client.list_logged_model_artifacts(model_id(version), "checkpoint/agent")}
+    assert kept == {"checkpoint/agent/state.tdz"}
     assert pinned(run / "checkpoints") == {"000020": ["registered as model"]}
-    assert promote(run, "20", "model", "champion", uri, season.runs_dir) == first
-    second = promote(run, "last", "model", "champion", uri, season.runs_dir)
+    assert promote(run, "20", "model", "champion", FEATURES, uri, season.runs_dir) == first
+    second = promote(run, "last", "model", "champion", FEATURES, uri, season.runs_dir)
     assert int(second.version) > int(first.version)
     assert look_up("model@champion", uri, season.runs_dir) == second
     assert look_up("champion", uri, season.runs_dir) == second
@@ -51,17 +52,31 @@ def test_a_server_takes_promotions_as_well(season, server):
     check_promotion(season, client, server.uri)
 
 
-def test_files_that_the_run_has_are_not_sent_again_and_others_are(season, client):
+def test_a_promoted_version_has_metrics_signature_report_and_description(season, client):
     run = season.run("1")
-    season.recorded(run, client)
-    promote(run, "best", "model", "champion", None, season.runs_dir)
-    (theirs,) = season.runs_dir.glob("artifacts/*/artifacts/checkpoints/000020")
-    before = (theirs / "hashes.json").stat().st_mtime_ns
-    promote(run, "best", "model", "rain", None, season.runs_dir)
-    assert (theirs / "hashes.json").stat().st_mtime_ns == before
-    (theirs / "agent" / "state.tdz").unlink()
-    promote(run, "best", "model", "rain", None, season.runs_dir)
-    assert (theirs / "agent" / "state.tdz").exists()
+    run_id = season.recorded(run, client)
+    rows = [
+        {"iteration": n, "env_steps": 100 * n, "eval_lap_time_s": 9.876543, "kl": 1.0} for n in (10, 20, 30)
+    ]
+    rows[1] |= {"eval_completion": 98.7654, "eval_race_score_s": 9.5}
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (run / "report.html").write_text("<p>what the training tells")
+    client.log_metric(run_id, "race/score_s", 9.5, 1234, 2000)
+    promote(run, "best", "model", "champion", FEATURES, None, season.runs_dir)
+    version = client.get_model_version_by_alias("model", "champion")
+    assert version.description.startswith(
+        "Checkpoint 20 of `1`: race score 9.50 s, lap 9.88 s, 98.8 % of the lap."
+    )
+    logged = client.get_logged_model(model_id(version))
+    metrics = {metric.key: metric.value for metric in logged.metrics}
+    assert metrics == {"race/lap_time_s": 9.876543, "race/completion": 98.7654, "race/score_s": 9.5}
+    assert len(client.get_metric_history(run_id, "race/score_s")) == 1
+    files = Path(logged.artifact_location.removeprefix("file://"))
+    assert {file.name for file in files.iterdir()} == {"MLmodel", "report.html", "checkpoint"}
+    signature = Model.load(str(files / "MLmodel")).signature
+    assert signature.inputs.inputs[0].shape == (-1, len(FEATURES))
+    assert signature.outputs.inputs[0].shape == (-1, 2)
+    assert not [path for path in files.rglob("*") if path.suffix in (".pkl", ".pickle", ".pt", ".pth")]
 
 
 def spoil(checkpoint: Path) -> None:

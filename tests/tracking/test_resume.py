@@ -7,6 +7,7 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.names import metric_name
 from deepracer_exp.tracking.recorder import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracking_file import read_told
@@ -49,7 +50,7 @@ def runs(client):
 
 
 def points(client, run_id, key="completion"):
-    return [(point.step, point.value) for point in client.get_metric_history(run_id, key)]
+    return [(point.step, point.value) for point in client.get_metric_history(run_id, metric_name(key))]
 
 
 def test_a_resumed_run_goes_on_in_the_same_mlflow_run(store, client, identity, killed):
@@ -67,7 +68,7 @@ def test_a_resumed_run_goes_on_in_the_same_mlflow_run(store, client, identity, k
 
 
 def test_the_times_of_points_are_those_of_the_training(client, identity, killed):
-    history = client.get_metric_history(killed.run_id, "completion")
+    history = client.get_metric_history(killed.run_id, "train/completion")
     start_ms = read_told(identity).start_ms
     assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 11)]
 
@@ -229,3 +230,51 @@ def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
     with pytest.raises(BadInput, match=says) as refused:
         MLflowTracker(store).reopen(identity)
     assert str(identity) in str(refused.value)
+
+
+def test_a_run_begun_under_other_names_has_all_its_points_under_those_of_today(
+    store, client, identity, killed
+):
+    client.log_metric(killed.run_id, "completion", 1 / 3, 125, 100)
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    rows = [row(iteration) for iteration in range(1, 21)]
+    tell(tracker, rows)
+    assert tracker.finish("FINISHED") == 0
+    assert points(client, killed.run_id) == [(one["env_steps"], one["completion"]) for one in rows]
+
+
+def test_what_came_of_a_run_heads_its_description_and_that_of_its_experiment(store, client, tmp_path):
+    def train(name: str, lap_s: float) -> str:
+        folder = tmp_path / name
+        folder.mkdir()
+        tracker = MLflowTracker(store)
+        tags = {"mlflow.note.content": "as it began"}
+        tracker.start(name, "race", {}, tags, folder / "tracking.json")
+        (folder / "best_lap.png").write_bytes(b"picture")
+        tracker.log_artifact(folder / "best_lap.png")
+        best = {"iteration": 4, "env_steps": 400, "metric": "race_score", "rank": [1.0, -lap_s]}
+        best |= {"eval_lap_time_s": lap_s, "eval_race_score_s": lap_s, "eval_completion": 100.0}
+        summary = {"status": "finished", "reason": "converged: all", "best": best}
+        (folder / "summary.json").write_text(json.dumps(summary))
+        assert tracker.finish("FINISHED", 60) == 0
+        return str(tracker.run_id)
+
+    def notes(run_id: str) -> tuple[str, str]:
+        run = client.get_run(run_id)
+        return run.data.tags["mlflow.note.content"], client.get_experiment(run.info.experiment_id).tags[
+            "mlflow.note.content"
+        ]
+
+    slow, fast = train("slow", 12.3456789), train("fast", 8.7654321)
+    of_run, of_experiment = notes(fast)
+    assert of_run.startswith("**finished**: converged: all")
+    assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0 % of the lap" in of_run
+    assert f"(get-artifact?path=best_lap.png&run_uuid={fast})" in of_run
+    assert of_run.endswith("as it began")
+    assert "[fast]" in of_experiment
+    assert "8.77 s" in of_experiment
+    assert client.get_run(fast).data.metrics["race/best/lap_time_s"] == 8.7654321
+    experiment_id = client.get_run(slow).info.experiment_id
+    client.set_experiment_tag(experiment_id, "mlflow.note.content", "mine")
+    assert notes(train("fastest", 7.0))[1] == "mine"

@@ -13,6 +13,7 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.tracking.delivery import deliver
+from deepracer_exp.tracking.names import metric_name
 from deepracer_exp.tracking.recorder import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 
@@ -35,7 +36,7 @@ def test_a_server_killed_and_restarted_mid_run_has_every_point_once(server, tmp_
     server.start()
     assert tracker.finish("KILLED", deadline_s=60) == 0
     client = MlflowClient(tracking_uri=server.uri)
-    points = client.get_metric_history(tracker.run_id, "completion")
+    points = client.get_metric_history(tracker.run_id, "train/completion")
     assert sorted((point.step, point.value) for point in points) == [(n, float(n)) for n in range(40)]
     assert client.get_run(tracker.run_id).info.status == "KILLED"
     assert [file.path for file in client.list_artifacts(tracker.run_id, "reports")] == [
@@ -53,7 +54,7 @@ def test_a_server_down_at_the_start_gets_one_whole_run_when_it_comes(server, tmp
     client = MlflowClient(tracking_uri=server.uri)
     experiment = client.get_experiment_by_name("race")
     (run,) = client.search_runs([experiment.experiment_id])
-    assert (run.data.params, run.data.metrics) == ({"seed": "1"}, {"kl": 1.0})
+    assert (run.data.params, run.data.metrics) == ({"seed": "1"}, {"update/kl": 1.0})
 
 
 def test_a_server_that_hangs_blocks_nobody_and_gets_every_point_later(server, tmp_path, wait_until, identity):
@@ -70,7 +71,7 @@ def test_a_server_that_hangs_blocks_nobody_and_gets_every_point_later(server, tm
     finally:
         server.signal(signal.SIGCONT)
     assert tracker.finish("FINISHED", deadline_s=60) == 0
-    points = MlflowClient(tracking_uri=server.uri).get_metric_history(tracker.run_id, "kl")
+    points = MlflowClient(tracking_uri=server.uri).get_metric_history(tracker.run_id, "update/kl")
     assert sorted(point.step for point in points) == list(range(201))
 
 
@@ -91,7 +92,7 @@ def test_a_run_that_ends_while_the_server_is_down_is_delivered_when_it_is_back(s
     assert deliver(tmp_path, server.uri, tmp_path) == 100
     assert deliver(tmp_path, server.uri, tmp_path) == 0
     client = MlflowClient(tracking_uri=server.uri)
-    points = client.get_metric_history(tracker.run_id, "kl")
+    points = client.get_metric_history(tracker.run_id, "update/kl")
     assert [(point.step, point.value) for point in points] == [(row["env_steps"], row["kl"]) for row in rows]
     assert client.get_run(tracker.run_id).info.status == "FINISHED"
 
@@ -117,5 +118,5 @@ def test_recordings_and_servers_that_are_killed_by_turns_leave_every_point_once(
     assert run.info.status == "FINISHED"
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     for key in rows[0].keys() - {"env_steps"}:
-        history = client.get_metric_history(run.info.run_id, key)
+        history = client.get_metric_history(run.info.run_id, metric_name(key))
         assert [(p.step, p.value) for p in history] == [(row["env_steps"], row[key]) for row in rows], key

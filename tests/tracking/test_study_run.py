@@ -58,8 +58,8 @@ def test_the_run_of_a_study_tells_its_search_its_progress_and_its_best(store, tm
     assert found.data.tags["sweep.progress"] == "3 of 60 trials: 1 complete, 1 pruned, 1 failed"
     assert (found.data.tags["sweep.best_trial"], found.data.tags["end"]) == ("7", "finished")
     assert "deepracer-exp train \\\n    a=1\n" in found.data.tags["mlflow.note.content"]
-    assert found.data.metrics["trial_race_score_s"] == 9.5
-    assert (found.data.metrics["trial_lap_time_s"], found.data.metrics["trials_complete"]) == (9.4, 1)
+    assert found.data.metrics["trial/race_score_s"] == 9.5
+    assert (found.data.metrics["trial/lap_time_s"], found.data.metrics["study/complete"]) == (9.4, 1)
     client = MlflowClient(tracking_uri=store.uri)
     assert [file.path for file in client.list_artifacts(run_id)] == ["report.html"]
 
@@ -78,7 +78,7 @@ def test_the_runs_table_of_a_study_opens_with_what_its_trials_differ_in(store):
         "algorithm.lr",
         "reward.constants.X_",
     ]
-    assert {"metrics.`trial_lap_time_s`", "metrics.`trial_completion`", "tags.`end`"} <= set(columns)
+    assert {"metrics.`trial/lap_time_s`", "metrics.`trial/completion`", "tags.`end`"} <= set(columns)
 
 
 def test_whoever_goes_on_with_a_study_goes_on_with_its_run(store):
@@ -94,9 +94,9 @@ def test_whoever_goes_on_with_a_study_goes_on_with_its_run(store):
     second.update(progress(4, best_trial=5, best_values={"race_score": 9.75}))
     assert second.finish("FINISHED", 60)
     (found,) = runs_of(store)
-    assert (found.data.metrics["trial_race_score_s"], found.data.tags["sweep.best_trial"]) == (9.75, "5")
+    assert (found.data.metrics["trial/race_score_s"], found.data.tags["sweep.best_trial"]) == (9.75, "5")
     client = MlflowClient(tracking_uri=store.uri)
-    assert [point.step for point in client.get_metric_history(first.run_id, "trials_complete")] == [3, 4]
+    assert [point.step for point in client.get_metric_history(first.run_id, "study/complete")] == [3, 4]
 
 
 def test_trials_that_began_before_the_run_of_their_study_stand_below_it_none_the_less(store, monkeypatch):
@@ -181,7 +181,7 @@ def test_a_store_that_comes_late_gets_the_newest_progress_only(store, monkeypatc
     run_id = run.wait_for_id(60)
     assert run.finish("FINISHED", 60)
     client = MlflowClient(tracking_uri=store.uri)
-    assert [point.step for point in client.get_metric_history(run_id, "trials_complete")] == [8]
+    assert [point.step for point in client.get_metric_history(run_id, "study/complete")] == [8]
     assert sum("does not answer" in record.message for record in caplog.records) == 1
 
 
@@ -223,13 +223,13 @@ def test_the_seeds_of_a_trial_stand_under_one_run_whoever_asks(store):
     ids = {open_trial_run(store, "spring", 7, parent, ["algorithm.lr=0.001"]) for _ in range(2)}
     other = open_trial_run(store, "spring", 8, parent, ["algorithm.lr=0.002"])
     (run_id,) = ids
-    end_trial_run(store, "spring", run_id, "FINISHED", "finished: converged", {"eval_lap_time_s": 9.1})
+    end_trial_run(store, "spring", run_id, "FINISHED", "finished: converged", {"trial/lap_time_s": 9.1})
     study.finish("FINISHED", 60)
     found = {run.info.run_id: run for run in runs_of(store)}
     assert set(found) == {parent, run_id, other}
     assert found[run_id].data.tags["mlflow.parentRunId"] == parent
     assert found[run_id].data.params == {"algorithm.lr": "0.001"}
-    assert (found[run_id].info.status, found[run_id].data.metrics) == ("FINISHED", {"eval_lap_time_s": 9.1})
+    assert (found[run_id].info.status, found[run_id].data.metrics) == ("FINISHED", {"trial/lap_time_s": 9.1})
     assert found[other].info.status == "RUNNING"
 
 

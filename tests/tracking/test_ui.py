@@ -28,13 +28,13 @@ def record(store, runs_dir: Path, seed: int) -> str:
     tracker.start(
         f"progress_per_step s{seed}",
         "race",
-        run_params(NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}),
+        run_params({}, NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}, []),
         run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed)),
         runs_dir / "tracking.json",
     )
     tracker.log({key: float(seed) for key in reversed(METRICS)}, 8192)
-    (runs_dir / "summary.json").write_text('{"seed": 1}')
-    tracker.log_artifact(runs_dir / "summary.json", "reports")
+    (runs_dir / "notes.json").write_text('{"seed": 1}')
+    tracker.log_artifact(runs_dir / "notes.json", "reports")
     assert tracker.finish("FINISHED") == 0
     assert tracker.run_id is not None
     return tracker.run_id
@@ -56,10 +56,9 @@ def test_a_look_at_no_runs_says_to_train_first_and_creates_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_server_has_its_own_page(tmp_path):
-    announced: list[str] = []
-    serve_ui(tmp_path, "http://me:s3cr3t@tracking.example:5000", 5000, announced.append)
-    assert announced == ["http://tracking.example:5000"]
+def test_a_server_that_does_not_answer_has_no_page_to_open(tmp_path, free_port):
+    with pytest.raises(BadInput, match=rf"ui of http://127.0.0.1:{free_port}: "):
+        serve_ui(tmp_path, f"http://me:s3cr3t@127.0.0.1:{free_port}", 5000, print)
 
 
 @pytest.mark.slow
@@ -69,15 +68,17 @@ def test_the_ui_shows_runs_by_name_and_opens_their_files(store, tmp_path, free_p
         client = MlflowClient(tracking_uri=url)
         experiment = client.get_experiment_by_name("race")
         page = f"{url}/#/experiments/{experiment.experiment_id}/runs"
-        assert runs_page(url) == f"{page}?workflowType=machine_learning&viewStateShareKey={VIEW}"
+        assert (
+            runs_page(url, None, tmp_path) == f"{page}?workflowType=machine_learning&viewStateShareKey={VIEW}"
+        )
         runs = {run.info.run_id: run for run in client.search_runs([experiment.experiment_id])}
         assert runs.keys() == set(run_ids)
         for seed, run_id in enumerate(run_ids, start=1):
             data = runs[run_id].data
-            assert data.metrics == dict.fromkeys(METRICS, float(seed))
+            assert data.metrics == dict.fromkeys((name for name, _ in METRICS.values()), float(seed))
             assert data.params.items() >= {**NAMES, "seed": str(seed), "algorithm.lr": "0.0003"}.items()
             assert data.tags.items() >= {**NAMES, "git_commit": "0123abc"}.items()
-            file = f"{url}/get-artifact?run_id={run_id}&path=reports/summary.json"
+            file = f"{url}/get-artifact?run_id={run_id}&path=reports/notes.json"
             assert urllib.request.urlopen(file).read() == b'{"seed": 1}'
 
 
