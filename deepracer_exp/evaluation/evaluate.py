@@ -60,7 +60,8 @@ def evaluate(
     uri = config.tracking_uri or (None if isinstance(tracking, TrackingOff) else tracking.uri)
     files = {file: "evaluations"} | ({} if film is None else {film.file: "films"})
     metrics = _metrics(evaluation, trained_on)
-    deliver_evaluation(run.path, uri, Path(config.runs_dir), stored.counters["env_steps"], metrics, files)
+    runs_dir = run.path.resolve().parents[1]
+    deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
     return evaluation
 
 
