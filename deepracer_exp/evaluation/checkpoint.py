@@ -121,7 +121,11 @@ def check(path: Path, *, resumable: bool = False) -> Path:
         what = "leads nowhere" if path.is_symlink() else "is no folder" if path.exists() else "is not there"
         raise BadInput(f"{path}: {what}; a pickle is never loaded")
     path = path.resolve()
-    files = {file.name: file for file in path.rglob("*") if not file.is_dir()}
+    entries = list(path.rglob("*"))
+    links = [entry for entry in entries if entry.is_symlink()]
+    if links:
+        raise BadInput(f"{links[0]}: is a link; the files of a checkpoint lie in its own folder")
+    files = {file.name: file for file in entries if not file.is_dir()}
     foreign = sorted(files.keys() - _STATE - {_MANIFEST, HASHES})
     if foreign:
         raise BadInput(
@@ -142,7 +146,7 @@ def check(path: Path, *, resumable: bool = False) -> Path:
     if _AGENT not in components or not components.keys() <= {_AGENT, _TRAINING}:
         raise BadInput(f"{path}: no checkpoint of ours: holds {', '.join(components) or 'nothing'}")
     for name, record in components.items():
-        folder = path / record["path"]
+        folder = path / record["path"]  # torchrl lets no absolute path and no `..` pass
         there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
         if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
             raise BadInput(f"{path}: no checkpoint of ours: {name} is not {' and '.join(sorted(_STATE))}")

@@ -240,12 +240,29 @@ def test_a_well_hashed_checkpoint_of_another_kind_is_refused(folder):
         {"components": {}},
         {"components": {**manifest["components"], "other": manifest["components"]["agent"]}},
         {"components": {"agent": {**manifest["components"]["agent"], "adapter": "torchrl.dumps"}}},
-        {"components": {"agent": {**manifest["components"]["agent"], "path": "../000020"}}},
         {"format": "foreign"},
     ):
         (path / "manifest.json").write_text(json.dumps(manifest | change))
         write_hashes(path)
         assert "no checkpoint of ours" in refusal(folder, "10")
+
+
+@pytest.mark.parametrize("where", ["absolute", "..", "inside out", "link to a folder", "link to a file"])
+def test_a_checkpoint_whose_files_lie_elsewhere_is_refused_although_its_hashes_fit(folder, where):
+    path, other = folder / "000010", folder / "000020"
+    manifest = json.loads((path / "manifest.json").read_text())
+    part = manifest["components"]["agent"]["path"]
+    if where.startswith("link"):
+        target = path / part if where.endswith("folder") else path / part / "state.tdz"
+        remove(target) if target.is_dir() else target.unlink()
+        target.symlink_to(other / target.relative_to(path))
+    else:
+        elsewhere = {"absolute": str(other / part), "..": f"../000020/{part}"}
+        manifest["components"]["agent"]["path"] = elsewhere.get(where, f"{part}/../../../000020/{part}")
+        (path / "manifest.json").write_text(json.dumps(manifest))
+    write_hashes(path)
+    said = refusal(folder, "10")
+    assert ("is a link; " if where.startswith("link") else "no checkpoint of ours: ") in said
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"format": 1}', b"\xff\xfe"])
