@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from deepracer_exp.evaluation.result import USUAL, Evaluation
-from deepracer_exp.evaluation.standings import figures_of
 
 
 def values_of(evaluation: Evaluation, objectives: Sequence[str], trial_time_s: float) -> list[float]:
-    """Return the values of the objectives on the usual conditions, means over tracks.
+    """Return the values of the objectives, means over tracks; lap time and completion of the usual conditions.
 
     Args:
         evaluation: of the policy.
@@ -16,12 +15,12 @@ def values_of(evaluation: Evaluation, objectives: Sequence[str], trial_time_s: f
         trial_time_s: the longest that a trial may take. A policy without a complete lap is worth more than that, the
             more the less of the lap it drives: samplers need a number for it, too.
     """
-    found = figures_of(evaluation)
-    nothing = without_lap(found.completion, trial_time_s)
+    usual = evaluation.on(USUAL)
+    nothing = without_lap(usual.completion, trial_time_s)
     values = {
-        "race_score": found.race_score_s,
-        "lap_time": evaluation.on(USUAL).mean_lap_time_s,
-        "completion": found.completion,
+        "race_score": evaluation.race_score_s,
+        "lap_time": usual.mean_lap_time_s,
+        "completion": usual.completion,
     }
     return [nothing if values[one] is None else float(values[one] or 0.0) for one in objectives]
 
@@ -37,15 +36,11 @@ def without_lap(completion: float, trial_time_s: float) -> float:
 
 
 def value_on_the_way(row: Mapping[str, Any], objective: str, trial_time_s: float) -> float | None:
-    """Return the value of an evaluation while training; None if the row of metrics.jsonl is of none.
-
-    The row does not tell how many laps failed: their time is taken to be in proportion to what was not driven.
-    """
-    completion, lap_time_s = row.get("eval_completion"), row.get("eval_lap_time_s")
+    """Return the value of an evaluation while training; None if the row of metrics.jsonl is of none."""
+    completion = row.get("eval_completion")
+    value = row.get({"race_score": "eval_race_score_s", "lap_time": "eval_lap_time_s"}.get(objective, ""))
     if completion is None:
         return None
     if objective == "completion":
         return float(completion)
-    if lap_time_s is None:
-        return without_lap(completion, trial_time_s)
-    return float(lap_time_s) * (100 / completion if objective == "race_score" else 1.0)
+    return without_lap(completion, trial_time_s) if value is None else float(value)

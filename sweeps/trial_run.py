@@ -293,7 +293,7 @@ class TrialRun:
 
     def _gone_on(self, run_dir: Path) -> Outcome | None:
         """Go on with a run that was begun; None if there is nothing to go on with."""
-        if not kept_checkpoints(run_dir / "checkpoints"):
+        if not (run_dir / "config.yaml").is_file():
             return None
         if is_held(run_dir):
             # Its process is stopped or slow, and may wake up: it keeps the folder.

@@ -8,11 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from matplotlib.typing import ColorType
 
-from .figures import FAINT, GREEN, INK, MANY
+from .figures import FAINT, INK, MANY
 
 
 @dataclass(frozen=True)
@@ -38,14 +37,13 @@ class Point:
     held_out: Lap | None
 
 
-def checkpoints_figure(title: str, points: Sequence[Point], recommended: str, tolerance: float) -> Figure:
+def checkpoints_figure(title: str, points: Sequence[Point], recommended: str) -> Figure:
     """Draw lap time against the share of complete laps, a colour for each checkpoint.
 
     Args:
         title: name of the run.
         points: its checkpoints, the oldest first.
         recommended: name of the one that gets a ring.
-        tolerance: points of a hundred below the surest checkpoint within which the time decides.
     """
     figure = Figure(figsize=(9.0, 5.2), dpi=150, layout=ConstrainedLayoutEngine(w_pad=0.15, h_pad=0.12))
     axes = figure.add_subplot()
@@ -59,13 +57,9 @@ def checkpoints_figure(title: str, points: Sequence[Point], recommended: str, to
     axes.set_ylabel("complete laps, per cent", color=FAINT)
     axes.set_xlabel("lap time, 25th percentile, seconds  (faster to the right)", color=FAINT)
     axes.xaxis.set_major_locator(MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]))
-    timed = [point for point in points if point.usual.time_s is not None]
-    surest = max((point.usual.complete for point in timed), default=None)
-    if surest is None:
+    if all(point.usual.time_s is None for point in points):
         axes.text(0.5, 0.5, "no complete lap", transform=axes.transAxes, ha="center", color=FAINT)
         axes.set_xticks([])
-    else:
-        axes.axhspan(max(surest - tolerance, -4), surest, color=GREEN, alpha=0.10, linewidth=0)
     for number, point in enumerate(points):
         # Lap times are multiples of the control period, so that points fall on each other: the older one is larger.
         above = sum(later.usual == point.usual for later in points[number + 1 :])
@@ -73,9 +67,6 @@ def checkpoints_figure(title: str, points: Sequence[Point], recommended: str, to
     axes.margins(x=0.12)
     axes.invert_xaxis()
     keys, labels = _legend(points, recommended)
-    if surest is not None:
-        keys.append(Patch(color=GREEN, alpha=0.15, linewidth=0))
-        labels.append(f"within {tolerance:g} points of the surest")
     figure.legend(keys, labels, loc="outside right upper", frameon=False, fontsize=9, labelcolor=INK)
     return figure
 

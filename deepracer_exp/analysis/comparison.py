@@ -6,11 +6,10 @@ from typing import Any
 
 from deepracer_exp.config import stored
 from deepracer_exp.formats.run_files import RunRecord
+from deepracer_exp.formats.run_result import FIGURES, result_of
 
 NOTHING = stored.ABSENT
 _NO_MATTER = ("runs_dir", "debug", "report", "tracking")  # whatever they are, the car drives the same
-LAST = 10
-"""Iterations at the end of a run over which its figures are averaged: single ones wobble."""
 
 
 def differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
@@ -44,20 +43,13 @@ def value_text(value: Any, most: int = 48) -> str:
     return text if len(text) <= most else f"{text[: most - 15]} … {text[-12:]}"
 
 
-def final_mean(record: RunRecord, column: str) -> float | None:
-    """Return the mean of a metric over the run's last iterations; with several tracks the mean of theirs."""
-    rows = record.rows
-    columns = [key for key in rows[-1] if key.startswith(f"{column}/")] or [column]
-    known = [[row[key] for row in rows[-LAST:] if row.get(key) is not None] for key in columns]
-    return sum(sum(values) / len(values) for values in known) / len(known) if all(known) else None
-
-
-def best_lap_s(record: RunRecord) -> float | None:
-    """Return the fastest lap of the training; with several tracks the mean of theirs, None while one has none."""
+def last_value(record: RunRecord, column: str) -> float | None:
+    """Return a metric of the last iteration; of lap times, with several tracks, the mean of theirs if each has one."""
     last = record.rows[-1]
-    times = [value for key, value in last.items() if key.startswith("best_lap_time_s/")]
-    times = times or [last["best_lap_time_s"]]
-    return None if None in times else sum(times) / len(times)
+    known = [value for key, value in last.items() if key.startswith(f"{column}/")]
+    if last.get(column) is not None or not known:
+        return last.get(column)
+    return None if None in known else sum(known) / len(known)
 
 
 Result = tuple[str, Callable[[RunRecord], Any], str, int]
@@ -68,7 +60,15 @@ def _moment(name: str) -> Callable[[RunRecord], Any]:
 
 
 def _last(name: str) -> Callable[[RunRecord], Any]:
-    return lambda record: record.rows[-1].get(name)
+    return lambda record: last_value(record, name)
+
+
+def _best(name: str) -> Callable[[RunRecord], Any]:
+    def of(record: RunRecord) -> Any:
+        result = result_of(record.summary)
+        return getattr(result, name) if result is not None and result.evaluated else None
+
+    return of
 
 
 def _times(factor: float, value: Callable[[RunRecord], Any]) -> Callable[[RunRecord], Any]:
@@ -80,30 +80,31 @@ def _times(factor: float, value: Callable[[RunRecord], Any]) -> Callable[[RunRec
 
 
 RESULTS: tuple[Result, ...] = (
-    ("end", lambda record: record.summary.get("reason") or "goes on, or was killed", "{}", 0),
+    ("end", lambda record: record.summary.get("reason") or "running, or was killed", "{}", 0),
     ("control steps", _last("env_steps"), "{:,.0f}", 0),
     ("minutes", _times(1 / 60, _last("wall_clock_s")), "{:.1f}", 0),
     ("cost", lambda record: record.summary.get("cost"), "{:.2f}", 0),
-    ("laps", _last("laps"), "{:,.0f}", 1),
-    ("completion, %", lambda record: final_mean(record, "completion"), "{:.1f}", 1),
-    ("complete laps, %", _times(100, _last("lap_share")), "{:.0f}", 1),
-    ("best lap, s", best_lap_s, "{:.2f}", -1),
-    ("mean lap, s", lambda record: final_mean(record, "mean_lap_time_s"), "{:.2f}", -1),
-    ("evaluated completion, %", _last("eval_completion"), "{:.1f}", 1),
-    ("held-out completion, %", _last("held_out_completion"), "{:.1f}", 1),
-    ("evaluated lap, s", _last("eval_lap_time_s"), "{:.2f}", -1),
+    ("best checkpoint", _best("iteration"), "{:06d}", 0),
+    *((name, _best(key), form, better) for name, key, form, better in FIGURES),
+    ("laps in training", _last("laps"), "{:,.0f}", 1),
+    ("completion in training, %", _last("completion"), "{:.1f}", 1),
+    ("complete laps in training, %", _times(100, _last("lap_share")), "{:.0f}", 1),
+    ("best lap in training, s", _last("best_lap_time_s"), "{:.2f}", -1),
+    ("mean lap in training, s", _last("mean_lap_time_s"), "{:.2f}", -1),
     ("steps to the first lap", _moment("first_lap"), "{:,.0f}", -1),
     ("steps until reliable", _moment("reliable"), "{:,.0f}", -1),
-    ("mean return", lambda record: final_mean(record, "mean_return"), "{:.1f}", 0),
-    ("entropy, nats", lambda record: final_mean(record, "entropy"), "{:.2f}", 0),
+    ("return", _last("mean_return"), "{:.1f}", 0),
+    ("entropy, nats", _last("entropy"), "{:.2f}", 0),
 )
-"""What is compared: name, value, format, and whether a higher value is better (1), a lower one (-1), or neither."""
+"""What is compared: the best checkpoint as its evaluation found it, and of the training the last iteration, as in its
+view and in summary.json. Of each: name, value, format, and whether a higher value is better (1), a lower one (-1), or
+neither."""
 
 
 def results(records: Sequence[RunRecord]) -> list[tuple[str, list[str], int | None]]:
     """Return what came of the runs: name, a text a run, and the number of the best one if there is one.
 
-    What no run has is left out. Completion, lap times, return and entropy are means over the last iterations.
+    What no run has is left out.
     """
     lines = []
     for name, value, form, better in RESULTS:

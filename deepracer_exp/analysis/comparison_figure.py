@@ -14,7 +14,7 @@ from matplotlib.typing import ColorType
 
 from deepracer_exp.formats.run_files import RunRecord
 
-from .comparison import best_lap_s, final_mean
+from .comparison import last_value
 from .figures import FAINT, INK, MANY
 
 _SMOOTHED = 5  # iterations
@@ -75,10 +75,10 @@ def _overlay(axes: Axes, title: str, records: Sequence[RunRecord], column: str) 
 
 
 def _bars(axes: Axes, records: Mapping[str, RunRecord]) -> None:
-    """Draw each run's best lap as a bar, and the mean of its last iterations as a line."""
-    _style(axes, "Laps, seconds: best (bar), mean at the end (line)")
-    best = [best_lap_s(record) for record in records.values()]
-    means = [final_mean(record, "mean_lap_time_s") for record in records.values()]
+    """Draw the best lap of each training as a bar, and the mean of its last iteration as a line."""
+    _style(axes, "Laps in training, seconds: best (bar), mean of the last iteration (line)")
+    best = [last_value(record, "best_lap_time_s") for record in records.values()]
+    means = [last_value(record, "mean_lap_time_s") for record in records.values()]
     longest = max((time for time in (*best, *means) if time is not None), default=1.0)
     for number, (time, mean) in enumerate(zip(best, means, strict=True)):
         if time is None:

@@ -79,7 +79,7 @@ def family(run: Path, runs_dir: Path) -> Member:
 
 
 def best_members(root: Member) -> dict[int, str]:
-    """Return the best of the family by `id`, with a word for it: of each track and measure, where there are several.
+    """Return the best of the family by `id`, with what it is the best by: of each track and measure.
 
     Where a run was evaluated, those that were not are out.
     """
@@ -90,29 +90,26 @@ def best_members(root: Member) -> dict[int, str]:
         key = (member.course, result.measure)
         if key not in groups or result.rank > groups[key][1].rank:
             groups[key] = (member, result)
-    courses, measures = ({key[at] for key in groups} for at in (0, 1))
+    courses = {course for course, _ in groups}
     words: dict[int, str] = {}
-    for (course, measure), (member, _) in groups.items():
-        word = "best" + f" on {course}" * (len(courses) > 1) + f" by {measure}" * (len(measures) > 1)
+    for (course, _), (member, result) in groups.items():
+        word = "best" + f" on {course}" * (len(courses) > 1) + f" by {result.criterion}"
         words[id(member)] = ", ".join(filter(None, [words.get(id(member)), word]))
     return words
 
 
 def generations(root: Member) -> list[tuple[int, Member, RunResult]]:
-    """Return the member with the fastest lap of each generation on each track; evaluated laps before others."""
-    found: dict[tuple[int, str], tuple[Member, RunResult]] = {}
+    """Return the best member of each generation on each track and measure; evaluated ones before others."""
+    found: dict[tuple[int, str, str], tuple[Member, RunResult]] = {}
+    evaluated = {(one.generation, one.course) for one in root.walk() if one.result and one.result.evaluated}
     for member in root.walk():
-        if member.result is None or member.result.lap_time_s is None:
+        result, place = member.result, (member.generation, member.course)
+        if result is None or (place in evaluated and not result.evaluated):
             continue
-        key = (member.generation, member.course)
-        if key not in found or _lap_order(member.result) < _lap_order(found[key][1]):
-            found[key] = (member, member.result)
+        key = (*place, result.measure)
+        if key not in found or result.rank > found[key][1].rank:
+            found[key] = (member, result)
     return [(key[0], *found[key]) for key in sorted(found)]
-
-
-def _lap_order(result: RunResult) -> tuple[bool, float]:
-    assert result.lap_time_s is not None
-    return not result.evaluated, result.lap_time_s
 
 
 def _parent(lineage: Lineage, places: list[Path]) -> Path:

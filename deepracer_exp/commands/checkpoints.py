@@ -6,10 +6,9 @@ from pathlib import Path
 
 from .stderr_warnings import warnings_on_stderr
 
-_TRIALS = 20
 _PICTURES = (".png", ".svg", ".pdf")
 _EPILOG = """\
-  deepracer-exp checkpoints RUN                             20 trials; one ends where the track is left
+  deepracer-exp checkpoints RUN                             the trials by which the training chose its best one
   deepracer-exp checkpoints RUN evaluation=summit evaluation.trials=40
   deepracer-exp checkpoints RUN evaluation.tracks=[Oval_track,Bowtie_track]
   deepracer-exp checkpoints RUN -o checkpoints.png          also draw speed against stability
@@ -37,7 +36,7 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 def _checkpoints(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_evaluation
-    from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.config.overrides import group_of, override_line
     from deepracer_exp.errors import BadInput
 
     runs = [given for given in args.overrides if "=" not in given]
@@ -53,7 +52,8 @@ def _checkpoints(args: argparse.Namespace) -> int:
     if args.output is not None and Path(args.output).suffix not in _PICTURES:
         raise BadInput(f"--output {args.output}: accepted: {', '.join(_PICTURES)}")
     own = [override_line("run", run) for run in runs]
-    config, _ = compose_evaluation([f"evaluation.trials={_TRIALS}", *overrides, *own])
+    config, _ = compose_evaluation([*overrides, *own])
+    own_trials = not any(group_of(given) == "evaluation" for given in overrides)
     args.debug = config.debug
 
     from rich.console import Console
@@ -64,6 +64,11 @@ def _checkpoints(args: argparse.Namespace) -> int:
     out = Console(width=None if sys.stdout.isatty() else 160, highlight=False, markup=False)
     with warnings_on_stderr():
         show_checkpoints(
-            config, args.output, args.json, out, Console(stderr=True, highlight=False, markup=False)
+            config,
+            own_trials,
+            args.output,
+            args.json,
+            out,
+            Console(stderr=True, highlight=False, markup=False),
         )
     return 0

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from deepracer_exp.analysis.family import Member
-    from deepracer_exp.formats.run_result import RunResult
 
 _MOST_CHANGES = 6
 _EPILOG = """\
@@ -23,7 +22,7 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "lineage",
         help="show a run's family tree",
         description="Show what a run was cloned from and what was cloned from it, what each clone changed and what "
-        "came of it, and the best lap of each generation. Reads the runs' folders alone.",
+        "came of it, and the best of each generation. Reads the runs' folders alone.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -62,7 +61,7 @@ def _lineage(args: argparse.Namespace) -> int:
     courses = len({member.course for _, member, _ in fastest}) > 1
     for generation, member, result in fastest:
         course = [member.course] if courses else []
-        table.add_row(f"generation {generation}", *course, f"best lap {_lap(result)}", member.name)
+        table.add_row(f"generation {generation}", *course, result.words(), member.name)
     with console.capture() as drawn:
         console.print(grow(root, Tree(_label(root, run, best))))
         if fastest:
@@ -101,19 +100,11 @@ def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
 def _came_to(member: "Member") -> list[str]:
     if member.record is None:
         return ["missing: its folder is gone"]
-    status = member.record.summary.get("status", "goes on, or was killed")
+    status = member.record.summary.get("status", "running, or was killed")
     facts = [] if status == "finished" else [str(status)]
     if member.result is not None:
-        if member.result.completion is not None:
-            facts.append(f"completion {member.result.completion:.1f} %")
-        facts.append(f"lap {_lap(member.result)}")
+        facts.append(member.result.words())
     return facts
-
-
-def _lap(result: "RunResult") -> str:
-    if result.lap_time_s is None:
-        return "none"
-    return f"{result.lap_time_s:.2f} s" + " (training)" * (not result.evaluated)
 
 
 def _value(value: object) -> str:

@@ -13,19 +13,25 @@ from deepracer_exp.errors import BadInput
 from .checkpoint import LINKS, kept_checkpoints
 from .evaluator import Evaluator
 from .run import read_run
-from .standings import TOLERANCE, Figures, Recommendation, Standing, recommend, standings
+from .standings import Figures, Recommendation, Standing, recommend, standings
 from .standings_report import legend, notes, table, write_json
 
 logger = logging.getLogger("deepracer_exp")
 
 
 def show_checkpoints(
-    config: EvaluateConfig, picture: str | None, file: str | None, out: Console, told: Console
+    config: EvaluateConfig,
+    own_trials: bool,
+    picture: str | None,
+    file: str | None,
+    out: Console,
+    told: Console,
 ) -> Recommendation:
     """Drive a run's kept checkpoints under a protocol, show how they did and recommend one.
 
     Args:
         config: validated; its checkpoint says nothing.
+        own_trials: drive the trials of the training and not those of `config`.
         picture: file of the picture; None: none is drawn.
         file: JSON file to write; None: none.
         out: for the results.
@@ -43,14 +49,15 @@ def show_checkpoints(
         if link.is_symlink() and not link.exists():
             logger.warning("%s leads nowhere", link)
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, config.evaluation)
+    protocol = run.experiment.evaluation if own_trials else config.evaluation
+    evaluator = Evaluator(run.experiment, protocol)
     told.print(
         f"{run.path.name}: {len(kept)} checkpoint{'s' * (len(kept) > 1)}, {len(evaluator.trials)} trials each",
         soft_wrap=True,
     )
     with told.status("") as status:
         found = list(standings(run, evaluator, lambda name: status.update(f"{name} drives")))
-    chosen = recommend(found)
+    chosen = recommend(found, run.experiment.checkpoints.metric)
     if chosen is None:
         raise BadInput(f"{found[-1].fault}; none in {run.checkpoints} can be used")
     out.print(table(found, chosen, out))
@@ -62,10 +69,10 @@ def show_checkpoints(
     out.print(f"  checkpoint={chosen.name} chooses it in evaluate, export and clone")
     try:
         if file is not None:
-            write_json(Path(file), run.path, config.evaluation, found, chosen)
+            write_json(Path(file), run.path, protocol, found, chosen)
         if picture is not None:
             points = [_point(one, one.figures) for one in found if one.figures is not None]
-            checkpoints_figure(run.path.name, points, chosen.name, 100 * TOLERANCE).savefig(picture)
+            checkpoints_figure(run.path.name, points, chosen.name).savefig(picture)
             out.print(f"\n{picture}: speed against stability", soft_wrap=True)
     except (OSError, ValueError) as error:
         raise BadInput(f"{picture if file is None else file}: cannot be written: {error}") from error

@@ -52,6 +52,11 @@ class Group:
         return float(np.mean([attempt.progress for attempt in self.decided]))
 
     @property
+    def lap_share(self) -> float:
+        """Return the complete laps per lap tried."""
+        return len(self.lap_times_s) / len(self.decided)
+
+    @property
     def mean_lap_time_s(self) -> float | None:
         """Return the mean time of the complete laps, None without one."""
         times = self.lap_times_s

@@ -8,16 +8,12 @@ import numpy as np
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.checkpoint_files import pinned
+from deepracer_exp.formats.run_result import CRITERIA
 
 from .checkpoint import LINKS, check, kept_checkpoints, read_policy
 from .evaluator import Evaluator
-from .result import HELD_OUT, USUAL, Evaluation, Group
+from .result import HELD_OUT, USUAL, Evaluation, Group, Metric, Rank
 from .run import StoredRun
-
-TOLERANCE = 0.05
-"""Share of complete laps that a faster checkpoint may lose to the surest one: one lap in twenty."""
-_SAME_S = 2
-"""Decimals of a lap time beyond which nobody is faster."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +38,9 @@ class Figures:
     lap_time_median_s: float | None
     lap_time_best_s: float | None
     race_score_s: float | None
-    """Seconds per complete lap, failed laps included."""
+    """Seconds per complete lap on all conditions, failed laps included."""
+    rank: Rank
+    """By the run's own criterion, higher is better."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +87,8 @@ def standings(run: StoredRun, evaluator: Evaluator, on_next: Callable[[str], Non
         counters, figures, fault = {}, None, None
         try:
             stored = read_policy(run.experiment, check(path))
-            counters, figures = stored.counters, figures_of(evaluator(stored.networks.policy))
+            evaluation = evaluator(stored.networks.policy)
+            counters, figures = stored.counters, figures_of(evaluation, run.experiment.checkpoints.metric)
         except BadInput as error:
             fault = str(error).removeprefix(f"{path.resolve()}: ")
         yield Standing(
@@ -102,8 +101,13 @@ def standings(run: StoredRun, evaluator: Evaluator, on_next: Callable[[str], Non
         )
 
 
-def figures_of(evaluation: Evaluation) -> Figures:
-    """Sum up an evaluation."""
+def figures_of(evaluation: Evaluation, metric: Metric) -> Figures:
+    """Sum up an evaluation.
+
+    Args:
+        evaluation: of one policy.
+        metric: what it is ranked by.
+    """
     usual = evaluation.on(USUAL)
     held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
     share = usual.statistics()["lap_share"]
@@ -123,57 +127,38 @@ def figures_of(evaluation: Evaluation) -> Figures:
         lap_time_p25_s=times(_percentile(25)),
         lap_time_median_s=times(_percentile(50)),
         lap_time_best_s=times(_percentile(0)),
-        race_score_s=times(lambda group: group.race_score_s),
+        race_score_s=evaluation.race_score_s,
+        rank=evaluation.rank(metric),
     )
 
 
-def recommend(standings: Sequence[Standing]) -> Recommendation | None:
-    """Return the fastest of the checkpoints that arrive about as often as the surest one; None: all are torn.
+def recommend(standings: Sequence[Standing], metric: Metric) -> Recommendation | None:
+    """Return the checkpoint that is the best by the run's own criterion, `Evaluation.rank`; None: all are torn.
 
-    A race is lost off the track: a lap that is not completed costs more than a fast one wins. But single laps of
-    twenty are chance, so that within `TOLERANCE` of the best share the 25th percentile of the lap times decides: it
-    is what a policy drives on a good lap, and unlike the best lap no single stroke of luck.
+    In the trials of the training it is the run's `best`: all that are kept were evaluated in these. Of equals it is
+    the oldest, as there.
+
+    Args:
+        standings: the oldest first.
+        metric: what the run's evaluations are ranked by.
     """
-    driven = {one.name: one.figures for one in standings if one.figures is not None}
+    driven = [(one, one.figures) for one in standings if one.figures is not None]
     if not driven:
         return None
-    timed = {name: found for name, found in driven.items() if found.lap_time_p25_s is not None}
-    if not timed:
-        name = max(reversed(driven), key=lambda name: driven[name].completion)
-        part = f"{driven[name].completion:.0f}%"
-        return Recommendation(
-            name, f"no checkpoint completes a lap; this one drives {part} of it, on average"
-        )
-    surest = max(timed.values(), key=lambda found: found.lap_share)
-    sure = [n for n, found in timed.items() if found.lap_share >= surest.lap_share - TOLERANCE - 1e-9]
-    name = min(reversed(sure), key=lambda name: _order(timed[name]))
-    return Recommendation(name, "; ".join(_reasons(name, timed)))
+    ranked = sorted(driven, key=lambda pair: pair[1].rank, reverse=True)
+    (best, found), *others = ranked
+    why = f"best by {CRITERIA[metric]}: {_words(found)}"
+    if others:
+        why += f"; next is {others[0][0].name}: {_words(others[0][1])}"
+    marked = next((pair for pair in driven if "best" in pair[0].labels), None)
+    if marked is not None and marked[0] is not best:
+        why += f"; `best`, chosen in the trials of the training, is {marked[0].name}: {_words(marked[1])}"
+    return Recommendation(best.name, why)
 
 
-def _reasons(name: str, timed: dict[str, Figures]) -> Iterator[str]:
-    chosen = timed[name]
-    yield f"{_laps(chosen)} complete laps, 25th percentile {_p25_s(chosen):.2f} s"
-    fastest = min(timed, key=lambda other: _order(timed[other]))
-    gain_s = _p25_s(chosen) - _p25_s(timed[fastest])
-    if round(gain_s, _SAME_S) > 0:
-        yield f"{fastest} is {gain_s:.2f} s faster but completes only {_laps(timed[fastest])}"
-    surest = max(timed, key=lambda other: (timed[other].lap_share, -_p25_s(timed[other])))
-    loss_s = _p25_s(timed[surest]) - _p25_s(chosen)
-    if timed[surest].lap_share > chosen.lap_share:
-        yield f"{surest} completes {_laps(timed[surest])} but is {loss_s:.2f} s slower"
-    steadiest = max(timed, key=lambda other: timed[other].held_out_lap_share or 0.0)
-    own, held_out = chosen.held_out_lap_share, timed[steadiest].held_out_lap_share
-    if own is not None and held_out is not None and held_out > own + TOLERANCE + 1e-9:
-        yield f"on held-out conditions {steadiest} completes {held_out:.0%} and this one {own:.0%}"
-
-
-def _order(found: Figures) -> tuple[float, ...]:
-    return round(_p25_s(found), _SAME_S), -found.lap_share, -(found.held_out_completion or 0.0)
-
-
-def _p25_s(found: Figures) -> float:
-    assert found.lap_time_p25_s is not None
-    return found.lap_time_p25_s
+def _words(found: Figures) -> str:
+    score = "no complete lap" if found.race_score_s is None else f"race score {found.race_score_s:.2f} s"
+    return f"{score}, completion {found.completion:.1f} %"
 
 
 def _percentile(percent: int) -> Callable[[Group], float | None]:
@@ -182,7 +167,3 @@ def _percentile(percent: int) -> Callable[[Group], float | None]:
         return float(np.percentile(times, percent)) if len(times) else None
 
     return of
-
-
-def _laps(found: Figures) -> str:
-    return f"{found.lap_share:.0%}"

@@ -16,7 +16,7 @@ from .result import CONFIDENCE
 from .standings import Figures, Recommendation, Standing
 
 _MINOR = ("median", "score s")
-_HELD_OUT = "held out %"
+_HELD_OUT = "held-out done %"
 _LABELS = "kept as"
 _NAMES = ("steps", _LABELS, "laps %", "done %", _HELD_OUT, "p25 s", "median", "best", "score s")
 
@@ -53,10 +53,10 @@ def legend(standings: Sequence[Standing]) -> str:
     return "; ".join(
         [
             f"laps: share of complete laps, in brackets its {CONFIDENCE:.0%} interval",
-            "done: part of the lap driven, mean",
-            *["held out: likewise, on held-out conditions"] * held_out,
+            "done: completion, the part of the lap driven, mean",
+            *["held-out done: the same on held-out conditions"] * held_out,
             "p25: a quarter of the laps are faster",
-            "score: time per complete lap, failed laps included",
+            "score: race score, seconds per complete lap on all conditions, failed laps included",
         ]
     )
 

@@ -24,12 +24,14 @@ class CheckpointStore:
     killed, both names lead to a complete checkpoint.
     """
 
-    def __init__(self, run_dir: Path, keep: int):
+    def __init__(self, run_dir: Path, keep: int, every: int | None = None):
         """Open the folder, make it if there is none, and clear away what a kill left unfinished.
 
         Args:
             run_dir: folder of the run.
             keep: how many of the newest checkpoints stay.
+            every: iterations between two evaluations: only evaluated checkpoints stay, so that all that are there at
+                the end compare; None: there are no evaluations, and any checkpoint stays.
 
         Raises:
             BadInput: it is not known which checkpoints must stay.
@@ -37,7 +39,7 @@ class CheckpointStore:
         """
         self.folder = run_dir / "checkpoints"
         self.folder.mkdir(exist_ok=True)
-        self._keep = keep
+        self._keep, self._every = keep, every or 1
         for path in self.folder.glob(".*"):
             _remove(path)
         pinned(self.folder)
@@ -55,8 +57,8 @@ class CheckpointStore:
         Args:
             agent: networks, optimizer and schedule.
             counters: iteration, env steps and the like, JSON types.
-            training: the rest of what a resumed training needs: tensors, arrays and JSON types; None: nobody can go
-                on from here, and the checkpoint is not `last`.
+            training: the rest of what a resumed training needs: tensors, arrays and JSON types; None: no training
+                can resume from here, and the checkpoint is not `last`.
             best: it is the best so far.
 
         Raises:
@@ -71,18 +73,22 @@ class CheckpointStore:
             self._link("last", name)
         self._prune()
 
+    def mark_best(self, iteration: int) -> None:
+        """Let `best` lead to an iteration's checkpoint; the one before stays, for a run that resumes with it."""
+        self._link("best", checkpoint_name(iteration))
+
     def rewind(self, iteration: int, best: int | None) -> None:
         """Go back to an iteration: `last` is its checkpoint, and what came later goes, unless it must stay.
 
         Args:
-            iteration: it has a checkpoint; 0 without one: nothing stays.
+            iteration: it has a checkpoint.
             best: iteration of the best checkpoint up to there, None if there was none.
         """
         pins = pinned(self.folder)
         for path in self._own():
             if int(path.name) > iteration and path.name not in pins:
                 _remove(path)
-        for label, number in (("last", iteration or None), ("best", best)):
+        for label, number in (("last", iteration), ("best", best)):
             if number is not None and (self.folder / checkpoint_name(number)).is_dir():
                 self._link(label, checkpoint_name(number))
             else:
@@ -116,7 +122,9 @@ class CheckpointStore:
     def _prune(self) -> None:
         own = self._own()
         kept = {str(path.readlink()) for path in self.folder.iterdir() if path.is_symlink()}
-        kept |= {path.name for path in own[-self._keep :]} | pinned(self.folder).keys()
+        # The one of the start is of no use once there is another.
+        evaluated = [path.name for path in own if int(path.name) and int(path.name) % self._every == 0]
+        kept |= {*evaluated[-self._keep :]} | pinned(self.folder).keys()
         for path in own:
             if path.name not in kept:
                 _remove(path)

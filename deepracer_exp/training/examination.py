@@ -1,6 +1,8 @@
 """Evaluations of the policy while it is being trained."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -20,6 +22,8 @@ class Mark:
     """The same on the held-out conditions; None where there are none."""
     eval_lap_time_s: float | None
     """Mean time of the complete laps on the usual conditions, over all tracks."""
+    eval_lap_share: float
+    """Complete laps per lap tried on the usual conditions, 0 to 1."""
     eval_race_score_s: float | None
     """Seconds per complete lap on all conditions, failed laps included; None without a lap on each track."""
 
@@ -28,7 +32,7 @@ class Mark:
         return {name: getattr(self, name) for name in COLUMNS}
 
 
-COLUMNS = ("eval_completion", "held_out_completion", "eval_lap_time_s", "eval_race_score_s")
+COLUMNS = ("eval_completion", "held_out_completion", "eval_lap_share", "eval_lap_time_s", "eval_race_score_s")
 NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(COLUMNS)
 
 
@@ -55,6 +59,10 @@ class Examination:
         """Return whether the policy is to be evaluated after so many updates."""
         return self._every is not None and iteration % self._every == 0
 
+    def without_the_last(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a row of metrics.jsonl as it was before its policy was evaluated only because the run ended there."""
+        return {**row} if self.is_due(row["iteration"]) else {**row, **NOT_EVALUATED}
+
     def __call__(self, policy: torch.nn.Module) -> Mark:
         """Evaluate the policy.
 
@@ -69,6 +77,7 @@ class Examination:
             rank=evaluation.rank(self._metric),
             eval_completion=usual.completion,
             held_out_completion=evaluation.on(HELD_OUT).completion if has_held_out else None,
+            eval_lap_share=usual.lap_share,
             eval_lap_time_s=usual.mean_lap_time_s,
             eval_race_score_s=evaluation.race_score_s,
         )

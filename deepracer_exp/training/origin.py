@@ -11,7 +11,6 @@ from deepracer_exp.config.stored import differences, in_words
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.run_files import read_config
 
 HARMLESS = (
     "budget",
@@ -28,12 +27,14 @@ _MEASURED_BY = "stopping.episodes"
 """Of so many episodes is `lap_share`, in every row of metrics.jsonl."""
 
 
-def origin(run_dir: Path, setup: RaceSetup) -> dict[str, Any]:
-    """Return the configuration of a run and a hash of each of the files it was made from, JSON types."""
-    return {
-        "config": read_config(run_dir),
-        "files": _hashes(setup),
-    }
+def origin(config: Mapping[str, Any], setup: RaceSetup) -> dict[str, Any]:
+    """Return the configuration of a run and a hash of each of the files it was made from, JSON types.
+
+    Args:
+        config: all values, as in config.yaml.
+        setup: its files, read.
+    """
+    return {"config": dict(config), "files": _hashes(setup)}
 
 
 def refuse_changes(

@@ -20,7 +20,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     from deepracer_exp.analysis.figures import LINE_COLUMNS, driven_line, driven_lines, learning_curves
 
     metrics_file = run_dir / "metrics.jsonl"
-    if not metrics_file.is_file():
+    if not metrics_file.is_file() or not metrics_file.stat().st_size:
         return
     trace = read_trace(run_dir / "trace", LINE_COLUMNS)
     if len(courses) == 1:

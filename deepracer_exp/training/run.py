@@ -4,7 +4,7 @@ import ast
 import json
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,12 +18,12 @@ from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.evaluation.checkpoint import intact_checkpoint, kept_checkpoints
-from deepracer_exp.formats.lineage_file import LINEAGE, Lineage
+from deepracer_exp.evaluation.checkpoint import intact_checkpoint
+from deepracer_exp.formats.lineage_file import LINEAGE, Lineage, read_lineage
 from deepracer_exp.formats.run_files import read_config, read_object
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.names import joined, lineage_tags, run_params, run_tags
-from deepracer_exp.tracking.recorder import open_tracker
+from deepracer_exp.tracking.recorder import Tracker, open_tracker
 
 from .alerts import Alerts
 from .budget import Budget, refuse_spent
@@ -75,7 +75,7 @@ def train(
         TakenOver: `watch` said so.
     """
     # From here on, so that Ctrl-C during the start leaves a whole folder, too.
-    with Interruption() as interruption:
+    with Interruption(_printing(console)) as interruption:
         training = _begin(experiment, composition, console, start, watch)
         return _run(training, interruption)
 
@@ -93,8 +93,8 @@ def resume(run_dir: Path, overrides: Sequence[str], console: Console, watch: Wat
         BadInput: the run has come to its end, or is being trained, or cannot go on as it was.
         TakenOver: `watch` said so.
     """
-    with Interruption() as interruption:
-        return _run(_go_on(run_dir, overrides, console, watch), interruption)
+    with Interruption(_printing(console)) as interruption:
+        return _run(_resumed(run_dir, overrides, console, watch), interruption)
 
 
 def read_files(experiment: Experiment) -> RaceSetup:
@@ -127,25 +127,41 @@ def _begin(
         label += f"-clone{lineage.generation}"
     folder = RunFolder.create(experiment.runs_dir, experiment.name, label)
     try:
-        commit = folder.describe(composition, setup.reward, experiment.seed, names)
-        if lineage is not None:
-            folder.write(LINEAGE, json.dumps(asdict(lineage), indent=2) + "\n")
-        training = Training(experiment, setup, folder, names, tracker, console, watch)
+        training = Training(experiment, setup, folder, composition.mapping, names, tracker, console, watch)
+        if start is not None:
+            training.networks.load_state_dict(start[0].state_dict())
+            folder.write(LINEAGE, json.dumps(asdict(start[1]), indent=2) + "\n")
         if watch is not None:
             watch.begins(folder.path)
-    except (BadInput, TakenOver):
+        training.save_start()
+        commit = folder.describe(composition, setup.reward, experiment.seed, names)
+    except (OSError, RunFailed) as error:
+        folder.remove()
+        what = (
+            f"cannot write {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+        )
+        raise BadInput(f"runs_dir={experiment.runs_dir}: {what}; give a folder with room") from error
+    except BaseException:
         folder.remove()
         raise
-    except OSError as error:
-        folder.remove()
-        raise BadInput(
-            f"runs_dir={experiment.runs_dir}: cannot write {error.filename}: {error.strerror}; give a folder with "
-            "room"
-        ) from error
-    if start is not None:
-        training.networks.load_state_dict(start[0].state_dict())
     for note in composition.notes:
         logger.info(note)
+    _track(tracker, folder, experiment, composition, names, setup, commit, watch)
+    return training
+
+
+def _track(
+    tracker: Tracker,
+    folder: RunFolder,
+    experiment: Experiment,
+    composition: Composition,
+    names: Mapping[str, str],
+    setup: RaceSetup,
+    commit: str | None,
+    watch: Watch | None,
+) -> None:
+    """Begin to record a run that no tracker has heard of."""
+    lineage = read_lineage(folder.path)
     tags = run_tags(names, commit, setup.reward.sha256, folder.path.resolve())
     if lineage is not None:
         tags |= lineage_tags(lineage)
@@ -161,38 +177,38 @@ def _begin(
         tags,
         identity=folder.path / tracking_file.NAME,
     )
-    return training
 
 
-def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Watch | None) -> Training:
+def _resumed(run_dir: Path, overrides: Sequence[str], console: Console, watch: Watch | None) -> Training:
     stored = read_config(run_dir)
-    names = read_object(run_dir / "provenance.json").get("names", {})
+    provenance = read_object(run_dir / "provenance.json")
+    names = provenance.get("names", {})
     composition = with_overrides(stored, names, overrides)
     # The folder may have been moved with the one it lies in.
     composition.mapping["runs_dir"] = str(run_dir.parent.parent)
     experiment = validate(composition.mapping)
     _refuse_ended(run_dir, experiment, "stopping" in map(group_of, overrides))
     setup = read_files(experiment)
-    kept = kept_checkpoints(run_dir / "checkpoints")
-    # Killed before its first checkpoint, it begins anew; with checkpoints of which none is whole, never.
-    checkpoint = intact_checkpoint(run_dir / "checkpoints", "last", resumable=True) if kept else None
-    state = None if checkpoint is None else read_training(checkpoint)
-    if state is not None:
-        refuse_changes(run_dir, state, composition.mapping, setup)
+    checkpoint = intact_checkpoint(run_dir / "checkpoints", "last", resumable=True)
+    state = read_training(checkpoint)
+    refuse_changes(run_dir, state, composition.mapping, setup)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     folder = RunFolder(run_dir)
-    iteration = 0 if state is None else state["iteration"]
+    iteration = state["iteration"]
     try:
-        training = Training(experiment, setup, folder, names, tracker, console, watch)
-        rows = [row for row in folder.metrics() if row["iteration"] <= iteration]
+        training = Training(experiment, setup, folder, stored, names, tracker, console, watch)
+        rows = training.rows_until(iteration)
         if len(rows) != iteration:
             raise BadInput(
                 f"{run_dir / 'metrics.jsonl'}: has {len(rows)} of the {iteration} rows up to the checkpoint; restore "
-                "the file, or go on from the checkpoint with `deepracer-exp clone`"
+                "the file, or train on from the checkpoint with `deepracer-exp clone`"
             )
-        if checkpoint is not None and state is not None:
-            training.go_on_from(checkpoint, state, rows)
-        tracker.reopen(folder.path / tracking_file.NAME)
+        training.resume_from(checkpoint, state, rows)
+        if (folder.path / tracking_file.NAME).exists():
+            tracker.reopen(folder.path / tracking_file.NAME)
+        else:  # killed before it was recorded, or trained with tracking=off
+            commit = provenance.get("git_commit")
+            _track(tracker, folder, experiment, composition, names, setup, commit, watch)
     except BadInput:
         folder.release()
         raise
@@ -200,13 +216,20 @@ def _go_on(run_dir: Path, overrides: Sequence[str], console: Console, watch: Wat
     if read_object(run_dir / "summary.json").get("stopping"):
         for tag, value in UNDECIDED.items():
             tracker.set_tag(tag, value)
-    folder.rewind(iteration)
-    training.checkpoints.rewind(iteration, None if state is None else (state["best"] or {}).get("iteration"))
+    folder.rewind(rows)
+    training.checkpoints.rewind(iteration, (state["best"] or {}).get("iteration"))
     folder.write("config.yaml", composition.yaml())
-    logger.info("goes on after iteration %d", iteration)
+    where = f"resumes after iteration {iteration}" if iteration else "had no checkpoint yet: begins again"
+    logger.info(where)
+    _printing(console)(f"{run_dir.name}: {where}")
     for why in _not_the_same(experiment, setup):
         logger.warning("the result will not be that of an uninterrupted run: %s", why)
     return training
+
+
+def _printing(console: Console) -> Callable[[str], None]:
+    """Return what prints a line as it is, above the view of the progress where that is shown."""
+    return lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _run(training: Training, interruption: Interruption) -> Outcome:

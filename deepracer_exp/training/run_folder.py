@@ -9,7 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TextIO
@@ -68,13 +68,14 @@ class RunFolder:
     ) -> str | None:
         """Write the configuration and where code and reward come from; return the git commit if there is one.
 
+        config.yaml makes a folder a run, and is written last: a run that was killed at any moment can be resumed.
+
         Args:
             composition: of the experiment.
             reward: its reward function.
             seed: of the run.
             names: what a racer calls its choices.
         """
-        self.write("config.yaml", composition.yaml())
         overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
         self.write("overrides.yaml", overrides or "[]\n")
         self.write("reward_function.py", source_with_constants(reward))
@@ -93,6 +94,7 @@ class RunFolder:
             "command": sys.argv[1:],
         }
         self.write("provenance.json", json.dumps(provenance, indent=2) + "\n")
+        self.write("config.yaml", composition.yaml())
         return commit
 
     def append_metrics(self, row: dict[str, Any]) -> None:
@@ -104,15 +106,18 @@ class RunFolder:
         """Return the lines of metrics.jsonl."""
         return read_metrics(self._metrics) if self._metrics.exists() else []
 
-    def rewind(self, iteration: int) -> None:
-        """Go back to an iteration: what was written later goes."""
-        rows = [row for row in self.metrics() if row["iteration"] <= iteration]
+    def write_metrics(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write metrics.jsonl again, a line a row."""
         self.write("metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+
+    def rewind(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Go back to the last of these rows of metrics.jsonl: what was written later goes."""
+        self.write_metrics(rows)
         for name in ("summary.json", "report.html", "best_lap.png", "learning.png"):
             (self.path / name).unlink(missing_ok=True)
         for file in (self.path / "trace").glob("*"):
             number = file.name.partition("-")[0]
-            if not number.isdigit() or int(number) > iteration:
+            if not number.isdigit() or int(number) > len(rows):
                 file.unlink()
         shutil.rmtree(self.path / FAULTS_DIR, ignore_errors=True)
 

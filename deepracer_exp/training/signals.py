@@ -1,13 +1,20 @@
 """Ctrl-C and SIGTERM, heard at the end of an iteration."""
 
 import signal
+from collections.abc import Callable
 from types import FrameType, TracebackType
 
 
 class Interruption:
-    """Notes a request to end; the second Ctrl-C ends at once."""
+    """Notes a request to end and answers it; the second Ctrl-C ends at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, answer: Callable[[str], None] | None = None) -> None:
+        """Hear nothing yet.
+
+        Args:
+            answer: called with a line when the first signal comes; None: nothing is shown.
+        """
+        self._answer = answer
         self.signum: int | None = None
         self._before: dict[int, object] = {}
 
@@ -32,3 +39,7 @@ class Interruption:
         if self.signum is not None:
             raise KeyboardInterrupt
         self.signum = signum
+        if self._answer is not None:
+            self._answer(
+                "stopping: this iteration is finished and its policy evaluated; Ctrl-C again ends at once"
+            )

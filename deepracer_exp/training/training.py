@@ -69,6 +69,7 @@ class Training:
         experiment: Experiment,
         setup: RaceSetup,
         folder: RunFolder,
+        config: Mapping[str, Any],
         names: Mapping[str, str],
         tracker: Tracker,
         console: Console,
@@ -80,6 +81,7 @@ class Training:
             experiment: what is trained.
             setup: its files, read.
             folder: where everything is written.
+            config: all values, as in config.yaml.
             names: what a racer calls the choices.
             tracker: has begun.
             console: for the view of the progress.
@@ -92,7 +94,8 @@ class Training:
         self.experiment, self.setup, self.folder = experiment, setup, folder
         self._names, self._tracker, self._watch = names, tracker, watch
         self._beaten: str | None = None
-        self.checkpoints = CheckpointStore(folder.path, experiment.checkpoints.keep)
+        kept = experiment.checkpoints
+        self.checkpoints = CheckpointStore(folder.path, kept.keep, kept.every)
         self._alerts = Alerts(experiment.budget)
         self._budget = Budget(experiment.budget, folder.path)
         self._examination = Examination(experiment)
@@ -103,6 +106,7 @@ class Training:
         self._results = Results(self._tracks, cars, experiment.car.control_period_s, experiment.stopping)
         self._ranking = Ranking([course.tracks[0].length_m for course in setup.courses])
         self._trace = TraceWriter(folder.path / "trace")
+        self._console = console
         self._display = ProgressDisplay(
             console, run_header(folder, setup, names, self._results, self._budget)
         )
@@ -116,7 +120,7 @@ class Training:
         self.agent = PPO(
             self.networks, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed
         )
-        self._origin = origin(folder.path, setup)
+        self._origin = origin(config, setup)
         self._cars: dict[str, Any] | None = None
         self._env_steps = 0
         self._iteration = 0
@@ -131,10 +135,15 @@ class Training:
         self._log_file = log_to(folder.path / "log.txt")
 
     def drive_and_learn(self, interruption: Interruption) -> str:
-        """Collect, learn and record until there is a reason to stop; return it."""
-        over = self._reason_to_stop(interruption) if self._iteration else None
-        if over is not None:  # killed while it was ending
-            return over
+        """Collect, learn and record until there is a reason to stop, evaluate the last policy, return the reason."""
+        # There is one already if the run was killed while it was ending, or Ctrl-C came while it began.
+        reason = self._reason_to_stop(interruption) or self._trained(interruption)
+        # A trial that is interrupted is made again from its checkpoint, and its worker is waited for.
+        if interruption.signum is None or self._watch is None:
+            self._evaluate_last()
+        return reason
+
+    def _trained(self, interruption: Interruption) -> str:
         experiment = self.experiment
         frames = frames_per_batch(experiment)
         # The view first: workers take a second or two to start.
@@ -151,7 +160,20 @@ class Training:
         ):
             return self._loop(collection, interruption)
 
-    def go_on_from(
+    def save_start(self) -> None:
+        """Save the policy as it is before the first iteration: a run that is killed before its second resumes there.
+
+        Raises:
+            RunFailed: the disk takes no more.
+        """
+        self.checkpoints.save(self.agent, self._counters(), self._state(None))
+
+    def rows_until(self, iteration: int) -> list[dict[str, Any]]:
+        """Return the rows of metrics.jsonl up to an iteration, as an uninterrupted run has them."""
+        rows = [row for row in self.folder.metrics() if row["iteration"] <= iteration]
+        return [self._examination.without_the_last(row) for row in rows]
+
+    def resume_from(
         self, checkpoint: Path, state: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
     ) -> None:
         """Take over what a checkpoint holds of a run that ended too early.
@@ -159,7 +181,7 @@ class Training:
         Args:
             checkpoint: its folder.
             state: what `read_training` found in it.
-            rows: of metrics.jsonl, up to the checkpoint's iteration.
+            rows: those up to the checkpoint's iteration.
 
         Raises:
             BadInput: it does not fit the experiment.
@@ -230,29 +252,43 @@ class Training:
             update_s = time.monotonic() - began
             self._iteration += 1
             self._row = self._measured(finished, update, batch.numel(), collect_s, update_s)
-            mark = self._evaluated() if self._examination.is_due(self._iteration) else None
+            due = self._examination.is_due(self._iteration)
+            mark = self._evaluated() if due else None
             if self._watch is not None:
                 self._beaten = self._watch.sees(self._row)
             self._decision = self._stopping.observe(self._row)
             reason = self._reason_to_stop(interruption)
-            if reason is not None and interruption.signum is None and self._best.policy is None:
-                mark = self._evaluated()
             self._record(rows)
             better = self._best.beaten_by(mark, self._counters())
-            if reason is not None or better or self._is_time_to_save():
+            if reason is not None or due or self._is_time_to_save():
                 self._save(collection, better)
             self._send_alerts()
             if reason is not None:
                 return reason
         raise RunFailed("the collector ended without a reason")
 
+    def _evaluate_last(self) -> None:
+        """Evaluate the policy of the last iteration, if that was not due: the best one may be that.
+
+        It stands in metrics.jsonl and in the summary and in no checkpoint, so that a run which resumes here is the
+        one that was never interrupted.
+        """
+        if not self._iteration or not self._examination.is_held or self._examination.is_due(self._iteration):
+            return
+        self._console.print(f"evaluating the policy of iteration {self._iteration}", highlight=False)
+        mark = self._evaluated()
+        self.folder.write_metrics([*self.folder.metrics()[:-1], self._row])
+        self._tracker.log(mark.columns(), step=self._env_steps)
+        if self._best.beaten_by(mark, self._counters()):
+            self.checkpoints.mark_best(self._iteration)
+
     def _save(self, collection: Batches, best: bool) -> None:
-        self.checkpoints.save(self.agent, self._counters(), self._state(collection), best=best)
+        self.checkpoints.save(self.agent, self._counters(), self._state(collection.state_dict()), best=best)
         self._tracker.safe_until(self._env_steps)
         self._saved_at = time.monotonic()
 
-    def _state(self, collection: Batches) -> dict[str, Any]:
-        """Return what `go_on_from` needs beside the agent."""
+    def _state(self, cars: dict[str, Any] | None) -> dict[str, Any]:
+        """Return what `resume_from` needs beside the agent; `cars` are None before the first iteration."""
         return {
             "iteration": self._iteration,
             "env_steps": self._env_steps,
@@ -262,7 +298,7 @@ class Training:
             "best": self._best.policy,
             "first_lap": self._first_lap,
             "reliable": self._reliable,
-            "cars": collection.state_dict(),
+            "cars": cars,
             **self._origin,
         }
 
@@ -341,10 +377,8 @@ class Training:
             **self._results.metrics_of_tracks(finished),
         }
 
-    def _evaluated(self) -> Mark | None:
-        """Evaluate the policy, unless nobody wants it, and put what came out into the row."""
-        if not self._examination.is_held:
-            return None
+    def _evaluated(self) -> Mark:
+        """Evaluate the policy and put what came out into the row."""
         mark = self._examination(self.networks.policy)
         self._row |= mark.columns()
         return mark

@@ -98,10 +98,12 @@ def test_best_is_what_was_said_to_be_and_last_what_a_training_can_go_on_from(sto
         read_training(store.folder / "best")
 
 
-@pytest.mark.parametrize(("keep", "kept"), [(1, [2, 4]), (2, [2, 3, 4])])
-def test_the_best_and_the_newest_are_kept(tmp_path, keep, kept):
-    store = CheckpointStore(tmp_path, keep)
-    for iteration in range(5):
+@pytest.mark.parametrize(
+    ("keep", "every", "kept"), [(1, None, [2, 5]), (2, None, [2, 4, 5]), (1, 2, [2, 4, 5]), (9, 3, [2, 3, 5])]
+)
+def test_the_best_the_last_and_the_newest_that_were_evaluated_are_kept(tmp_path, keep, every, kept):
+    store = CheckpointStore(tmp_path, keep, every)
+    for iteration in range(6):
         store.save(make_agent(iteration), {"iteration": iteration}, TRAINING, best=iteration == 2)
     assert names(store) == [*(f"{number:06d}" for number in kept), "best", "last"]
 
@@ -113,7 +115,7 @@ def test_a_pinned_checkpoint_is_kept(store):
         store.save(make_agent(iteration), {"iteration": iteration}, TRAINING)
     assert names(store) == ["000000", "000002", "last", "pinned.json"]
     store.rewind(0, None)
-    assert names(store) == ["000000", "pinned.json"]
+    assert names(store) == ["000000", "last", "pinned.json"]
 
 
 def test_a_store_that_does_not_know_what_must_stay_removes_nothing(store, tmp_path):
