@@ -8,11 +8,18 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import binomtest, norm
 
+from .log_view import LogView
+
 LEAST_LAPS = 3
 """Complete laps of an iteration below which its 25th percentile says nothing."""
 DENSE = 0.5
 """Share of complete laps an iteration must have, of the highest share that any iteration has."""
 MOST = 3
+
+
+def candidates_of(view: LogView) -> pd.DataFrame:
+    """Return the candidates of a log; none of a run of ours, which keeps few checkpoints and has evaluated them."""
+    return candidates(view.iterations if view.recording.best is None else view.iterations.iloc[:0])
 
 
 def candidates(iterations: pd.DataFrame) -> pd.DataFrame:

@@ -8,7 +8,7 @@ import pandas as pd
 from scipy.stats import norm
 
 from . import sectors
-from .candidates import candidates
+from .candidates import candidates_of
 from .chart import (
     BLUE,
     FAINT,
@@ -108,7 +108,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     shown = laps.iloc[thinned(len(laps), 2500)]
     x, y = (table[name].to_numpy(np.float64) for name in ("iteration", "lap_time_p25_s"))
     share = 100 * table["lap_share"].to_numpy(np.float64)
-    best = candidates(view.iterations)
+    best = candidates_of(view)
     layers: list[Layer] = [
         Points(
             x=shown["iteration"].to_numpy(np.float64),

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.formats.run_result import RunResult
+
 from . import candidates as chosen
 from . import learning, off_track
 from .candidates import candidates, lap_chance
@@ -136,7 +138,19 @@ def _converged(view: LogView) -> Finding:
     )
 
 
+def _race_with(best: RunResult) -> Finding:
+    """Name the best checkpoint of a run of ours, as its summary does."""
+    sentence = "No checkpoint was evaluated: `deepracer-exp checkpoints RUN` lets those that were kept race."
+    values: dict[str, float | int | str] = {}
+    if best.iteration is not None:
+        sentence = f"Race with checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
+        values = {"iteration": best.iteration, "by": best.criterion}
+    return Finding(rule="submit", sentence=sentence, figure="training_progress", values=values)
+
+
 def _submit(view: LogView) -> Finding:
+    if view.recording.best is not None:
+        return _race_with(view.recording.best)
     best = candidates(view.iterations)
     thresholds = {"least_laps": chosen.LEAST_LAPS, "dense": chosen.DENSE}
     if not len(best):

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from .candidates import candidates
+from .candidates import candidates_of
 from .log_view import LogView
 
 NONE = "\N{EN DASH}"
@@ -41,7 +41,7 @@ def iteration_rows(view: LogView) -> Table:
 
 def candidate_rows(view: LogView) -> Table:
     """Return the iterations whose policy is worth submitting, the best first."""
-    return _table(candidates(view.iterations), _CANDIDATE_COLUMNS)
+    return _table(candidates_of(view), _CANDIDATE_COLUMNS)
 
 
 def best_laps(view: LogView) -> Table:

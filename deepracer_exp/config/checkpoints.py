@@ -20,4 +20,4 @@ class CheckpointsConfig:
     metric: Literal["race_score", "lap_time", "progress"]
     """What the evaluations are ranked by."""
     keep: Newest
-    """How many of the newest checkpoints stay beside the best."""
+    """How many of the newest evaluated checkpoints stay beside the best and the last."""

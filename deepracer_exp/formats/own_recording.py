@@ -1,6 +1,7 @@
 """A run of ours as a recording, in the schema of everybody's."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from .recording import (
     Recording,
 )
 from .run_files import read_config
+from .run_result import IN_TRAINING, RunResult, read_result
 from .trace import EPISODE_STATUS
 
 LEARNING = {
@@ -63,6 +65,7 @@ def read_own_recording(folder: Path) -> Recording:
     steps = _steps(folder, problems, files)
     config = _config(folder, problems, files)
     updates, evaluated = _metrics(folder, problems, files)
+    best = _best(folder, problems)
     return Recording(
         name=folder.resolve().name,
         steps=steps,
@@ -75,6 +78,7 @@ def read_own_recording(folder: Path) -> Recording:
         track=_track(config),
         problems=tuple(problems),
         files=tuple(files),
+        best=best,
     )
 
 
@@ -203,6 +207,17 @@ def _metrics(
         if np.isfinite(tried["completion"]):
             evaluated.append({"iteration": iteration, **tried})
     return _table(UPDATE_COLUMNS, updates), _table(EVALUATED_COLUMNS, evaluated)
+
+
+def _best(folder: Path, problems: list[LogProblem]) -> RunResult:
+    """Return what the run's summary says of its best checkpoint."""
+    try:
+        found = read_result(folder)
+    except BadInput as error:
+        file = folder / "summary.json"
+        problems.append(LogProblem(str(file), None, str(error).removeprefix(f"{file}: ")))
+        found = None
+    return found or RunResult(measure=IN_TRAINING, rank=(0.0, -math.inf), completion=None, lap_time_s=None)
 
 
 def _table(columns: Mapping[str, tuple[str, str]], rows: list[dict[str, Any]]) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from .model_metadata import ModelMetadata
+from .run_result import RunResult
 
 TRAINING = "training"
 """The stream, and the kind of job, of what a training drove."""
@@ -145,5 +146,7 @@ class Recording:
     problems: tuple[LogProblem, ...]
     files: tuple[Path, ...]
     """What was read; members of an archive stand below its path."""
+    best: RunResult | None = None
+    """Of a run of ours: its best checkpoint. None: a log of the service, whose iterations each have a checkpoint."""
     rounds: tuple[Round, ...] = ()
     """The trainings in the order of `steps`; empty where there is only one."""

@@ -24,6 +24,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "race/held_out_completion",
         "the same on conditions that were not trained on",
     ),
+    "eval_lap_share": ("race/lap_share", "share of the evaluation's laps that were completed (0 to 1)"),
     "completion": ("train/completion", "per cent of the lap driven per finished episode, mean"),
     "lap_share": (
         "train/lap_share",

@@ -237,7 +237,7 @@ def _run(training: Training, interruption: Interruption) -> Outcome:
         reason = training.drive_and_learn(interruption)
         code = interruption.exit_code
         return training.close(training.verdict if code is None else "interrupted", reason, code or 0)
-    except RunFailed as error:
+    except (RunFailed, BadInput) as error:  # BadInput: what it wrote itself is gone or was changed
         return training.fail(str(error), error)
     except OSError as error:
         return training.fail(f"{error.filename or training.folder.path}: {error.strerror or error}", error)

@@ -140,7 +140,7 @@ class Training:
         reason = self._reason_to_stop(interruption) or self._trained(interruption)
         # A trial that is interrupted is made again from its checkpoint, and its worker is waited for.
         if interruption.signum is None or self._watch is None:
-            self._evaluate_last()
+            self._evaluate_last(interruption.signum is None)
         return reason
 
     def _trained(self, interruption: Interruption) -> str:
@@ -267,18 +267,19 @@ class Training:
                 return reason
         raise RunFailed("the collector ended without a reason")
 
-    def _evaluate_last(self) -> None:
+    def _evaluate_last(self, is_over: bool) -> None:
         """Evaluate the policy of the last iteration, if that was not due: the best one may be that.
 
         It stands in metrics.jsonl and in the summary and in no checkpoint, so that a run which resumes here is the
-        one that was never interrupted.
+        one that was never interrupted. MLflow, which forgets nothing, has it only of a run that is over.
         """
         if not self._iteration or not self._examination.is_held or self._examination.is_due(self._iteration):
             return
         self._console.print(f"evaluating the policy of iteration {self._iteration}", highlight=False)
         mark = self._evaluated()
         self.folder.write_metrics([*self.folder.metrics()[:-1], self._row])
-        self._tracker.log(mark.columns(), step=self._env_steps)
+        if is_over:
+            self._tracker.log(mark.columns(), step=self._env_steps)
         if self._best.beaten_by(mark, self._counters()):
             self.checkpoints.mark_best(self._iteration)
 

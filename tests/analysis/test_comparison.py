@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -7,9 +8,8 @@ from matplotlib.image import imread
 
 from deepracer_exp.analysis.comparison import (
     NOTHING,
-    best_lap_s,
     differences,
-    final_mean,
+    last_value,
     results,
     value_text,
 )
@@ -72,23 +72,45 @@ def test_a_reward_function_that_was_edited_is_a_difference_though_its_file_has_t
     assert found == {"reward_function.py": ["sha256 11111111", "sha256 22222222"]}
 
 
-def test_figures_are_means_over_the_last_iterations(record):
-    assert final_mean(record("a"), "completion") == pytest.approx(5.0 * 15.5)
-    assert final_mean(record("a", lap_s=None), "mean_lap_time_s") is None
+def test_figures_of_the_training_are_those_of_its_last_iteration_as_in_the_view(record):
+    assert last_value(record("a"), "completion") == 100.0
+    assert last_value(record("a", lap_s=None), "mean_lap_time_s") is None
+
+
+def test_figures_of_the_best_checkpoint_are_those_of_the_summary(record):
+    best = {"iteration": 10, "metric": "race_score", "rank": [1.0, -8.5], "eval_completion": 96.25}
+    best |= {
+        "eval_lap_time_s": 8.25,
+        "eval_race_score_s": 8.5,
+        "held_out_completion": 81.0,
+        "eval_lap_share": 0.875,
+    }
+    evaluated = dataclasses.replace(record("a"), summary={"best": best, "reason": "done"})
+    table = {name: texts for name, texts, _ in results([evaluated, record("b")])}
+    assert {name: texts[0] for name, texts in table.items() if texts[1] == NOTHING} == {
+        "best checkpoint": "000010",
+        "race score, s": "8.50",
+        "complete laps, %": "88",
+        "completion, %": "96.2",
+        "held-out completion, %": "81.0",
+        "mean lap, s": "8.25",
+    }
 
 
 def test_lap_times_of_several_tracks_count_only_where_each_has_one(record):
     both = record("a", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 12.0})
-    assert best_lap_s(both) == 10.0
-    assert best_lap_s(record("b", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": None})) is None
+    both.rows[-1]["best_lap_time_s"] = None
+    assert last_value(both, "best_lap_time_s") == 10.0
+    both.rows[-1]["best_lap_time_s/B"] = None
+    assert last_value(both, "best_lap_time_s") is None
 
 
 def test_the_fastest_is_the_best_and_what_no_run_has_is_left_out(record):
     table = {name: (texts, best) for name, texts, best in results([record("a"), record("b", lap_s=9.0)])}
-    assert table["best lap, s"] == (["10.00", "9.00"], 1)
-    assert table["laps"] == (["20", "20"], None)
+    assert table["best lap in training, s"] == (["10.00", "9.00"], 1)
+    assert table["laps in training"] == (["20", "20"], None)
     assert table["control steps"][1] is None
-    assert "evaluated lap, s" not in table
+    assert "mean lap, s" not in table
     assert "cost" not in table
 
 
@@ -133,7 +155,7 @@ def test_the_command_shows_differences_and_results_and_writes_the_picture(record
     words = [line.split() for line in ended.stdout.splitlines()]
     assert ["A", "runs/e/first"] in words
     assert ["seed", "1", "2"] in words
-    assert ["best", "lap,", "s", "10.00", "9.25"] in words
+    assert ["best", "lap", "in", "training,", "s", "10.00", "9.25"] in words
     assert (tmp_path / "out.png").stat().st_size > 10_000
 
 

@@ -79,22 +79,14 @@ def test_with_all_checkpoints_torn_there_is_a_refusal(run_dir, call):
     assert ended.stdout == ""
 
 
-def test_twenty_trials_are_driven_unless_told_otherwise(run_dir, call, tmp_path):
+def test_the_trials_of_the_training_are_driven_unless_told_otherwise(run_dir, call, tmp_path):
     for name in ("000007", "000008"):
         shutil.rmtree(run_dir / "checkpoints" / name)
-    ended = call(
-        "checkpoints",
-        run_dir.name,
-        "evaluation.time_s=1",
-        "evaluation.held_out=null",
-        "--json",
-        "figures.json",
-    )
+    ended = call("checkpoints", run_dir.name, "--json", "figures.json")
     assert ended.code == 0, ended.stderr
-    assert "1 checkpoints, 20 trials each" not in ended.stderr
-    assert "1 checkpoint, 20 trials each" in ended.stderr
+    assert "1 checkpoint, 16 trials each" in ended.stderr
     assert "best leads nowhere" in ended.stderr
-    assert json.loads((tmp_path / "figures.json").read_text())["evaluation"]["trials"] == 20
+    assert json.loads((tmp_path / "figures.json").read_text())["evaluation"]["trials"] == 8
 
 
 def test_evaluate_says_loudly_that_another_checkpoint_drives(run_dir, call):

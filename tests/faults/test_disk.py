@@ -5,6 +5,8 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -97,3 +99,22 @@ def test_paths_of_any_name_work(train_here, tmp_path, name):
     (summary,) = (folder / "runs").glob("*/*/summary.json")
     assert json.loads(summary.read_text())["status"] == "finished"
     assert (summary.parent / "best_lap.png").is_file()
+
+
+@pytest.mark.parametrize("tracking", ["off", "mlflow"])
+def test_a_folder_that_vanishes_during_the_training_ends_the_run_with_one_line(
+    train_here, tmp_path, tracking
+):
+    def vanish() -> None:
+        give_up_at = time.monotonic() + 120
+        while time.monotonic() < give_up_at:
+            for metrics in tmp_path.glob("runs/*/*/metrics.jsonl"):
+                metrics.parent.rename(tmp_path / "gone")
+                return
+            time.sleep(0.01)
+
+    threading.Thread(target=vanish).start()
+    ended = train_here("budget.env_steps=100000000", f"tracking={tracking}")
+    assert ended.code == 3, ended.stderr
+    assert ended.complaint.startswith("deepracer-exp: run failed: runs/tiny/")
+    assert "No such file or directory" in ended.complaint

@@ -143,7 +143,7 @@ class Season:
         (run / "checkpoints" / "best").symlink_to("000020")
         (run / "checkpoints" / "last").symlink_to("000030")
         (run / "trace").mkdir()
-        (run / "trace" / "00000-iteration.parquet").write_bytes(bytes(1000))
+        (run / "trace" / "00001-iteration.parquet").write_bytes(bytes(1000))
         (run / "config.yaml").write_text(yaml.safe_dump(values | config))
         (run / "overrides.yaml").write_text("[]\n")
         (run / "provenance.json").write_text("{}")

@@ -35,28 +35,28 @@ def test_any_member_shows_the_whole_family_and_no_other(clan):
         assert list(found) == ["1-root", "2-child", "4-grandchild", "3-sibling"]
         assert [member.generation for member in found.values()] == [0, 1, 2, 1]
         assert found["4-grandchild"].changes == {"algorithm.lr": (0.0001, 1e-5)}
-        assert best_members(root) == {id(found["2-child"]): "best"}
+        assert best_members(root) == {id(found["2-child"]): "best by mean lap"}
     (alone,) = family(clan.runs_dir / "season" / "9-stranger", clan.runs_dir).walk()
     assert alone.name == "9-stranger"
 
 
-def test_the_best_lap_of_each_generation_stands_at_the_end(clan, call):
+def test_the_best_of_each_generation_stands_at_the_end(clan, call):
     ended = call("lineage", "3-sib")
     assert ended.code == 0, ended.stderr
     last = [" ".join(line.split()) for line in ended.stdout.splitlines()[-3:]]
     assert last == [
-        "generation 0 best lap 11.00 s 1-root",
-        "generation 1 best lap 9.50 s 2-child",
-        "generation 2 best lap 10.00 s 4-grandchild",
+        "generation 0 completion 90.0 %, mean lap 11.00 s 1-root",
+        "generation 1 completion 90.0 %, mean lap 9.50 s 2-child",
+        "generation 2 completion 90.0 %, mean lap 10.00 s 4-grandchild",
     ]
 
 
 def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
     ended = call("lineage", "4-grandchild")
     assert rows(ended.stdout, "4-grandchild", "<- this run")
-    assert rows(ended.stdout, "2-child", "* best")
+    assert rows(ended.stdout, "2-child", "* best by mean lap")
     assert len(rows(ended.stdout, "<- this run")) == len(rows(ended.stdout, "* best")) == 1
-    assert rows(ended.stdout, "generation 2, from 000030, completion 90.0 %, lap 10.00 s")
+    assert rows(ended.stdout, "generation 2, from 000030, completion 90.0 %, mean lap 10.00 s")
     assert rows(ended.stdout, "algorithm.lr 0.0001 -> 1e-05")
     assert "\x1b" not in ended.stdout
     assert all(line == line.rstrip() for line in ended.stdout.splitlines())
@@ -99,8 +99,8 @@ def test_a_clone_on_another_track_has_a_best_of_its_own(clan, call):
     there = clan.clone("5-away", parent, 2, track={"name": "bowtie", "knots": [1]})
     clan.result(there, (1, -20.0), 20.0)
     ended = call("lineage", "1-root")
-    assert rows(ended.stdout, "5-away", "* best on bowtie")
-    assert rows(ended.stdout, "2-child", "* best on oval")
+    assert rows(ended.stdout, "5-away", "* best on bowtie by mean lap")
+    assert rows(ended.stdout, "2-child", "* best on oval by mean lap")
     assert rows(ended.stdout, "track oval -> bowtie")
     assert rows(ended.stdout, "generation 2", "bowtie", "20.00 s")
     assert rows(ended.stdout, "generation 2", "oval", "10.00 s")
@@ -111,14 +111,14 @@ def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
     season.result(root, lap_share=0.5, best_lap_time_s=12.0, last={"completion": 61.0})
     season.result(season.clone("2", root), lap_share=0.9, best_lap_time_s=13.0)
     ended = call("lineage", "1")
-    assert rows(ended.stdout, "completion 61.0 %, lap 12.00 s (training)")
-    assert rows(ended.stdout, "2", "* best")
+    assert rows(ended.stdout, "in training completion 61.0 %, best lap 12.00 s")
+    assert rows(ended.stdout, "2", "* best by laps in training")
 
 
 def test_a_run_without_an_end_says_so(season, call):
     season.clone("2", season.run("1"))
     (season.runs_dir / "season" / "2" / "summary.json").unlink()
-    assert rows(call("lineage", "1").stdout, "generation 1, from 000020, goes on, or was killed")
+    assert rows(call("lineage", "1").stdout, "generation 1, from 000020, running, or was killed")
 
 
 def test_many_changes_are_counted(season, call):

@@ -1,8 +1,19 @@
 """What ends a run, and what is told of it: stopping rules and budgets in real trainings."""
 
+import json
+import os
+import shlex
+import shutil
+import signal
+import threading
+import time
+
 import pytest
 
+from deepracer_exp.analysis.findings import findings
+from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.formats.own_recording import read_own_recording
 from deepracer_exp.formats.run_files import read_run
 from deepracer_exp.training.stopping_replay import replay
 
@@ -70,3 +81,57 @@ def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
     )
     assert len(third.folders) == 2
     assert train_here(*shared, "name=another").code == 0
+
+
+def ctrl_c_after(iterations, folder) -> None:
+    """Send Ctrl-C to this process as soon as a run below a folder has as many iterations."""
+    give_up_at = time.monotonic() + 120
+    while time.monotonic() < give_up_at:
+        files = list(folder.glob("runs/*/*/metrics.jsonl"))
+        if files and files[0].read_text().count("\n") >= iterations:
+            os.kill(os.getpid(), signal.SIGINT)
+            return
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("end", ["budget", "ctrl-c"])
+def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_best_one(
+    train_here, call, tmp_path, end
+):
+    own = ("checkpoints.every=50", "stopping=none")
+    if end == "budget":
+        ended = train_here(*own, "budget.iterations=3")
+    else:
+        threading.Thread(target=ctrl_c_after, args=(3, tmp_path)).start()
+        ended = train_here(*own, "budget.env_steps=100000000")
+        assert ended.code == 130
+        assert "stopping: this iteration is finished" in ended.stderr
+        assert f"deepracer-exp resume {ended.folder.name} " in ended.stdout
+    last, best = ended.metrics[-1], ended.summary["best"]
+    assert last["iteration"] % 50 != 0
+    assert best["iteration"] == last["iteration"]
+    assert best["eval_completion"] == last["eval_completion"] is not None
+    name = f"{best['iteration']:06d}"
+    assert str((ended.folder / "checkpoints" / "best").readlink()) == name
+    assert f"checkpoint {name}, evaluated: " in ended.stdout
+    assert f"completion {best['eval_completion']:.1f} %" in ended.stdout
+    found = findings(prepare(read_own_recording(ended.folder)))
+    (submit,) = [one.sentence for one in found if one.rule == "submit"]
+    assert submit.startswith(f"Race with checkpoint {name}, the best by race score: ")
+    compared = call("checkpoints", ended.folder.name, "--json", "figures.json")
+    assert compared.code == 0, compared.stderr
+    table = json.loads((tmp_path / "figures.json").read_text())
+    assert table["recommended"]["name"] == name
+    (figures,) = [one["figures"] for one in table["checkpoints"] if one["name"] == name]
+    assert figures["rank"] == best["rank"]
+
+
+def test_the_lines_to_paste_after_a_training_work(trained, tmp_path, call_at):
+    ended = trained("budget.iterations=3")
+    folder = shutil.copytree(ended.folder.parents[1], tmp_path / "runs", symlinks=True).parent
+    begin = ended.stdout.index("\n  next\n")
+    lines = [shlex.split(line, comments=True) for line in ended.stdout[begin:].splitlines()[2:]]
+    assert [line[1] for line in lines] == ["evaluate", "evaluate", "clone", "resume"]
+    for line in lines:
+        if "--video" not in line:  # needs a renderer
+            assert call_at(folder, *line[1:]).code == 0, line

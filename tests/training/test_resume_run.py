@@ -4,15 +4,20 @@ import json
 import shutil
 
 import pytest
+import torch
 import yaml
 from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.run import read_run
 from deepracer_exp.formats.checkpoint_files import verify
 from deepracer_exp.formats.run_files import read_metrics
 from deepracer_exp.training.checkpoints import read_training
 from deepracer_exp.training.run import TIMES
 from deepracer_exp.training.run_folder import RunFolder
+from deepracer_exp.training.training import Training
+from tests.conftest import IN_PROCESS
 
 # Reached sooner than a lap: episodes end often.
 OFTEN = ("episode.max_steps=60", "checkpoints.every=2")
@@ -113,12 +118,41 @@ def test_with_no_intact_checkpoint_nothing_is_begun(cut, call):
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
 
 
-def test_a_run_killed_before_its_first_checkpoint_begins_anew(trained, cut, call):
-    run = cut()
-    shutil.rmtree(run / "checkpoints")
-    (run / "summary.json").unlink()
-    assert call("resume", run.name, "budget.iterations=6").code == 0
+def test_a_run_killed_as_soon_as_it_is_one_begins_again_and_is_recorded_once(trained, start, call, tmp_path):
+    killed = start("train", *IN_PROCESS, *OFTEN, "budget.env_steps=null", "budget.iterations=6")
+    (config,) = killed.wait_for(lambda: list(tmp_path.glob("runs/*/*/config.yaml")), "run")
+    killed.popen.kill()
+    killed.popen.wait()
+    run = config.parent
+    assert not (run / "tracking.json").exists()
+    ended = call("resume", run.name, "tracking=mlflow")
+    assert ended.code == 0, ended.stderr
+    assert f"{run.name}: had no checkpoint yet: begins again" in ended.stderr
     assert_same_run(run, whole(trained))
+    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
+    (experiment,) = [one for one in client.search_experiments() if one.name == "tiny"]
+    (recorded,) = client.search_runs([experiment.experiment_id])
+    assert recorded.info.status == "FINISHED"
+
+
+def test_a_clone_killed_as_soon_as_it_is_one_begins_again_with_its_parents_policy(cut, call, monkeypatch):
+    parent = cut()
+
+    def killed(self, interruption):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Training, "drive_and_learn", killed)
+        call("clone", f"run={parent.name}", "name=killed", "checkpoint=last")
+    (run,) = (parent.parents[1] / "killed").iterdir()
+    experiment = read_run(str(run), run.parents[1], None).experiment
+    states = [
+        read_checkpoint(experiment, folder / "checkpoints", "last").networks.state_dict()
+        for folder in (run, parent)
+    ]
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+    ended = call("resume", run.name)
+    assert (ended.code, len(rows(run))) == (0, 3), ended.stderr
 
 
 def test_a_run_killed_while_it_was_ending_is_ended_and_not_driven_on(cut, call):
