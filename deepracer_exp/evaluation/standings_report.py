@@ -16,7 +16,7 @@ from .result import CONFIDENCE
 from .standings import Figures, Recommendation, Standing
 
 _MINOR = ("median", "score s")
-_HELD_OUT = "held-out done %"
+_HELD_OUT = "held-out\ndone %"
 _LABELS = "kept as"
 _NAMES = ("steps", _LABELS, "laps %", "done %", _HELD_OUT, "p25 s", "median", "best", "score s")
 

@@ -18,7 +18,7 @@ import psutil
 
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.env.reward_source import RewardSource, source_with_constants
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.formats.run_files import read_metrics
 from deepracer_exp.formats.whole_file import write_whole
 
@@ -98,7 +98,15 @@ class RunFolder:
         return commit
 
     def append_metrics(self, row: dict[str, Any]) -> None:
-        """Add one line to metrics.jsonl."""
+        """Add one line to metrics.jsonl.
+
+        Raises:
+            RunFailed: the folder is not the one that was opened.
+            OSError: it takes no more.
+        """
+        # Others who write into it would make a folder that is gone again, with nothing else in it.
+        if not (self.path / RUNNING).exists():
+            raise RunFailed(f"{self.path}: the folder of the run is gone")
         with self._metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 

@@ -117,4 +117,4 @@ def test_a_folder_that_vanishes_during_the_training_ends_the_run_with_one_line(
     ended = train_here("budget.env_steps=100000000", f"tracking={tracking}")
     assert ended.code == 3, ended.stderr
     assert ended.complaint.startswith("deepracer-exp: run failed: runs/tiny/")
-    assert "No such file or directory" in ended.complaint
+    assert "is gone" in ended.complaint or "No such file or directory" in ended.complaint
