@@ -243,7 +243,7 @@ def _train(args: argparse.Namespace) -> int:
 
 def _validate(args: argparse.Namespace) -> int:
     # Before NumPy is imported: a reward function has one thread in a training, too, and on a busy machine the threads
-    # of a small linear-algebra problem wait for one another, up to the function's time limit.
+    # of a small linear-algebra problem wait for one another.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
     from deepracer_exp.config.compose import compose_experiment

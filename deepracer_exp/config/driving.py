@@ -112,4 +112,4 @@ class RewardConfig:
     constants: dict[str, Finite]
     """Values for UPPERCASE constants of the module."""
     time_limit_s: Positive
-    """Seconds one control step's reward calls may take before the run is failed."""
+    """Seconds of CPU that one control step's reward calls may take before the run is failed."""

@@ -32,7 +32,7 @@ name: {name}
 file: {file}
 # Values for the constants in capitals of the module, e.g. reward.constants.NAME=2.
 constants: {constants}
-# Seconds one control step's reward calls may take, all cars together, before the run is failed.
+# Seconds of CPU that one control step's reward calls may take, all cars together, before the run is failed.
 time_limit_s: {time_limit_s}
 """
 

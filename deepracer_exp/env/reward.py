@@ -3,6 +3,7 @@
 import itertools
 import math
 import reprlib
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from types import CodeType
 from typing import Any
@@ -14,7 +15,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 
 from .params import Road, batch_params, rows, scalar_params, select
 from .prints import RewardPrints
-from .reward_deadline import DeadlinePassed, deadline
+from .reward_guard import CtrlC, DeadlinePassed, Guard, Misconduct
 from .reward_source import RewardSource, source_with_constants
 
 MAX_REWARD = 1e5
@@ -25,11 +26,17 @@ class RewardFailed(RunFailed):
     """A reward function raised, hung or returned something that is no reward."""
 
     def __init__(
-        self, message: str, params: dict[str, Any] | None = None, car: int | None = None, what: str = ""
+        self,
+        message: str,
+        params: dict[str, Any] | None = None,
+        car: int | None = None,
+        what: str = "",
+        hung: bool = False,
     ) -> None:
         super().__init__(message)
         self.what = what
         """The middle of the message: what the function did, and in which line."""
+        self.hung = hung
         self.params = params
         """What the function was given (`reward_batch`: of all cars, where the car is not known)."""
         self.car = car
@@ -45,7 +52,7 @@ class RewardFunction:
     Args:
         source: The module; its overriding constants are set.
         n_cars: Number of cars.
-        time_limit_s: Wall-clock seconds for all calls of one step (see `deadline` for where it holds).
+        time_limit_s: Seconds of CPU for all calls of one step (see `Guard` for where it holds).
         prints: Where `print` goes; None discards it.
         scalar: Call `reward_function` even where the module has `reward_batch`.
 
@@ -69,8 +76,15 @@ class RewardFunction:
         self._is_batch = not scalar and "reward_batch" in code.co_names
         name = "reward_batch" if self._is_batch else "reward_function"
         cars = [None] if self._is_batch else list(range(n_cars))
-        with deadline(time_limit_s):
-            self._functions = [self._load(code, name, prints, car) for car in cars]
+        try:
+            with Guard(time_limit_s):
+                self._functions = [self._load(code, name, prints, car) for car in cars]
+        except CtrlC:
+            raise
+        except BaseException as error:  # noqa: BLE001 - raised again as what it means
+            what, cause = self.what_happened(error)
+            how = "" if isinstance(error, Unusable) else "cannot be run: "
+            raise BadInput(f"{source.path}: {how}{what}") from cause
         self._roads: Sequence[Road] = ()
         self._waypoints: list[np.ndarray] = []
 
@@ -83,6 +97,8 @@ class RewardFunction:
     ) -> NDArray[np.float64]:
         """Return the reward of every car, shape (n_cars,); 0 for the cars that are not active.
 
+        A module with `reward_batch` takes any number of cars.
+
         Args:
             columns: `params.COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
             roads: The courses that are driven.
@@ -92,8 +108,9 @@ class RewardFunction:
         Raises:
             RewardFailed: The function raised, hung, or returned no finite number within +-`MAX_REWARD`.
         """
-        rewards = np.zeros(self.n_cars)
-        cars = np.arange(self.n_cars) if active is None else np.flatnonzero(active)
+        n = len(columns["x"])
+        rewards = np.zeros(n)
+        cars = np.arange(n) if active is None else np.flatnonzero(active)
         if len(cars):
             road_of = np.zeros(len(cars), np.intp) if which is None else which[cars]
             if len(roads) > 1:
@@ -114,7 +131,7 @@ class RewardFunction:
         return self._functions
 
     def pay(self, params: dict[str, Any]) -> float:
-        """Return what the module of the first car (`scalar`) pays for params that the caller made, in its `deadline`.
+        """Return what the module of the first car (`scalar`) pays for params that the caller made, in its `Guard`.
 
         Raises:
             RewardFailed: The function raised, hung, or returned no finite number within +-`MAX_REWARD`.
@@ -122,10 +139,11 @@ class RewardFunction:
         given = dict(params)
         try:
             return _as_reward(self._functions[0](params))
-        except KeyboardInterrupt:
+        except CtrlC:
             raise
-        except BaseException as error:
-            raise self._failure(error, 0, given) from error
+        except BaseException as error:  # noqa: BLE001 - raised again as what it means
+            failure, cause = self._failure(error, 0, given)
+            raise failure from cause
 
     def _load(
         self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
@@ -136,16 +154,10 @@ class RewardFunction:
             "__file__": self.source.path,
             "print": printer,
         }
-        try:
-            exec(code, namespace)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            message = f"{self.source.path}: cannot be run: {self._what_happened(error)}"
-            raise BadInput(message) from error
+        exec(code, namespace)
         function = namespace.get(name)
         if not callable(function):
-            raise BadInput(f"{self.source.path}: {name} is {_short(function)}, a function is wanted")
+            raise Unusable(f"{name} is {_short(function)}, a function is wanted")
         return function
 
     def _call_each(
@@ -159,20 +171,20 @@ class RewardFunction:
         rewards: list[float] = []
         table, own_roads = list(rows(selected)), [roads[place] for place in road_of.tolist()]
         try:
-            with deadline(self.time_limit_s):
+            with Guard(self.time_limit_s):
                 for car, road, row in zip(cars, own_roads, table, strict=True):
                     reward = functions[car](scalar_params(row, *road))
                     # A plain float within the bounds needs no closer look; NaN fails the comparison.
                     if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
                         reward = _as_reward(reward)
                     rewards.append(reward)
-        except KeyboardInterrupt:
-            # Ctrl-C may well arrive in here, and is no fault of the function.
+        except CtrlC:
             raise
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001 - raised again as what it means
             # One reward a car that came through; a time limit may pass right after the last of them.
             at = min(len(rewards), len(cars) - 1)
-            raise self._failure(error, cars[at], scalar_params(table[at], *own_roads[at])) from error
+            failure, cause = self._failure(error, cars[at], scalar_params(table[at], *own_roads[at]))
+            raise failure from cause
         return rewards
 
     def _call_batch(
@@ -197,55 +209,80 @@ class RewardFunction:
 
         at = (0, len(cars))
         try:
-            with deadline(self.time_limit_s):
+            with Guard(self.time_limit_s):
                 for at in itertools.pairwise(bounds):
                     rewards[slice(*at)] = _as_rewards(self._functions[0](params(*at)), at[1] - at[0])
-        except KeyboardInterrupt:
+        except CtrlC:
             raise
-        except BaseException as error:
-            raise self._failure(error, None, params(*at)) from error
+        except BaseException as error:  # noqa: BLE001 - raised again as what it means
+            failure, cause = self._failure(error, None, params(*at))
+            raise failure from cause
         bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
         if len(bad):
             row, road = list(rows(selected))[bad[0]], roads[road_of[bad[0]]]
-            no_reward = _NotAReward(_no_reward(float(rewards[bad[0]])))
-            raise self._failure(no_reward, cars[bad[0]], scalar_params(row, *road))
+            no_reward = Unusable(_no_reward(float(rewards[bad[0]])))
+            raise self._failure(no_reward, cars[bad[0]], scalar_params(row, *road))[0]
         return rewards
 
-    def _failure(self, error: BaseException, car: int | None, params: dict[str, Any]) -> RewardFailed:
+    def _failure(
+        self, error: BaseException, car: int | None, params: dict[str, Any]
+    ) -> tuple[RewardFailed, Exception | None]:
+        """Return what is to be raised for an error of the function's, and from what."""
         function = "reward_batch" if self._is_batch else "reward_function"
         where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
-        what = self._what_happened(error)
-        return RewardFailed(f"reward {self.source.name}: {function} {what} ({where})", params, car, what)
+        what, cause = self.what_happened(error)
+        message = f"reward {self.source.name}: {function} {what} ({where})"
+        return RewardFailed(message, params, car, what, isinstance(error, DeadlinePassed)), cause
 
-    def _what_happened(self, error: BaseException) -> str:
-        if isinstance(error, _NotAReward):
-            return str(error)
+    def what_happened(self, error: BaseException) -> tuple[str, Exception | None]:
+        """Say in one line what an error of the module's code was, and in which line of it.
+
+        Also returned is what to raise from: the traceback as text. The error itself goes no further: printing it would
+        run code of the module (`__str__`, `__repr__`) without a guard.
+        """
+        if isinstance(error, Unusable):
+            return str(error), None
         line, trace = 0, error.__traceback__
         while trace is not None:
             if trace.tb_frame.f_code.co_filename == self.source.path:
                 line = trace.tb_lineno
             trace = trace.tb_next
         place = f" in line {line} of {self.source.path}" if line else ""
-        if isinstance(error, DeadlinePassed):
-            return f"took longer than the time limit of {self.time_limit_s:g} s for one step{place}"
-        message = _one_line(str(error))
-        return f"raised {type(error).__name__}{': ' + message if message else ''}{place}"
+        try:
+            with Guard(self.time_limit_s):
+                if isinstance(error, Misconduct):
+                    said = str(error)
+                else:
+                    message = _one_line(str(error))
+                    said = f"raised {type(error).__name__}{': ' + message if message else ''}"
+                return said + place, _Traceback("".join(traceback.format_exception(error)))
+        except CtrlC:
+            raise
+        except BaseException:  # noqa: BLE001 - of the error's own code
+            return f"raised an error that cannot be printed{place}", None
 
 
-class _NotAReward(Exception):  # noqa: N818 - never leaves this module
-    """The function returned, but no number that can be a reward; the message says what."""
+class _Traceback(Exception):  # noqa: N818 - as `multiprocessing` has it for errors of other processes
+    """The traceback of an error of the reward's, as text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(f"\n{text}")
+
+
+class Unusable(Exception):  # noqa: N818 - reads as what it is at the raise site
+    """What code of a reward module returned or defined cannot be used; the message says what."""
 
 
 def _as_reward(value: object) -> float:
     """Return what AWS's `float()` makes of `value`; text is refused, though `float("1")` would do."""
     if isinstance(value, str | bytes | bytearray):
-        raise _NotAReward(_no_reward(value))
+        raise Unusable(_no_reward(value))
     try:
         reward = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError) as error:
-        raise _NotAReward(_no_reward(value)) from error
+        raise Unusable(_no_reward(value)) from error
     if not math.fabs(reward) <= MAX_REWARD:
-        raise _NotAReward(_no_reward(value))
+        raise Unusable(_no_reward(value))
     return reward
 
 
@@ -253,10 +290,10 @@ def _as_rewards(value: object, n: int) -> NDArray[np.float64]:
     try:
         rewards = np.asarray(value)
     except ValueError as error:  # rows of different lengths
-        raise _NotAReward(_no_reward(value)) from error
+        raise Unusable(_no_reward(value)) from error
     if rewards.shape != (n,) or rewards.dtype.kind not in "biuf":
         shape = f"{rewards.dtype} of shape {rewards.shape}"
-        raise _NotAReward(f"returned {shape}; one number a car, shape ({n},), is wanted")
+        raise Unusable(f"returned {shape}; one number a car, shape ({n},), is wanted")
     return rewards.astype(np.float64)
 
 

@@ -15,7 +15,7 @@ from deepracer_exp.config.compose import compose_experiment, validate
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.env.params import rows, scalar_params, select
 from deepracer_exp.env.reward import RewardFailed, RewardFunction
-from deepracer_exp.env.reward_deadline import DeadlinePassed, deadline
+from deepracer_exp.env.reward_guard import Guard, Misconduct
 from deepracer_exp.env.reward_source import RewardSource, load_reward_source, zoo_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import LogProblem, Recording
@@ -25,11 +25,11 @@ from deepracer_exp.tracks.track import Track
 from .recorded_params import Ids, RecordedParams
 
 TIME_LIMIT_S = 5.0
-"""Seconds of one call; the trainings' own default."""
+"""Seconds of CPU of one call; the trainings' own default."""
 UNPAID = ("prepare", "pause", "park")
 """Statuses at which the service pays nothing and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
-_AT_ONCE = 100_000
-"""Rows whose params are rebuilt together; so memory does not grow with the recording."""
+_AT_ONCE = 4096
+"""Rows whose params are rebuilt together, and which one call of `reward_batch` gets: a training's step has hundreds."""
 _SPREAD = (0.02, 0.98)
 """Quantiles of the waypoints' means that become 0 and 1: one bonus at the finish is not to flatten all else."""
 
@@ -74,7 +74,7 @@ def replay_reward(
         recording: what was driven.
         reward: a name of the reward zoo or a Python file.
         courses: of the names in `recording.steps.track`; None: found as for figures.
-        time_limit_s: wall-clock seconds a call may take.
+        time_limit_s: seconds of CPU a call may take.
 
     Raises:
         BadInput: there is no such function or it cannot be loaded; it raised, hung or paid no finite number: one line
@@ -154,27 +154,25 @@ def _pay(
             some = own[begin : begin + _AT_ONCE]
             columns = params.columns(some)
             if function.is_batch:
-                paid[some] = _at_once(source, params, columns, ordered, some, time_limit_s)
+                paid[some] = _at_once(function, params, columns, ordered, some)
             else:
                 paid[some] = _one_by_one(function, params, columns, ordered, some)
     return paid
 
 
 def _at_once(
-    source: RewardSource,
+    function: RewardFunction,
     params: RecordedParams,
     columns: dict[str, np.ndarray],
     ordered: pd.DataFrame,
     some: Ids,
-    time_limit_s: float,
 ) -> NDArray[np.float64]:
-    # A car a row: `reward_batch` does not tell cars from steps.
-    function = RewardFunction(source, len(some), time_limit_s, None)
     try:
+        # A car a row: `reward_batch` does not tell cars from steps.
         return function(columns, params.roads, which=params.which[some])
     except RewardFailed as error:
         at = f"{len(some):,} steps at once" if error.car is None else _place(ordered, some[error.car])
-        raise BadInput(f"{source.path}: reward_batch {error.what} ({at})") from error
+        raise BadInput(f"{function.source.path}: reward_batch {error.what} ({at})") from error
 
 
 def _one_by_one(
@@ -188,13 +186,12 @@ def _one_by_one(
     roads = [params.roads[which] for which in params.which[some].tolist()]
     at = 0
     try:
-        with deadline(function.time_limit_s) as begin_anew:
+        with Guard(function.time_limit_s) as guard:
             for at, row in enumerate(rows(select(columns, None))):
                 paid[at] = function.pay(scalar_params(row, *roads[at]))
-                begin_anew()
-    except (RewardFailed, DeadlinePassed) as error:
-        limit = f"took longer than the time limit of {function.time_limit_s:g} s"
-        what = error.what if isinstance(error, RewardFailed) else limit
+                guard.restart()
+    except (RewardFailed, Misconduct) as error:
+        what = error.what if isinstance(error, RewardFailed) else str(error)
         place = _place(ordered, some[at])
         raise BadInput(f"{function.source.path}: reward_function {what} ({place})") from error
     return paid

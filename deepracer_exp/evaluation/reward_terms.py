@@ -13,8 +13,8 @@ from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.params import rows, scalar_params, select
-from deepracer_exp.env.reward import RewardFunction
-from deepracer_exp.env.reward_deadline import DeadlinePassed, deadline
+from deepracer_exp.env.reward import RewardFunction, Unusable
+from deepracer_exp.env.reward_guard import CtrlC, Guard
 from deepracer_exp.env.reward_source import RewardSource
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import Recording
@@ -48,7 +48,7 @@ def reward_terms(
         view: the training, on a known course.
         source: the module.
         most: steps that are asked about; more by the rest of an episode.
-        time_limit_s: wall-clock seconds a call may take.
+        time_limit_s: seconds of CPU a call may take.
 
     Returns:
         A row a step, labelled as in `view.steps`, a column a term, reward units; 0 where a step has no such term. None:
@@ -76,16 +76,17 @@ def reward_terms(
     roads = [params.roads[which] for which in params.which[asked].tolist()]
     found: list[dict[str, float]] = []
     try:
-        with deadline(time_limit_s) as begin_anew:
+        with Guard(time_limit_s) as guard:
             for row, road in zip(rows(select(params.columns(asked), None)), roads, strict=True):
                 found.append(_checked(terms, scalar_params(row, *road)))
-                begin_anew()
-    except (_NoTerms, DeadlinePassed) as error:
-        what = str(error) or f"took longer than the time limit of {time_limit_s:g} s"
-        at = steps.iloc[asked[len(found)]]
-        raise BadInput(
-            f"{source.path}: terms {what} (episode {at['episode']}, step {at['steps']})"
-        ) from error
+                guard.restart()
+    except CtrlC:
+        raise
+    except BaseException as error:  # noqa: BLE001 - raised again as what it means
+        what, cause = function.what_happened(error)
+        at = steps.iloc[asked[min(len(found), len(asked) - 1)]]
+        place = f"episode {at['episode']}, step {at['steps']}"
+        raise BadInput(f"{source.path}: terms {what} ({place})") from cause
     return pd.DataFrame(found, index=steps.index[asked]).fillna(0.0)
 
 
@@ -95,20 +96,13 @@ def _car() -> CarConfig:
     return compose_experiment([])[0].car
 
 
-class _NoTerms(Exception):  # noqa: N818 - never leaves this module
-    """What is wrong with the answer, in words."""
-
-
 def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
-    try:
-        answer = terms(params)
-    except Exception as error:
-        raise _NoTerms(f"raised {type(error).__name__}: {' '.join(str(error).split())}") from error
+    answer = terms(params)
     if not isinstance(answer, dict) or not answer:
-        raise _NoTerms(f"returned {str(answer)[:40]!r}, no dict of numbers")
+        raise Unusable(f"returned {str(answer)[:40]!r}, no dict of numbers")
     for name, value in answer.items():
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
-            raise _NoTerms(f"returned {str(value)[:40]!r} for {name!r}; accepted are finite numbers")
+            raise Unusable(f"returned {str(value)[:40]!r} for {name!r}; accepted are finite numbers")
     return {str(name): float(value) for name, value in answer.items()}
 
 

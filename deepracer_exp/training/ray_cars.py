@@ -55,7 +55,7 @@ class FarEnvFactory(EnvFactory):
 class Cars:
     """The cars of one process; a Ray actor whose methods run in its main thread.
 
-    Only there a reward function that hangs can be stopped (`env.reward_deadline`), so that its steps are told to
+    Only there a reward function that hangs can be stopped (`env.reward_guard`), so that its steps are told to
     `Beats` and not asked for from another thread of it.
     """
 

@@ -109,9 +109,9 @@ def batch_differs(setup: RaceSetup, asked: Situations, rewards: np.ndarray) -> I
     Raises:
         BadInput, RewardFailed: `reward_batch` cannot be used.
     """
-    if not RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None).is_batch:
+    batch = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
+    if not batch.is_batch:
         return
-    batch = RewardFunction(setup.reward, len(asked), setup.reward_time_limit_s, None)
     paid = batch(asked.columns, (asked.road,))
     wrong = np.flatnonzero(~np.isclose(paid, rewards, rtol=1e-6, atol=1e-9))
     if len(wrong):

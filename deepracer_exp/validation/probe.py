@@ -1,7 +1,7 @@
 """Calls a reward function in one situation after the other and notes what comes of it."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
 from statistics import median
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.env.reward import RewardFailed, RewardFunction
-from deepracer_exp.env.reward_deadline import DeadlinePassed, deadline
+from deepracer_exp.env.reward_guard import CtrlC, Guard, Misconduct
 from deepracer_exp.env.reward_source import RewardSource
 
 from .situations import Situations
@@ -46,7 +46,7 @@ class Probe:
 
         Args:
             source: the module.
-            time_limit_s: wall-clock seconds of a single call.
+            time_limit_s: seconds of CPU of a single call.
         """
         self._function = RewardFunction(source, 1, time_limit_s, None, scalar=True)
         self.failures: list[tuple[str, dict[str, Any]]] = []
@@ -54,8 +54,7 @@ class Probe:
 
     def ask(self, params: dict[str, Any]) -> Answer:
         """Call the function once."""
-        (answer,) = self._answers([params])
-        return answer
+        return self._answers([params])[-1]
 
     def rewards(self, asked: Situations, before: Situations | None = None) -> NDArray[np.float64]:
         """Return the reward of each situation, (n,), called in their order; NaN where the call failed.
@@ -65,24 +64,35 @@ class Probe:
             before: what the function is called with just before each of them, n situations; None: nothing.
         """
         if before is None:
-            return np.array([answer.reward for answer in self._answers(asked.params())])
-        both = chain.from_iterable(zip(before.params(), asked.params(), strict=True))
-        return np.array([answer.reward for answer in self._answers(both)])[1::2]
+            answers = self._answers(asked.params())[: len(asked)]
+        else:
+            both = chain.from_iterable(zip(before.params(), asked.params(), strict=True))
+            answers = self._answers(both)[1 : 2 * len(asked) : 2]
+        return np.array([answer.reward for answer in answers])
 
-    def _answers(self, asked: Iterable[dict[str, Any]]) -> Iterator[Answer]:
-        with deadline(self._function.time_limit_s) as begin_anew:
-            for params in asked:
-                if self.hangs:
-                    yield Answer(float("nan"), NOT_CALLED)
-                    continue
-                begin_anew()
-                try:
-                    answer = Answer(self._function.pay(params))
-                except RewardFailed as error:
-                    self.hangs = isinstance(error.__cause__, DeadlinePassed)
-                    self.failures.append((error.what, error.params or {}))
-                    answer = Answer(float("nan"), error.what)
-                yield answer
+    def _answers(self, asked: Iterable[dict[str, Any]]) -> list[Answer]:
+        """Call the function with each; behind the answers stands what only the end of all calls showed."""
+        answers: list[Answer] = []
+        waiting = iter(asked)
+        params: dict[str, Any] = {}
+        try:
+            with Guard(self._function.time_limit_s) as guard:
+                for params in waiting:
+                    if self.hangs:
+                        answers.append(Answer(float("nan"), NOT_CALLED))
+                        continue
+                    guard.restart()
+                    try:
+                        answers.append(Answer(self._function.pay(params)))
+                    except RewardFailed as error:
+                        self.hangs = error.hung
+                        self.failures.append((error.what, error.params or {}))
+                        answers.append(Answer(float("nan"), error.what))
+        except Misconduct as error:
+            self.failures.append((str(error), params))
+            answers.append(Answer(float("nan"), str(error)))
+            answers += (Answer(float("nan"), NOT_CALLED) for _ in waiting)
+        return answers
 
     def median_s(self, params: dict[str, Any]) -> float | None:
         """Return the median time of a call, of as many as fit into 50 ms, 3 to 1000.
@@ -93,12 +103,12 @@ class Probe:
         times: list[float] = []
         given = [{**params, "waypoints": params["waypoints"][:]} for _ in range(1000)]
         try:
-            with deadline(self._function.time_limit_s):
+            with Guard(self._function.time_limit_s):
                 while len(times) < 3 or (len(times) < len(given) and sum(times) < 0.05):
                     began = time.perf_counter()
                     call(given[len(times)])
                     times.append(time.perf_counter() - began)
-        except KeyboardInterrupt:
+        except CtrlC:
             raise
         except BaseException:  # noqa: BLE001 - told where the car stands still and the same happens
             return None

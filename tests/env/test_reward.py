@@ -1,7 +1,11 @@
+import builtins
 import hashlib
+import io
 import pickle
 import signal
+import sys
 import threading
+import traceback
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -152,24 +156,93 @@ def test_the_line_is_that_of_the_reward_file_even_if_a_library_raised() -> None:
     assert "in line 5 of /somewhere/mine.py" in str(failure(function(text)))
 
 
-def test_ctrl_c_is_not_taken_for_a_fault_of_the_reward() -> None:
+CTRL_C = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        f"{CTRL_C}; return 1.0",
+        f"\n    try:\n        {CTRL_C}\n        while True: pass\n    except: return 1.0",
+    ],
+)
+def test_ctrl_c_is_the_users_even_if_the_reward_swallows_it(body: str) -> None:
     with pytest.raises(KeyboardInterrupt):
-        function("raise KeyboardInterrupt")(columns(3), ROAD)
+        function(body)(columns(3), ROAD)
+
+
+def test_a_keyboard_interrupt_that_the_reward_raises_is_its_fault() -> None:
+    assert "raised KeyboardInterrupt in line 2" in str(failure(function("raise KeyboardInterrupt")))
+    with pytest.raises(BadInput, match="cannot be run: raised KeyboardInterrupt in line 1"):
+        function("raise KeyboardInterrupt\ndef reward_function(params): return 1.0\n")
+
+
+@pytest.mark.parametrize("method", ["__str__", "__repr__"])
+@pytest.mark.parametrize("body", ["raise SystemExit", "while True: pass"])
+def test_an_error_whose_text_is_hostile_is_a_fault_like_others(method: str, body: str) -> None:
+    text = (
+        f"class Evil(Exception):\n    def {method}(self):\n        {body}\n"
+        "def reward_function(params):\n    raise Evil(params)\n"
+    )
+    error = failure(function(text, time_limit_s=0.05))
+    assert "reward_function raised " in str(error)
+    assert "in line 5 of /somewhere/mine.py" in str(error)
+    assert "reward mine" in "".join(traceback.format_exception(error))
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        ("import builtins; builtins.len = None; return 1.0", "builtins.len"),
+        ("import builtins; del builtins.isinstance; return []", "builtins.isinstance"),
+        ("import io, sys; sys.stdout = io.StringIO(); return 1.0", "sys.stdout"),
+    ],
+)
+def test_what_everything_uses_is_put_back_and_its_replacement_is_a_fault(body: str, name: str) -> None:
+    before = builtins.__dict__.copy(), sys.stdout
+    assert f"reward_function replaced {name}" in str(failure(function(body)))
+    assert (builtins.__dict__, sys.stdout) == before
+
+
+def test_a_closed_stream_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    error = failure(function("import sys; sys.stdout.close(); return 1.0"))
+    assert "closed a standard stream" in str(error)
 
 
 @pytest.mark.parametrize(
     "body",
     [
         "\n    while True:\n        pass",
-        "\n    import time\n    time.sleep(60)",
         "\n    while True:\n        try: params['x']\n        except Exception: pass",
         "\n    try:\n        while True: pass\n    except:\n        pass\n    while True:\n        pass",
     ],
 )
 def test_a_reward_that_hangs_is_stopped_by_the_time_limit(body: str) -> None:
     error = failure(function(body, time_limit_s=0.05))
-    assert "reward_function took longer than the time limit of 0.05 s for one step in line" in str(error)
+    limit = "the time limit of 0.05 s of CPU for one step"
+    assert f"reward_function took longer than {limit} in line" in str(error)
     assert error.car == 0
+    assert error.hung
+
+
+def test_a_reward_that_sleeps_for_ever_is_stopped_too() -> None:
+    error = failure(function("\n    import time\n    time.sleep(600)", time_limit_s=0.02))
+    assert "reward_function took longer than 0.2 s without computing: 10 times the time limit" in str(error)
+
+
+def test_a_busy_machine_never_fails_a_good_reward() -> None:
+    """Each call waits longer than its limit, as on a machine that has no time for it, but computes next to nothing."""
+    reward = function("import time; time.sleep(0.03); return 1.0", time_limit_s=0.05)
+    np.testing.assert_array_equal(reward(columns(3), ROAD), np.ones(3))
+
+
+def test_time_in_which_the_whole_process_was_stopped_does_not_count() -> None:
+    stop = (
+        "import os, signal, subprocess; subprocess.Popen(['sh', '-c', f'sleep 1; kill -CONT {os.getpid()}'])"
+    )
+    body = f"{stop}; os.kill(os.getpid(), signal.SIGSTOP); return 1.0"
+    np.testing.assert_array_equal(function(body, n_cars=1, time_limit_s=0.05)(columns(1), ROAD), [1.0])
 
 
 def test_timer_and_handler_found_are_put_back() -> None:

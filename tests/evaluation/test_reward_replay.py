@@ -248,6 +248,18 @@ def test_a_function_that_fails_is_told_with_episode_and_step(circle, reward, tex
     assert "\n" not in str(error.value)
 
 
+def test_steps_are_paid_at_once_without_sharing_one_limit(circle, reward):
+    """All steps together use more CPU than the limit, 0.1 ms each."""
+    text = (
+        "import time\ndef reward_function(p):\n    return 0.0\ndef reward_batch(p):\n"
+        "    until = time.thread_time() + 1e-4 * len(p['x'])\n"
+        "    while time.thread_time() < until: pass\n    return p['x'] * 0.0 + 1.0\n"
+    )
+    recording = laps_of({0: 10_000}, 1.0)
+    replayed = replay_reward(recording, reward(text), circle, time_limit_s=0.8)
+    assert replayed.steps["new_reward"].sum() > 9_000
+
+
 def test_an_unknown_reward_is_refused(own):
     with pytest.raises(
         BadInput, match=r"'progres_gain' is not in the reward zoo \(did you mean progress_gain\?\)"
