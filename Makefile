@@ -2,7 +2,23 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RACER := $(VENV)/.installed-racer
 STAMP := $(VENV)/.installed
+
+# uv reads no settings of pip's: where packages come from, and whose certificates are trusted.
+ifdef PIP_INDEX_URL
+export UV_DEFAULT_INDEX ?= $(PIP_INDEX_URL)
+endif
+ifdef PIP_EXTRA_INDEX_URL
+export UV_INDEX ?= $(PIP_EXTRA_INDEX_URL)
+endif
+ifdef PIP_FIND_LINKS
+export UV_FIND_LINKS ?= $(PIP_FIND_LINKS)
+endif
+ifdef PIP_CERT
+export SSL_CERT_FILE ?= $(PIP_CERT)
+endif
+INSTALL = $(BIN)/uv pip install --python $(BIN)/python --constraint constraints.txt
 
 .DEFAULT_GOAL := help
 .PHONY: help env race test test-long test-faults check bench clean
@@ -12,13 +28,20 @@ help:  ## this list
 
 env: $(STAMP)  ## make .venv with everything the project needs
 
-$(STAMP): pyproject.toml constraints.txt
+$(RACER): pyproject.toml constraints.txt
 	@test -x $(BIN)/python || { echo "making $(VENV)"; $(PYTHON) -m venv $(VENV); }
-	@echo "installing deepracer_exp and what it stands on (a few minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt uv
+	@echo "installing deepracer_exp and what it needs to race, in the versions of constraints.txt"
+	@$(INSTALL) --editable .
 	@touch $@
 
-race: $(STAMP)  ## train the default experiment until the car drives reliably
+$(STAMP): $(RACER)
+	@echo "installing the tools for tests and development"
+	@$(INSTALL) --editable '.[dev]'
+	@touch $@
+
+race: $(RACER)  ## train the default experiment until the car drives reliably
+	@echo "training: $(BIN)/deepracer-exp train stopping=reliable"
 	@$(BIN)/deepracer-exp train stopping=reliable
 
 # One process a core, and a file's tests together: they share what the file trains.

@@ -25,6 +25,7 @@ from deepracer_exp.commands import (
 from deepracer_exp.commands.ending import tell, tell_all
 from deepracer_exp.commands.starting import start_workers_early
 from deepracer_exp.commands.stderr_warnings import warnings_on_stderr
+from deepracer_exp.commands.supervised import supervised
 from deepracer_exp.errors import BadInput, RunFailed
 
 _TRAIN_EPILOG = """\
@@ -72,7 +73,11 @@ The results are also written into the run's folder, evaluations/TIME.json.
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130/143 interrupted."""
+    """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130/143 interrupted.
+
+    Args:
+        arguments: of the command line; None: those of this process, in which no reward function runs then.
+    """
     parser = _parser()
     if arguments is None:
         sys.argv[1:] = without_passwords(sys.argv[1:])  # which the run's folder keeps
@@ -81,19 +86,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:  # argparse takes no positional arguments after an option between them
         args.overrides += rest
+    if arguments is None and getattr(args, "runs_rewards", False):
+        sys.exit(supervised(lambda: _call(args)))
+    sys.exit(_call(args))
+
+
+def _call(args: argparse.Namespace) -> int:
+    """Run the command that was asked for and return its exit code."""
     try:
-        code = args.command(args)
+        code = int(args.command(args))
+        sys.stdout.flush()  # while an error still is one
+        return code
     except BadInput as error:
-        code = _fail(error, BadInput.exit_code, args)
+        return _fail(error, BadInput.exit_code, args)
     except RunFailed as error:
-        code = _fail(error, RunFailed.exit_code, args)
+        return _fail(error, RunFailed.exit_code, args)
     except KeyboardInterrupt:
-        code = 130
+        return 130
     except BrokenPipeError:
         # The reader of our output (`| head`) has gone; what Python still holds for it is of no use.
         sys.stderr.close()
-        code = 141
-    sys.exit(code)
+        return 141
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -118,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument(
         "-m", "--multirun", action="store_true", help="run every combination of values given as lists"
     )
-    train.set_defaults(command=_train)
+    train.set_defaults(command=_train, runs_rewards=True)
 
     bring = commands.add_parser(
         "import",
@@ -150,7 +163,7 @@ def _parser() -> argparse.ArgumentParser:
     validate.add_argument("overrides", nargs="*", metavar="reward=NAME | reward.file=PATH | KEY=VALUE")
     validate.add_argument("-o", "--output", help="picture to write (default: REWARD-TRACK.png)")
     validate.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
-    validate.set_defaults(command=_validate)
+    validate.set_defaults(command=_validate, runs_rewards=True)
 
     evaluate = commands.add_parser(
         "evaluate",
@@ -166,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--video", metavar="FILE", help="film the fastest lap (.mp4)")
     evaluate.add_argument("--view", choices=("chase", "top"), default="chase", help="of the film")
     evaluate.add_argument("--cfg", action="store_true", help="print what is asked for as YAML and stop")
-    evaluate.set_defaults(command=_evaluate)
+    evaluate.set_defaults(command=_evaluate, runs_rewards=True)
 
     tracks = commands.add_parser(
         "tracks",

@@ -53,7 +53,7 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     analyze.add_argument(
         "--tracking-uri", help="MLflow store of ids and aliases (default: the one in --runs-dir)"
     )
-    analyze.set_defaults(command=_analyze)
+    analyze.set_defaults(command=_analyze, runs_rewards=True)
 
 
 def _analyze(args: argparse.Namespace) -> int:

@@ -34,7 +34,7 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     clone.add_argument(
         "--tracking-uri", help="MLflow store in which ids and aliases are looked up (default: in runs-dir)"
     )
-    clone.set_defaults(command=_clone)
+    clone.set_defaults(command=_clone, runs_rewards=True)
 
 
 def _clone(args: argparse.Namespace) -> int:

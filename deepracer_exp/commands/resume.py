@@ -37,7 +37,7 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     resume.add_argument(
         "--tracking-uri", help="MLflow store in which an id is looked up (default: the one in runs-dir)"
     )
-    resume.set_defaults(command=_resume)
+    resume.set_defaults(command=_resume, runs_rewards=True)
 
 
 def _resume(args: argparse.Namespace) -> int:

@@ -52,7 +52,7 @@ class Guard:
     def __enter__(self) -> Self:
         self._builtins = builtins.__dict__.copy()
         self._streams = {name: getattr(sys, name) for name in _STREAMS}
-        self._closed = [_is_closed(stream) for stream in self._streams.values()]
+        self._closed = {name: _is_closed(stream) for name, stream in self._streams.items()}
         self._entered_s = time.monotonic()
         self.restart()
         if self._has_signals:
@@ -127,11 +127,18 @@ class Guard:
             if getattr(sys, name, None) is not stream:
                 replaced.append(f"sys.{name}")
                 setattr(sys, name, stream)
-        if replaced:
-            return f"replaced {replaced[0]}, which everything else here uses too"
-        closed = [_is_closed(stream) for stream in self._streams.values()]
-        if closed != self._closed:
-            return "closed a standard stream, which everything else here uses too"
+        closed = [
+            f"sys.{name}"
+            for name, stream in self._streams.items()
+            if not self._closed[name] and _is_closed(stream)
+        ]
+        if closed:  # what is still to be said goes to the one that is left
+            out, err = sys.stdout, sys.stderr
+            sys.stdout = err if _is_closed(out) else out
+            sys.stderr = out if _is_closed(err) else err
+        for done, names_of in ("replaced", replaced), ("closed", closed):
+            if names_of:
+                return f"{done} {names_of[0]}, which everything else here uses too"
         return ""
 
 

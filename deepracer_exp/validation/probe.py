@@ -35,7 +35,8 @@ class Probe:
 
     Attributes:
         failures: what went wrong so far, with the params it went wrong with, in the order of the calls.
-        hangs: a call took longer than the time limit; from then on every call counts as failed unasked.
+        hangs: a call took longer than the time limit, or spoiled what everything uses; from then on every call counts
+            as failed unasked.
 
     Raises:
         BadInput: The module cannot be run.
@@ -89,6 +90,7 @@ class Probe:
                         self.failures.append((error.what, error.params or {}))
                         answers.append(Answer(float("nan"), error.what))
         except Misconduct as error:
+            self.hangs = True
             self.failures.append((str(error), params))
             answers.append(Answer(float("nan"), str(error)))
             answers += (Answer(float("nan"), NOT_CALLED) for _ in waiting)

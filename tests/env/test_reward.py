@@ -207,7 +207,8 @@ def test_what_everything_uses_is_put_back_and_its_replacement_is_a_fault(body: s
 def test_a_closed_stream_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     error = failure(function("import sys; sys.stdout.close(); return 1.0"))
-    assert "closed a standard stream" in str(error)
+    assert "closed sys.stdout" in str(error)
+    assert sys.stdout is sys.stderr
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,78 @@ def reward_function(params):
 """
 
 
+# What a reward function can do to the process around it, and what is said of it.
+ZOO = {
+    "text": ("raise Evil", "raised an error that cannot be printed"),
+    "interrupt": ("raise KeyboardInterrupt", "raised KeyboardInterrupt"),
+    "built-in": ("import builtins; builtins.len = builtins.print = None", "replaced builtins."),
+    "stream": ("sys.stdout = None", "replaced sys.stdout"),
+    "closes": ("sys.stdout.close()", "closed sys.stdout"),
+    "leaves": ("os._exit(0)", "left it with exit code 0"),
+}
+WHEN = {"load": "{}\ndef reward_function(params):\n    return 1.0\n"}
+WHEN["call"] = "def reward_function(params):\n    {}\n    return 1.0\n"
+EVIL = "import os, sys\nclass Evil(Exception):\n    def __str__(self): raise SystemExit(0)\n"
+
+
+def write_hostile(folder, kind, when):
+    path = folder / "hostile.py"
+    path.write_text(EVIL + WHEN[when].format(ZOO[kind][0]))
+    return str(path)
+
+
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize("kind", list(ZOO)[:-2])
+def test_a_hostile_reward_fails_a_training_and_a_validation_in_one_line(call, tmp_path, kind, when):
+    override = f"reward.file={write_hostile(tmp_path, kind, when)}"
+    tiny = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
+    for command in (("validate",), ("train", *tiny)):
+        ended = call(*command, override)
+        assert ended.code == (3 if command[0] == "train" and when == "call" else 2), ended.stderr
+        assert ZOO[kind][1] in ended.stdout + ended.stderr
+        assert "Traceback" not in ended.stderr
+        assert "finished" not in ended.stdout
+
+
+@pytest.mark.parametrize("kind", ["text", "interrupt", "built-in"])
+def test_a_hostile_reward_fails_a_replay_in_one_line(call, trained, tmp_path, kind):
+    run = str(trained().folder)
+    ended = call("analyze", run, "--out", "page.html", "--reward", write_hostile(tmp_path, kind, "call"))
+    assert ended.code == 2, ended.stderr
+    assert ZOO[kind][1] in ended.complaint
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize("command", ["train", "train in workers", "validate", "analyze"])
+def test_a_reward_that_leaves_the_process_never_ends_a_command_with_0(
+    run_at, trained, tmp_path, command, when
+):
+    file = write_hostile(tmp_path, "leaves", when)
+    match command:
+        case "validate":
+            arguments = ["validate", f"reward.file={file}"]
+        case "analyze":
+            arguments = ["analyze", str(trained().folder), "--out", "page.html", "--reward", file]
+        case _:
+            mode = "sync" if "workers" in command else "in_process"
+            tiny = ("experiment=tiny", "tracking=off", f"collector={mode}", "collector.processes=null")
+            arguments = ["train", *tiny, f"reward.file={file}"]
+    ended = run_at(tmp_path, *arguments)
+    assert ended.code == 3
+    assert "exit code 0" in ended.complaint
+    assert not list(tmp_path.glob("runs/*/*/summary.json")) or ended.summary["status"] == "failed"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("when", WHEN)
+def test_what_is_found_is_still_told_when_the_reward_has_closed_its_stream(run_at, tmp_path, when):
+    ended = run_at(tmp_path, "validate", f"reward.file={write_hostile(tmp_path, 'closes', when)}")
+    assert ended.code == 2
+    assert ZOO["closes"][1] in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
 @pytest.fixture
 def reward(tmp_path):
     """Write a reward function whose line 3 on is the given text; return the override that names it."""
@@ -92,13 +164,6 @@ def test_a_reward_that_swallows_its_time_limit_is_ended_by_the_watchdog(start_tr
     training = start_training(f"reward.file={path}", "reward.time_limit_s=1", "collector.hang_timeout_s=3")
     ended = training.end()
     ended.assert_run_failed("collector worker", "took no step for", "(after 3 steps)")
-    training.assert_nothing_left()
-
-
-@pytest.mark.slow
-def test_a_reward_that_leaves_the_process_never_ends_in_a_finished_run(start_training, reward):
-    training = start_training(reward("    if params['steps'] > 3: os._exit(0)", "    return 1.0"))
-    training.end().assert_run_failed("collector worker", "died with exit code 0")
     training.assert_nothing_left()
 
 
