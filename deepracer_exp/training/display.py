@@ -24,9 +24,13 @@ SPARKS = "▁▂▃▄▅▆▇█"
 REFRESH_S = 0.2
 """Shortest time between two drawings: more often only costs the training time."""
 LINE_S = 5.0
-"""Shortest time between two plain lines."""
-WIDE = 76
+"""Shortest time between two plain lines; from two minutes on it grows with the run, up to `_LINE_AT_MOST_S`."""
+_LINE_AT_MOST_S = 60.0
+_LINE_SHARE = 1 / 24
+HALVES = 60
 """Columns from which the figures stand in two halves side by side."""
+WIDE = 76
+"""Columns from which the limit of the budget stands beside the bar."""
 LABEL, VALUE, GAP, RIGHT = 12, 10, 3, 24
 """Columns of a figure's name, of its value, between the halves, and of the right half."""
 _FRAME_LINES = 10  # of the panel beside figures and table, and the terminal's last
@@ -55,7 +59,8 @@ class ProgressDisplay:
     """Shows a training while it runs; use as a context manager.
 
     On a terminal one panel is redrawn in place and stays at the end. Elsewhere, lines go to `console`: the
-    first row, then at most one every `LINE_S`, and the last. Give a console on stderr: stdout is for results.
+    first row, then one every now and then (see `LINE_S`), and the last. Give a console on stderr: stdout is for
+    results.
     """
 
     def __init__(
@@ -64,7 +69,8 @@ class ProgressDisplay:
         self._console = console
         self._clock = clock
         self._view = _View(header)
-        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        # A terminal that is called dumb cannot draw in place.
+        self._live = Live(console=console, auto_refresh=False) if console.is_interactive else None
         self._started_s = 0.0
         self._shown_s = -math.inf
         self._pending = False
@@ -98,9 +104,11 @@ class ProgressDisplay:
             eta_s: seconds left, or None where nobody knows.
         """
         now_s = self._clock()
-        self._view.add(row, fraction, eta_s, now_s - self._started_s)
+        elapsed_s = now_s - self._started_s
+        self._view.add(row, fraction, eta_s, elapsed_s)
         self._pending = True
-        if now_s - self._shown_s >= (LINE_S if self._live is None else REFRESH_S):
+        line_s = min(max(LINE_S, _LINE_SHARE * elapsed_s), _LINE_AT_MOST_S)
+        if now_s - self._shown_s >= (line_s if self._live is None else REFRESH_S):
             self._shown_s = now_s
             self._show()
 
@@ -165,8 +173,10 @@ class _View:
         width = min(options.max_width, 100)
         # Less the border and two columns of padding on each side.
         inner = width - 6
-        figures = self._figures(inner, width >= WIDE)
-        if self._tracks:
+        figures = self._figures(inner, width >= HALVES)
+        if width < HALVES:  # the first ones matter most
+            figures = figures[: max(1, console.height - _FRAME_LINES + 1)]
+        elif self._tracks:
             room = console.height - len(figures) - _FRAME_LINES
             figures += [Text(""), *self._tracks.lines(inner, room)]
         yield Panel(
@@ -188,11 +198,13 @@ class _View:
 
     def _bar(self, width: int, wide: bool) -> Table:
         spent = Text.assemble((f"{100 * self._fraction:.0f} %", "bold"))
-        if wide:
-            spent.append(f" of {self.header.budget}", style="dim")
+        left = _left(self._eta_s)
+        if width >= HALVES - 6:
+            spent.append(f" of {self.header.budget if wide else 'budget'}", style="dim")
+            left = f"{_clock(self._elapsed_s)} · {left}"
         row = Table.grid(padding=(0, 2), expand=True)
         row.width = width
-        row.add_column(ratio=1, min_width=10)
+        row.add_column(ratio=1, min_width=4)
         row.add_column(justify="right", no_wrap=True)
         row.add_column(justify="right", no_wrap=True)
         row.add_row(
@@ -204,14 +216,14 @@ class _View:
                 finished_style="cyan",
             ),
             spent,
-            f"{_clock(self._elapsed_s)} · {_left(self._eta_s)}",
+            left,
         )
         return row
 
-    def _figures(self, width: int, wide: bool) -> list[Text]:
+    def _figures(self, width: int, halves: bool) -> list[Text]:
         row = self._row
-        left = width - GAP - RIGHT if wide else width
-        right = RIGHT if wide else width
+        left = width - GAP - RIGHT if halves else width
+        right = RIGHT if halves else width
 
         def curve(key: str, style: str, bounds: tuple[float, float] | None = None) -> Text:
             return Text(sparkline(self._history[key], left - LABEL - VALUE, bounds), style=style)
@@ -221,38 +233,33 @@ class _View:
             text.truncate(room, overflow="ellipsis", pad=True)
             return text
 
-        learning = [
-            cell(
-                "completion", _format(row, "completion", ".1f", " %"), curve("completion", "green", (0, 100))
-            ),
-            cell("return", _format(row, "mean_return", ",.2f"), curve("mean_return", "cyan")),
-            cell("entropy", _format(row, "entropy", ".3f"), curve("entropy", "magenta")),
-        ]
-        laps = [
-            cell("laps", _format(row, "laps", ",.0f"), room=right),
-            cell(f"of last {self.header.remembered}", _share(row), room=right),
-        ]
+        completion = cell(
+            "completion", _format(row, "completion", ".1f", " %"), curve("completion", "green", (0, 100))
+        )
+        returns = cell("return", _format(row, "mean_return", ",.2f"), curve("mean_return", "cyan"))
+        entropy = cell("entropy", _format(row, "entropy", ".3f"), curve("entropy", "magenta"))
         rate = _format(row, "lr", ".2g")
-        if self._tracks:  # lap times stand at each track
-            laps.append(cell("learn rate", rate, room=right))
-        else:
-            learning.append(cell("learn rate", rate))
-            laps += [
-                cell("best lap", _format(row, "best_lap_time_s", ".2f", " s"), room=right),
-                cell("mean lap", _format(row, "mean_lap_time_s", ".2f", " s"), room=right),
+        laps = cell("laps", _format(row, "laps", ",.0f"), room=right)
+        share = cell(f"of last {self.header.remembered}", _share(row), room=right)
+        best = cell("best lap", _format(row, "best_lap_time_s", ".2f", " s"), room=right)
+        mean = cell("mean lap", _format(row, "mean_lap_time_s", ".2f", " s"), room=right)
+        steps = cell("env steps", _format(row, "env_steps", ",.0f"))
+        speed = cell("speed", _format(row, "env_steps_per_s", ",.0f", " steps/s"))
+        iteration = cell("iteration", _format(row, "iteration", ",.0f"), room=right)
+        episodes = cell("episodes", _format(row, "episodes", ",.0f"), room=right)
+        if not halves:
+            lap_times = () if self._tracks else (best, mean)
+            learn_rate = cell("learn rate", rate)
+            return [
+                *(iteration, completion, laps, share, *lap_times[:1], entropy, returns),
+                *(*lap_times[1:], steps, speed, episodes, learn_rate),
             ]
-        work = [
-            cell("env steps", _format(row, "env_steps", ",.0f")),
-            cell("speed", _format(row, "env_steps_per_s", ",.0f", " steps/s")),
-        ]
-        counts = [
-            cell("iteration", _format(row, "iteration", ",.0f"), room=right),
-            cell("episodes", _format(row, "episodes", ",.0f"), room=right),
-        ]
-        if not wide:
-            return [*learning, Text(""), *laps, Text(""), *work, *counts]
-        halves = [*zip(learning, laps, strict=True), (Text(""), Text("")), *zip(work, counts, strict=True)]
-        return [one + " " * GAP + other for one, other in halves]
+        if self._tracks:  # lap times stand at each track
+            rows = [(completion, laps), (returns, share), (entropy, cell("learn rate", rate, room=right))]
+        else:
+            rows = [(completion, laps), (returns, share), (entropy, best), (cell("learn rate", rate), mean)]
+        rows += [(Text(""), Text("")), (steps, iteration), (speed, episodes)]
+        return [one + " " * GAP + other for one, other in rows]
 
 
 def sparkline(values: list[float], width: int, bounds: tuple[float, float] | None = None) -> str:

@@ -90,16 +90,17 @@ def lines(act: Callable[[ProgressDisplay, Clock], None], header: RunHeader = HEA
     return file.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("width", [60, 76, 80, 120, 200])
-def test_the_panel_fits_the_terminal_and_shows_every_figure(width: int) -> None:
+@pytest.mark.parametrize(("width", "height"), [(60, 20), (76, 24), (80, 20), (120, 24), (200, 60)])
+def test_the_panel_fits_the_terminal_and_shows_every_figure(width: int, height: int) -> None:
     def act(display: ProgressDisplay) -> None:
         for _ in range(100):
             display.update(ROW, 0.67, 23.0)
 
-    panel = screen(width, act)
+    panel = screen(width, act, height)
     text = "\n".join(panel)
-    assert len(panel) < 24
+    assert len(panel) < height
     assert {len(line) for line in panel} == {min(width, 100)}
+    assert not any("…" in line for line in panel[3:])
     for word in [*SHOWN, "67 %", "0:23 left", "re:Invent 2018", HEADER.folder, "default"]:
         assert word in text, word
 
@@ -157,6 +158,32 @@ def test_without_a_terminal_there_are_single_plain_lines() -> None:
         "0:23 left",
     ]:
         assert word in written[2]
+
+
+def test_a_terminal_too_small_for_every_figure_keeps_those_that_matter() -> None:
+    panel = screen(40, lambda display: display.update(ROW, 0.67, 23.0), height=16)
+    text = "\n".join(panel)
+    assert len(panel) < 16
+    for word in ["iteration   40", "completion  99.5 %", "laps        525", "best lap    9.33 s", "67 %"]:
+        assert word in text, word
+
+
+def test_a_terminal_that_cannot_draw_in_place_gets_plain_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    file = io.StringIO()
+    with ProgressDisplay(Console(file=file, force_terminal=True), HEADER, Clock()) as display:
+        display.update(ROW, 0.67, 23.0)
+    assert "\x1b" not in file.getvalue()
+    assert "iteration 40" in file.getvalue()
+
+
+def test_a_long_training_writes_a_line_a_minute_into_a_log() -> None:
+    def act(display: ProgressDisplay, clock: Clock) -> None:
+        for _ in range(3600):
+            clock.now_s += 1.0
+            display.update(ROW, 0.1, None)
+
+    assert 60 < len(lines(act)) < 130
 
 
 def test_plain_lines_come_at_a_limited_rate_and_the_last_row_is_never_lost() -> None:
