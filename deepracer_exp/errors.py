@@ -72,6 +72,16 @@ def _one_line(text: str) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return `` (did you mean X?)`` for the known word nearest to `word`, or an empty string."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    """Return `` (did you mean X?)`` for the known word nearest to `word`, or an empty string.
+
+    A word that begins with it is nearest, then one that looks like it, and then one that holds it.
+    """
+    words, lower = list(known), word.casefold()
+    long = len(word) > 2
+    close = (
+        [one for one in words if long and one.startswith(word)]
+        or [one for one in words if long and one.casefold().startswith(lower)]
+        or difflib.get_close_matches(word, words, n=1, cutoff=0.5)
+        or [one for one in words if long and lower in one.casefold()]
+    )
     return f" (did you mean {close[0]}?)" if close else ""

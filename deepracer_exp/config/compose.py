@@ -25,10 +25,10 @@ from .custom_files import Beneath, beneath, read_custom_files
 from .evaluation import EvaluateConfig
 from .experiment import Experiment
 from .export import ExportConfig
-from .options import conf_dirs, find, groups, options
+from .options import conf_dirs, find, groups, listed, options
 from .overrides import line_for_hydra, override_line, parse_single, parse_sweep
-from .several_tracks import GROUP as TRACK
-from .several_tracks import in_own_words, several_tracks
+from .track_options import GROUP as TRACK
+from .track_options import by_world_name, complete, in_own_words, register_worlds, several_tracks
 
 Config = TypeVar("Config")
 
@@ -117,7 +117,7 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     """
     overrides = without_passwords(list(overrides))
     given = [parse_single(override) for override in overrides]
-    own = [override for override in given if override.key_or_group != custom_files.KEY]
+    own = [by_world_name(override) for override in given if override.key_or_group != custom_files.KEY]
     for override in own:
         _check_key(entry, override)
     files = _files(given, {one.key_or_group: text for one, text in zip(given, overrides, strict=True)})
@@ -145,7 +145,9 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     assert isinstance(mapping, dict)
     if has_tracks and TRACK in mapping and TRACK not in choices:
         raise BadInput("track: a list of tracks in a file; several are chosen as an override: track=[A,B]")
-    if several is not None:
+    if several is None and has_tracks and isinstance(mapping.get(TRACK), dict):
+        mapping[TRACK] = complete(choices[TRACK], mapping[TRACK])
+    elif several is not None:
         several.put_in_place(mapping)
         choices[TRACK] = f"[{','.join(several.names)}]"
     return Composition(
@@ -161,6 +163,7 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
 def _composed(name: str | None, lines: list[str]) -> DictConfig:
     """Let Hydra put together a file of `conf/`, or what the overrides alone choose, with Hydra's own settings."""
     project, *more = conf_dirs()
+    register_worlds()
     if more:
         lines = [*lines, override_line("hydra.searchpath", [f"file://{folder}" for folder in more])]
     with initialize_config_dir(str(project), version_base="1.3"):
@@ -259,7 +262,7 @@ def _check_key(entry: str, override: Override) -> None:
     if override.package is not None:
         raise BadInput(f"{key}@{override.package}: an option's place is its group's; write {key}=OPTION")
     if key in groups(entry) and not override.is_delete() and not isinstance(value, str | list | None):
-        raise BadInput(f"{override.input_line}: no such {key}; options: {', '.join(options(key))}")
+        raise BadInput(f"{override.input_line}: no such {key}; options: {listed(key, options(key))}")
 
 
 def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
@@ -303,7 +306,7 @@ def _unreadable_file() -> str:
 
 
 def _no_such_option(group: str, option: str, known: Sequence[str]) -> str:
-    return f"{group}={option}: no such {group}{nearest(option, known)}; options: {', '.join(known)}"
+    return f"{group}={option}: no such {group}{nearest(option, known)}; options: {listed(group, known)}"
 
 
 def _unknown_key(entry: str, key: str, chosen: Composition) -> str:

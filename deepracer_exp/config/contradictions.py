@@ -1,8 +1,10 @@
 """Values of an experiment that contradict one another."""
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.formats.worlds import worlds
 
 from .experiment import Experiment
+from .track import TrackConfig
 
 
 def check_together(experiment: Experiment) -> None:
@@ -51,14 +53,28 @@ def check_together(experiment: Experiment) -> None:
         )
     for name, track in experiment.tracks.items():
         key = f"track.{name}" if isinstance(experiment.track, dict) else "track"
-        if not isinstance(track.width_m, float) and len(track.width_m) != len(track.knots):
-            raise BadInput(
-                f"{key}.width_m has {len(track.width_m)} values and {key}.knots {len(track.knots)}: "
-                "give one width, or one per knot"
-            )
+        _check_shape(key, track)
     cars = collector.cars * (collector.processes or 1)
     if cars < len(experiment.tracks):
         raise BadInput(
             f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted "
             f"there: at least {-(-len(experiment.tracks) // (collector.processes or 1))}"
+        )
+
+
+def _check_shape(key: str, track: TrackConfig) -> None:
+    knots, width_m = track.knots, track.width_m
+    if (knots is None) != (width_m is None):
+        there, missing = ("width_m", "knots") if knots is None else ("knots", "width_m")
+        raise BadInput(
+            f"{key}.{there} without {key}.{missing}: a road of one's own has both, a world neither"
+        )
+    if knots is not None and isinstance(width_m, tuple) and len(width_m) != len(knots):
+        raise BadInput(
+            f"{key}.width_m has {len(width_m)} values and {key}.knots {len(knots)}: give one width, or one per knot"
+        )
+    if knots is None and track.file is None and track.name not in worlds():
+        raise BadInput(
+            f"{key}.name={track.name}: no world of the service{nearest(track.name, worlds())}; a track of one's own "
+            "has knots and width_m, or a file"
         )

@@ -1,11 +1,16 @@
 """Where option files lie: the project's `conf/`, and `./conf` of the working folder beside it."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import yaml
 
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.formats.worlds import worlds
+
+MOST_LISTED = 24
+"""Options that fit into a message."""
 
 
 def conf_dir() -> Path:
@@ -27,7 +32,8 @@ def conf_dirs() -> list[Path]:
         for group in sorted(str(path.relative_to(project)) for path in project.rglob("*/") if path.is_dir()):
             for path in sorted((own / group).glob("*.yaml")):
                 namesake = project / group / path.name
-                if namesake.is_file() and namesake.read_bytes() != path.read_bytes():
+                another = namesake.is_file() and namesake.read_bytes() != path.read_bytes()
+                if another or (group == "track" and path.stem in worlds() and not namesake.is_file()):
                     raise BadInput(f"{path}: the project has another {group} of that name; rename the file")
         return [project, own.resolve()]
     except OSError as error:
@@ -50,8 +56,16 @@ def groups(entry: str = "train") -> list[str]:
 
 
 def options(group: str) -> list[str]:
-    """Return the names of a group's options, sorted."""
-    return sorted({path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")})
+    """Return the names of a group's options, sorted; worlds of the service need no file to be tracks."""
+    files = {path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")}
+    return sorted(files | worlds().keys() if group == "track" else files)
+
+
+def listed(group: str, known: Sequence[str]) -> str:
+    """Return a group's options for the end of a message; of many, where they are listed."""
+    if len(known) <= MOST_LISTED:
+        return ", ".join(known)
+    return f"{len(known)}, `deepracer-exp train --options {group}` lists them"
 
 
 def options_of(group: str) -> list[str]:

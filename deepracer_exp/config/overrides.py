@@ -12,6 +12,8 @@ from deepracer_exp.errors import BadInput
 
 # Keys of these mappings are the user's own, so an override may add to them.
 OPEN_MAPPINGS = ("reward.constants",)
+# Options of these groups may leave keys out, which are filled in and checked after Hydra.
+COMPLETED = ("track", "several_tracks")
 # Values of these keys are taken as they are typed: Hydra's grammar has no umlaut, bracket or second equals sign
 # in a value without quotes, and a comma makes a sweep.
 PLAIN_TEXT = (
@@ -60,7 +62,7 @@ def parse_sweep(override: str) -> Override:
 def line_for_hydra(override: Override) -> str:
     """Return the expression that Hydra is to compose."""
     line = override.input_line or ""
-    inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in OPEN_MAPPINGS)
+    inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in (*OPEN_MAPPINGS, *COMPLETED))
     if inside and not override.is_add() and not override.is_force_add() and not override.is_delete():
         return f"++{line}"
     return line

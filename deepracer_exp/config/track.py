@@ -24,24 +24,24 @@ class FloorConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackConfig:
-    """A course given by spline knots, or by a file that replaces them."""
+    """A course: a world of the service, spline knots, or a file."""
 
     name: str
-    """The world's name in the DeepRacer service."""
+    """The world's name in the DeepRacer service; of a track with knots or a file, any."""
     title: str
-    closed: bool
-    """Whether the last knot joins the first."""
     direction: Literal["forward", "reversed", "alternate"]
-    """Drive in the order of the knots (or route rows), against it, or so and so in turn, episode by episode."""
+    """Drive in the order of the waypoints (or knots), against it, or so and so in turn, episode by episode."""
     weight: Positive
     """How many of the cars drive here, relative to the other tracks of the experiment."""
-    width_m: Positive | tuple[Positive, ...]
-    """Distance between the borders in metres: one number, or one per knot."""
-    knots: tuple[Point, ...]
-    """Centre-line spline knots (x, y) in metres, evenly spaced in arc length."""
-    floor: FloorConfig
     file: str | None
-    """A route (.npy) or a YAML of knots that takes the place of name, title, closed, width_m and knots."""
+    """A route (.npy) or a YAML of knots that takes the place of the world or the knots."""
+    knots: tuple[Point, ...] | None
+    """Centre-line spline knots (x, y) in metres, which take the place of the world."""
+    width_m: Positive | tuple[Positive, ...] | None
+    """Distance between the borders of a road of knots in metres: one number, or one per knot."""
+    closed: bool
+    """Whether the last knot joins the first."""
+    floor: FloorConfig
 
 
 def _kind(value: Any) -> str:

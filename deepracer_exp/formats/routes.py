@@ -1,6 +1,8 @@
-"""Course files: AWS's route arrays (.npy) and YAML files of spline knots."""
+"""Course files: the service's worlds, its route arrays (.npy), and YAML files of spline knots."""
 
 import math
+import zipfile
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +11,7 @@ import numpy as np
 from deepracer_exp.errors import BadInput, nearest, reading
 
 from .user_file import ROUTE_BYTES, open_user_file, read_yaml
+from .worlds import FILE, ROUTES, UNITS_PER_M, worlds
 
 REPEAT_M = 1e-9
 """A point closer than this to the one before it repeats it."""
@@ -86,6 +89,30 @@ def checked_rows(rows: np.ndarray) -> np.ndarray:
 def is_first_of_equals(points: np.ndarray) -> np.ndarray:
     """Tell for points (n, 2) in metres whether each differs from the one before it (bool); the first does."""
     return np.linalg.norm(np.diff(points, axis=0, prepend=np.inf), axis=1) >= REPEAT_M
+
+
+@cache
+def world_rows(name: str) -> np.ndarray:
+    """Return a world's route rows (n, 6) float64, read-only: centre x, y, inner x, y, outer x, y in metres."""
+    first = 0
+    for world in worlds().values():
+        if world.name == name:
+            break
+        first += world.rows
+    rows = _units()[first : first + worlds()[name].rows] / UNITS_PER_M
+    rows.flags.writeable = False
+    return rows
+
+
+@cache
+def _units() -> np.ndarray:
+    """Return the rows of all worlds (rows, 6) int64 in units of 0.1 mm."""
+    with zipfile.ZipFile(FILE) as file, file.open(ROUTES) as member:
+        bends = np.lib.format.read_array(member, allow_pickle=False)
+    ends = np.cumsum([world.rows for world in worlds().values()])
+    # Each world is stored as its second differences.
+    parts = np.split(bends.astype(np.int64), ends[:-1])
+    return np.concatenate([part.cumsum(axis=0).cumsum(axis=0) for part in parts])
 
 
 def read_knots(path: str | Path) -> Knots:

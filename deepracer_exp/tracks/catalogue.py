@@ -1,13 +1,13 @@
 """The service's worlds as courses, and which of them a recording was driven on."""
 
-import zipfile
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.formats.worlds import FILE, ROUTES, UNITS_PER_M, find_world, worlds
+from deepracer_exp.formats.routes import world_rows
+from deepracer_exp.formats.worlds import find_world, worlds
 
 from .track import PLAIN_FLOOR, Track
 
@@ -22,19 +22,6 @@ class Recognised(NamedTuple):
     reversed: bool
     distance_m: float
     """Mean distance between the recorded places and the waypoints recorded as closest."""
-
-
-@cache
-def world_rows(name: str) -> np.ndarray:
-    """Return a world's route rows (n, 6) float64, read-only: centre x, y, inner x, y, outer x, y in metres."""
-    first = 0
-    for world in worlds().values():
-        if world.name == name:
-            break
-        first += world.rows
-    rows = _units()[first : first + worlds()[name].rows] / UNITS_PER_M
-    rows.flags.writeable = False
-    return rows
 
 
 @cache
@@ -78,14 +65,3 @@ def recognise(points: np.ndarray, closest_waypoint: np.ndarray) -> list[Recognis
                 found.append(Recognised(world.name, reversed, float(away_m.mean())))
     near = [one for one in found if one.distance_m < NEAR_M]
     return sorted(near, key=lambda one: round(one.distance_m, 6))
-
-
-@cache
-def _units() -> np.ndarray:
-    """Return the rows of all worlds (rows, 6) int64 in units of 0.1 mm."""
-    with zipfile.ZipFile(FILE) as file, file.open(ROUTES) as member:
-        bends = np.lib.format.read_array(member, allow_pickle=False)
-    ends = np.cumsum([world.rows for world in worlds().values()])
-    # Each world is stored as its second differences.
-    parts = np.split(bends.astype(np.int64), ends[:-1])
-    return np.concatenate([part.cumsum(axis=0).cumsum(axis=0) for part in parts])

@@ -12,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.config.track import FloorConfig, TrackConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.routes import checked_rows, read_knots, read_route
+from deepracer_exp.formats.routes import checked_rows, read_knots, read_route, world_rows
 
 from .road import Bands, build_bands, road_area
 from .segments import Segments, build_segments
@@ -133,7 +133,7 @@ class Track:
 
     @classmethod
     def from_config(cls, config: TrackConfig, reversed: bool | None = None) -> "Track":
-        """Build the course an experiment names; `config.file` takes the place of its knots.
+        """Build the course an experiment names: a world of the service, or what its file or knots say.
 
         Args:
             config: What is driven on.
@@ -146,6 +146,9 @@ class Track:
         if config.file is not None:
             with _blaming("track.file"):
                 return _from_file(Path(config.file), backwards, config.floor)
+        if config.knots is None:
+            rows, title = world_rows(config.name), config.title
+            return cls.from_route(rows, config.name, title=title, reversed=backwards, floor=config.floor)
         with _blaming(f"track {config.name}"):
             return cls.from_knots(
                 np.array(config.knots, np.float64).reshape(-1, 2),

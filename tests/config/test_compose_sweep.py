@@ -130,7 +130,7 @@ def test_ready_made_keys_of_a_group_chosen_on_the_command_line_are_optional():
 def test_an_options_pattern_stands_for_the_options_of_today():
     request = compose_sweep(["network=glob([mlp_*], exclude=*_shared)"])
     assert request.space == {"network": "choice(mlp_deep,mlp_small)"}
-    assert dimension("track", "glob(2022*)") == Choices(("2022_summit_speedway",))
+    assert dimension("track", "glob(*summit_speedway)") == Choices(("2022_summit_speedway",))
 
 
 # --- What is refused

@@ -4,7 +4,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import conf_dir, conf_dirs, groups, options
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, nearest
 
 
 @pytest.fixture
@@ -82,3 +82,35 @@ def test_any_path_of_the_working_folder_will_do(tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     own(folder, "budget/mine.yaml", BUDGET)
     assert compose_experiment(["budget=mine"])[0].budget.env_steps == 777
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("reinvent", "reinvent_base"),
+        ("OVAL", "Oval_track"),
+        ("champ", "2022_reinvent_champ_ccw"),
+        ("reinvnt_wod", "reinvent_wood"),
+        ("moon", None),
+        ("", None),
+    ],
+)
+def test_what_begins_with_a_word_is_nearer_than_what_looks_like_it(word, meant):
+    assert nearest(word, options("track")) == (f" (did you mean {meant}?)" if meant else "")
+
+
+def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(here):
+    own(here, "track/mine.yaml", "width_m: 0.76\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
+    overrides = ["track.direction=reversed", "track.floor.friction=0.5"]
+    track = compose_experiment(["track=mine", *overrides])[0].track
+    assert (track.name, track.title, track.width_m, track.closed) == ("mine", "mine", 0.76, True)
+    assert (track.direction, track.floor.friction, track.floor.road_color) == ("reversed", 0.5, "#4a4d52")
+    several = compose_experiment(["track=[mine,Oval_track]", "track.mine.weight=2"])[0].tracks
+    assert [(track.name, track.weight) for track in several.values()] == [("mine", 2), ("Oval_track", 1)]
+    assert "mine" in compose_experiment(["track=all"])[0].tracks
+
+
+def test_a_track_of_ones_own_does_not_take_the_name_of_a_world(here):
+    own(here, "track/Oval_track.yaml", "width_m: 0.76\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
+    with pytest.raises(BadInput, match=r"Oval_track\.yaml: the project has another track of that name"):
+        compose_experiment([])

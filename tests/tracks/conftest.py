@@ -4,10 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
-from pydantic import TypeAdapter
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.tracks.track import Track
 
@@ -16,9 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 @cache
 def compose_track(name: str, *overrides: str) -> TrackConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        composed = compose(overrides=[f"+track={name}", *overrides])
-    return TypeAdapter(TrackConfig).validate_python(OmegaConf.to_container(composed.track))
+    return compose_experiment([f"track={name}", *overrides])[0].track
 
 
 @pytest.fixture(scope="session")

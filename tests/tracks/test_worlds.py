@@ -64,10 +64,22 @@ def test_every_world_makes_a_course_with_all_its_rows(name):
     found = track.project(track.waypoints)
     assert np.isfinite(found.heading_rad).all()
     assert (np.diff(found.ndist[:-1]) >= 0).all()
-    # A waypoint is behind itself; of waypoints that repeat each other, it is the last.
-    repeats_next = np.r_[~is_first_of_equals(track.waypoints)[1:], False]
-    number = np.arange(len(rows) - 1)
-    np.testing.assert_array_equal(found.previous[:-1], (number + repeats_next[:-1]))
+    assert track.road.geom_type == "Polygon"
+    assert len(track.road.interiors) == track.closed
+    assert track.on_road(track.points_at(np.linspace(0.001, 0.999, 1000))).all()
+
+
+def test_a_repeated_waypoint_has_two_numbers_and_one_direction():
+    track = world_track("Spain_track")
+    (second,) = np.flatnonzero(~is_first_of_equals(track.waypoints))
+    place = track.project(track.waypoints[second][None]).ndist
+    around = track.points_at(place[:, None] + np.array([[-1e-4, 0.0, 1e-4]]))[0]
+    found = track.project(around)
+    assert found.previous.tolist() == [second - 2, second, second]
+    assert found.next.tolist() == [second - 1, second + 1, second + 1]
+    pose = track.start_pose(place)
+    toward = track.waypoints[second + 1] - track.waypoints[second]
+    assert pose.yaw_rad == pytest.approx(np.arctan2(toward[1], toward[0]))
 
 
 def test_59_worlds_have_a_waypoint_twice():

@@ -1,24 +1,35 @@
-"""Several tracks at once: `track=[A,B]` or `track=all`, and overrides of one of them or of all.
+"""The options of the group `track`: the service's worlds and tracks of one's own, one or several at once.
 
-Hydra composes each option into a place of its own under `PLACE`; afterwards they stand by their names under `track`.
+Worlds need no files: they are registered with Hydra by name. What an option does not say is as in
+`conf/track/reinvent_base.yaml`, so that a track of one's own needs no more than `knots` and `width_m`.
+
+Of several (`track=[A,B]`, `track=all`) Hydra composes each into a place of its own under `PLACE`; afterwards they stand
+by their names under `track`.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
+import yaml
+from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override
 
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.formats.worlds import find_world, leaders, worlds
 
-from .options import options
-from .overrides import parse_single
+from .options import conf_dir, listed, options
+from .overrides import override_line, parse_single
 from .track import TrackConfig
 
 GROUP = "track"
 ALL = "all"
 PLACE = "several_tracks"
+BASE = "reinvent_base"
+"""The option whose values hold where another one says nothing."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +45,50 @@ class SeveralTracks:
     def put_in_place(self, mapping: dict[Any, Any]) -> None:
         """Put the tracks under `track`, by their names."""
         places = mapping.pop(PLACE)
-        mapping[GROUP] = {name: places[_place(at)] for at, name in enumerate(self.names)}
+        mapping[GROUP] = {name: complete(name, places[_place(at)]) for at, name in enumerate(self.names)}
+
+
+@cache
+def register_worlds() -> None:
+    """Make every world that has no file in `conf/track` an option that Hydra finds."""
+    store = ConfigStore.instance()
+    files = {path.stem for path in (conf_dir() / GROUP).glob("*.yaml")}
+    for world in (world for name, world in worlds().items() if name not in files):
+        store.store(group=GROUP, name=world.name, node={"name": world.name, "title": world.title})
+
+
+def complete(option: str, values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return a track's values with those of `BASE` where it has none; its name is its option's."""
+    return _over(_base() | {"name": option, "title": values.get("name", option)}, values)
+
+
+@cache
+def _base() -> dict[Any, Any]:
+    values = yaml.safe_load((conf_dir() / GROUP / f"{BASE}.yaml").read_text(encoding="utf-8"))
+    assert isinstance(values, dict)
+    return values
+
+
+def _over(below: Mapping[Any, Any], values: Mapping[Any, Any]) -> dict[Any, Any]:
+    laid = deepcopy(dict(below))
+    for key, value in values.items():
+        both = isinstance(value, dict) and isinstance(laid.get(key), dict)
+        laid[key] = _over(laid[key], value) if both else value
+    return laid
+
+
+def by_world_name(override: Override) -> Override:
+    """Return the choice of a track by the world's own name where it is given by its official one."""
+    value = override.value()
+    if override.key_or_group != GROUP or not isinstance(value, str | list):
+        return override
+    known = options(GROUP)
+
+    def own(name: object) -> object:
+        return name if name in (ALL, *known) or "/" in str(name) else find_world(str(name)) or name
+
+    named = [own(name) for name in value] if isinstance(value, list) else own(value)
+    return override if named == value else parse_single(override_line(GROUP, named))
 
 
 def several_tracks(own: Sequence[Override]) -> SeveralTracks | None:
@@ -47,7 +101,8 @@ def several_tracks(own: Sequence[Override]) -> SeveralTracks | None:
     value = chosen[-1].value() if chosen else None
     known = options(GROUP)
     if value == ALL and ALL not in known:
-        names = tuple(known)
+        variants = worlds().keys() - set(leaders())
+        names = tuple(name for name in known if name not in variants)
     elif isinstance(value, list):
         names = tuple(str(name) for name in value)
         _check(chosen[-1].input_line or "", names, known)
@@ -87,11 +142,13 @@ def _moved(override: Override, prefix: str, at: int) -> Override:
 def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
     if not names:
         raise BadInput(
-            f"{line}: no track; accepted: {GROUP}=[A,B], {GROUP}={ALL}; tracks: {', '.join(known)}"
+            f"{line}: no track; accepted: {GROUP}=[A,B], {GROUP}={ALL}; tracks: {listed(GROUP, known)}"
         )
     for at, name in enumerate(names):
         if name not in known:
-            raise BadInput(f"{line}: no such track {name}{nearest(name, known)}; options: {', '.join(known)}")
+            raise BadInput(
+                f"{line}: no such track {name}{nearest(name, known)}; options: {listed(GROUP, known)}"
+            )
         if name in names[:at]:
             raise BadInput(
                 f"{line}: {name} stands there twice; {GROUP}.{name}.weight=2 gives it twice the cars"

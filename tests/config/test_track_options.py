@@ -1,10 +1,14 @@
 import re
+from dataclasses import fields
 
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment, expand_grid
-from deepracer_exp.config.options import options
+from deepracer_exp.config.overrides import parse_single
+from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.config.track_options import by_world_name
 from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.worlds import find_world, leaders, worlds
 
 TWO = "track=[Oval_track,Bowtie_track]"
 
@@ -38,8 +42,35 @@ def test_a_list_of_one_is_a_mapping_too():
     assert list(compose_experiment(["track=[Oval_track]"])[0].track) == ["Oval_track"]
 
 
-def test_all_are_all_options():
-    assert list(tracks("track=all")) == options("track")
+def test_all_are_the_first_world_of_each_family():
+    assert set(tracks("track=all")) == set(leaders())
+
+
+@pytest.mark.parametrize("variant", ["Oval_track", "reInvent2019_wide_mirrored", "2024_reinvent_champ_cw"])
+def test_a_world_is_named_in_the_configuration_and_not_copied_into_it(variant):
+    experiment, composition = compose_experiment([f"track={variant}"])
+    assert (experiment.track.name, composition.choices["track"]) == (variant, variant)
+    assert composition.mapping["track"]["knots"] is None
+    assert composition.mapping["track"].keys() == {field.name for field in fields(TrackConfig)}
+
+
+@pytest.mark.parametrize("world", worlds().values(), ids=lambda world: world.name)
+def test_an_official_name_is_understood_as_it_is_typed(world):
+    for title in {world.title, world.title.lower()}:
+        (override,) = (by_world_name(parse_single(f"track={title}")),)
+        assert override.value() == find_world(world.title)
+        assert by_world_name(parse_single(f"track=[{title},Oval_track]")).value()[0] == find_world(
+            world.title
+        )
+
+
+def test_an_official_name_is_a_track_of_several_and_of_a_sweep():
+    assert list(tracks("track=[Ace Speedway,2022 re:Invent Championship]")) == [
+        "2022_april_open",
+        "2022_reinvent_champ_ccw",
+    ]
+    lines = expand_grid(["track=Oval_track,Ace Speedway"])
+    assert [compose_experiment(line)[0].track.name for line in lines] == ["Oval_track", "2022_april_open"]
 
 
 def test_the_order_is_that_of_the_list():
@@ -103,7 +134,10 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
         ([TWO, "track.Monaco.weight=2"], "Monaco is neither a chosen track nor a key of all tracks"),
         ([TWO, "track.wieght=2"], r"wieght is neither .* \(did you mean weight\?\)"),
         ([TWO, "track.floor.frction=2"], r"track.floor.frction: no such key \(did you mean friction\?\)"),
-        ([TWO, "track.Oval_track.wieght=2"], r"track.wieght: no such key with track=Oval_track"),
+        (
+            [TWO, "track.Oval_track.wieght=2"],
+            r"track.Oval_track.wieght: no such key \(did you mean weight\?\)",
+        ),
         ([TWO, "track.Oval_track.weight=0"], "track.Oval_track.weight=0: input should be greater than 0"),
         (
             [TWO, "track.Oval_track.weight=abc"],
@@ -112,7 +146,7 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
         ([TWO, "track.direction=sideways"], 'track.Oval_track.direction="sideways": input should be'),
         (
             [TWO, "track.Oval_track.width_m=[1,2]"],
-            "track.Oval_track.width_m has 2 values and track.Oval_track",
+            "track.Oval_track.width_m without track.Oval_track.knots",
         ),
         ([TWO, "+track.Oval_track.foo=2"], "track.Oval_track.foo: no such key"),
         (["track.Oval_track.weight=2"], r"accepted where several tracks are chosen .* it is track.weight"),
