@@ -8,11 +8,11 @@ the twelve tracks, forward and reversed, from 20 starts spread evenly over the l
 action. Completion is the mean share of the lap that was driven until the episode ended (0 to 1); laps is the share of
 complete laps.
 
-The tracks were chosen by a rule, before any result was looked at. Of the catalogue, the straight track (its ends
-make it another task), the copies of reinvent_base with other floors, and the two widest, Monaco and caecer_loop, are
-left out. The twelve that remain are sorted by width (then by name) and taken in pairs of neighbours. The first pair
-gives its narrower track to SEEN, the second its wider one, and so on in turn, so that both lists have about the same
-widths: 0.67 to 1.16 m, mean 0.91 m, and 0.72 to 1.07 m, mean 0.89 m.
+The tracks were chosen by a rule, before any result was looked at. Of the eighteen of `all_tracks`, the straight track
+(its ends make it another task), the copies of reinvent_base with other floors, and the two widest, Monaco and
+caecer_loop, are left out. The twelve that remain are sorted by width (then by name) and taken in pairs of neighbours.
+The first pair gives its narrower track to SEEN, the second its wider one, and so on in turn, so that both lists have
+about the same widths: 0.67 to 1.16 m, mean 0.91 m, and 0.72 to 1.07 m, mean 0.89 m.
 """
 
 import argparse

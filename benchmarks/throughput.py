@@ -9,7 +9,7 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
   the call counts.
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
   experiment's without its `reward_batch`), episodes begun anew as they end.
-- `all_tracks_over_one_env` (a ratio): the same on all tracks of the catalogue at once, over the figure on one track.
+- `all_tracks_over_one_env` (a ratio): the same on eighteen tracks at once, over the figure on one track.
 - `collect_steps_per_s`: batches of an iteration's frames through `Collection` in sync mode with 1 and 2 worker
   processes, the experiment's cars per process, its network sampling actions with its first weights.
 - `train_steps_per_s`: `deepracer-exp train` as a process of its own without MLflow: collection, update, trace, metrics,
@@ -47,6 +47,7 @@ from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.training.collection import Collection, cores
 
+from .all_tracks import TRACKS
 from .command import read_metrics, train
 from .driving import SameDriving
 from .report import machine, number, table, write_json
@@ -86,7 +87,7 @@ def driving(overrides: Sequence[str], n_cars: int, rounds: int, seconds: float) 
     """Measure physics and environment, and the environment on all tracks."""
     same = SameDriving(compose_experiment(overrides)[0], n_cars)
     everywhere = SameDriving(
-        compose_experiment([*overrides, "track=all", f"collector.cars={n_cars}"])[0], n_cars
+        compose_experiment([*overrides, f"track=[{','.join(TRACKS)}]", f"collector.cars={n_cars}"])[0], n_cars
     )
     return in_turns(
         rounds,

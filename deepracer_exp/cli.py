@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     validate.add_argument("overrides", nargs="*", metavar="reward=NAME | reward.file=PATH | KEY=VALUE")
-    validate.add_argument("-o", "--output", help="picture to write (default: REWARD-TRACK.png)")
+    validate.add_argument("-o", "--output", help="picture to write (default: runs/validate/REWARD-TRACK.png)")
     validate.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
     validate.set_defaults(command=_validate, runs_rewards=True)
 
@@ -184,10 +184,10 @@ def _parser() -> argparse.ArgumentParser:
     tracks = commands.add_parser(
         "tracks",
         help="list the tracks, or draw one",
-        description="List the tracks with length, width and shape; with a name, write a picture of that track.",
+        description="List the tracks with length, width and variants; with a name, draw that track.",
     )
     tracks.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
-    tracks.add_argument("-o", "--output", help="picture to write (default: NAME.png)")
+    tracks.add_argument("-o", "--output", help="also write a picture of it")
     tracks.set_defaults(command=_tracks)
 
     ui = commands.add_parser(
@@ -328,32 +328,14 @@ def _tell_notes(notes: Iterable[str]) -> None:
 
 
 def _tracks(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.config.options import options
-    from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
-    from deepracer_exp.tracks.track import Track
+    from rich.console import Console
 
-    def load(override: str) -> Track:
-        tracks = compose_experiment([override])[0].tracks
-        if len(tracks) > 1:
-            raise BadInput(f"{override}: {len(tracks)} tracks; accepted: one to draw")
-        (config,) = tracks.values()
-        return Track.from_config(config)
+    from deepracer_exp.commands.tracks import list_tracks, show_track
 
-    if args.name is not None:
-        is_file = Path(args.name).suffix in (".npy", ".yaml", ".yml")
-        track = load(f"track.file={args.name}" if is_file else f"track={args.name}")
-        output = Path(args.output or f"{track.name}.png")
-        try:
-            draw_picture(track, output)
-        except (OSError, ValueError) as error:
-            raise BadInput(f"--output {output}: cannot be written: {error}") from error
-        print(f"{track.title}: {track.length_m:.2f} m, {track.width_m:.2f} m wide -> {output}")
-        return 0
-    for name in options("track"):
-        track = load(f"track={name}")
-        print(f"\n{name} ({track.title}): {track.length_m:.2f} m, {track.width_m:.2f} m wide")
-        print(draw_terminal(track, columns=48, rows=12))
+    if args.name is None:
+        list_tracks(Console(width=None if sys.stdout.isatty() else 160))
+    else:
+        show_track(args.name, args.output)
     return 0
 
 

@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ import yaml
 
 from deepracer_exp import __version__
 from deepracer_exp.config.options import groups, options
+from deepracer_exp.formats.worlds import leaders, worlds
 
 HEAVY = (
     "torch",
@@ -128,10 +130,22 @@ def test_a_grid_runs_every_combination_and_prints_a_table(call):
         assert folder.name in table
 
 
-def test_tracks_lists_every_track_with_its_measures(call):
-    text = call("tracks").stdout
-    for name in options("track"):
-        assert f"\n{name} (" in text
+def test_tracks_lists_each_family_once_with_its_variants(call):
+    lines = [line.split() for line in call("tracks").stdout.splitlines()]
+    named = {line[0]: line for line in lines if line}
+    assert set(leaders()) <= named.keys()
+    assert not (worlds().keys() - set(leaders())) & named.keys()
+    assert named["2022_april_open"][-5:] == ["50.30", "1.07", "169", "…_ccw", "…_cw"]
+    assert named["reinvent_base"][-1] == "reinvent_wood"
+
+
+def test_tracks_draws_one_with_its_waypoint_numbers_and_writes_nothing_unasked(call, tmp_path):
+    text = call("tracks", "Circuit de Barcelona-Catalunya").stdout
+    assert text.startswith(
+        "Circuit de Barcelona-Catalunya (Spain_track): 60.00 m, 0.91 m wide, 259 waypoints"
+    )
+    assert len(re.findall(r"\b\d{1,2}0\b", text.partition("\n")[2])) > 5
+    assert not list(tmp_path.iterdir())
 
 
 def test_tracks_draws_a_picture_of_one(call, tmp_path):
@@ -144,7 +158,7 @@ def test_tracks_draws_a_picture_of_one(call, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["tracks", "reinvent_bse"], "did you mean reinvent_base?"),
+        (["tracks", "reinvent"], "did you mean reinvent_base?"),
         (["tracks", "missing.npy"], "missing.npy"),
         (["tracks", "reinvent_base", "-o", "no/such/folder.png"], "no/such/folder.png"),
         (["tracks", "reinvent_base", "-o", "picture.nothing"], "picture.nothing"),

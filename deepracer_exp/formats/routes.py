@@ -93,7 +93,14 @@ def is_first_of_equals(points: np.ndarray) -> np.ndarray:
 
 @cache
 def world_rows(name: str) -> np.ndarray:
-    """Return a world's route rows (n, 6) float64, read-only: centre x, y, inner x, y, outer x, y in metres."""
+    """Return a world's route rows (n, 6) float64, read-only: centre x, y, inner x, y, outer x, y in metres.
+
+    Raises:
+        BadInput: there is no such world.
+    """
+    if name not in worlds():
+        known = f"`deepracer-exp tracks` lists all {len(worlds())}"
+        raise BadInput(f"{name}: no such world{nearest(name, worlds())}; {known}")
     first = 0
     for world in worlds().values():
         if world.name == name:

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.formats.routes import world_rows
 from deepracer_exp.formats.worlds import find_world, worlds
 
@@ -35,14 +34,9 @@ def world_track(name: str, reversed: bool = False) -> Track:
     Raises:
         BadInput: there is no such world.
     """
-    found = find_world(name)
-    if found is None:
-        raise BadInput(
-            f"{name}: no such world{nearest(name, worlds())}; `deepracer-exp tracks` lists all {len(worlds())}"
-        )
-    return Track.from_route(
-        world_rows(found), found, title=worlds()[found].title, reversed=reversed, floor=PLAIN_FLOOR
-    )
+    found = find_world(name) or name
+    rows = world_rows(found)
+    return Track.from_route(rows, found, title=worlds()[found].title, reversed=reversed, floor=PLAIN_FLOOR)
 
 
 def recognise(points: np.ndarray, closest_waypoint: np.ndarray) -> list[Recognised]:

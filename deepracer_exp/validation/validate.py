@@ -9,6 +9,7 @@ from rich.table import Table
 
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.errors import BadInput
 
 from .check import Check, look_closer, other_direction, read, try_scenes
 from .probe import NOT_CALLED
@@ -32,7 +33,7 @@ def validate(
     Args:
         experiment: the reward function, the track, the car and the action space.
         trial: the same, as a short training; None: no training.
-        output: the picture to write; None: named after reward function and track, in the current folder.
+        output: the picture to write; None: named after reward function and track, beside the runs.
         strict: what the AWS console would refuse is refused.
         out: for the report.
         err: for the progress of the trial.
@@ -48,18 +49,34 @@ def validate(
     setup = check.setup
     out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
     _tell_console(out, check)
+    (track,) = experiment.tracks.values()
+    if track.file is not None or track.knots is not None:
+        _line(
+            out, "Waypoints: numbered as in the track's own file or knots, not as in any world of the service"
+        )
     against = other_direction(experiment)
     try_scenes(check, against)
     _tell_scenes(out, check)
     if not check.failures:
         look_closer(check, against)
     if not check.failures:
-        _draw(out, check, output)
+        _draw(out, check, _beside_the_runs(experiment, check) if output is None else Path(output))
     _tell_lines(out, "Warnings", "yellow", check.warnings)
     _tell_lines(out, "Failures", "red", check.failures)
     if trial is not None and not check.failures and not (strict and check.console):
         _tell_trial(out, run_trial(*trial, err))
     return _verdict(out, check, strict)
+
+
+def _beside_the_runs(experiment: Experiment, check: Check) -> Path:
+    folder = Path(experiment.runs_dir) / "validate"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(
+            f"{folder}: cannot be made: {error.strerror}; runs_dir or --output says where else"
+        ) from None
+    return folder / f"{check.setup.reward.name}-{check.setup.track.name}.png"
 
 
 def _line(out: Console, text: str, style: str | None = None) -> None:
@@ -96,7 +113,7 @@ def _time(microseconds: float) -> str:
     return f"{microseconds:.3g} us" if microseconds < 1000 else f"{microseconds / 1000:,.3g} ms"
 
 
-def _draw(out: Console, check: Check, output: str | None) -> None:
+def _draw(out: Console, check: Check, path: Path) -> None:
     paid = f"Pays {check.lowest:.4g} to {check.highest:.4g} a step, in {check.situations:,} situations"
     if check.memory == "earlier calls":
         paid += "; what it pays depends on earlier calls"
@@ -105,7 +122,6 @@ def _draw(out: Console, check: Check, output: str | None) -> None:
         _line(out, "No map and no laps: a call takes too long")
         return
     setup = check.setup
-    path = Path(output or f"{setup.reward.name}-{setup.track.name}.png")
     draw_reward_map(setup, check.surveyor, check.survey, check.memory, check.detail, path)
     _line(out, f"What it pays for: {shlex.quote(str(path))}")
 

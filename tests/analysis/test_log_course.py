@@ -10,6 +10,7 @@ import pytest
 from deepracer_exp.analysis.log_course import catalogue_track, find_courses
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.sectors import sectors_of
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import Recording
 from deepracer_exp.tracks.catalogue import world_rows
@@ -110,11 +111,9 @@ def test_of_several_courses_the_most_driven_one_is_shown_unless_another_is_asked
 
 
 def test_a_run_of_ours_has_its_courses_in_its_configuration(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[2] / "conf/track/Oval_track.yaml").read_text(encoding="utf-8")
-    lines = [line for line in text.replace("name: Oval_track", "name: mine").splitlines() if line[:1] != "#"]
-    (tmp_path / "config.yaml").write_text(
-        "track:\n" + "\n".join(f"  {line}" for line in lines), encoding="utf-8"
-    )
+    knots = catalogue_track("Oval_track").waypoints[:-1:4].tolist()
+    overrides = ["track.name=mine", f"track.knots={knots}".replace(" ", ""), "track.width_m=0.67"]
+    (tmp_path / "config.yaml").write_text(compose_experiment(overrides)[1].yaml(), encoding="utf-8")
     recording = replace(
         renamed(made_up_recording([Drive()], course="Oval_track"), "mine"), files=(tmp_path / "config.yaml",)
     )

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from benchmarks import all_tracks, generalisation, sb3_peer, throughput, time_to_lap
 from benchmarks.driving import PASS_STEPS, SameDriving, scalar_setup
 from benchmarks.report import median, table
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.tracks.catalogue import world_track
 
 # One process and one iteration; any 3 episodes count as reliable.
 SHORTEST = (
@@ -137,8 +137,7 @@ def test_the_tracks_seen_and_unseen_follow_from_widths_alone() -> None:
         "Monaco",
         "caecer_loop",
     )
-    files = Path(__file__).parents[2].glob("conf/track/*.yaml")
-    widths_m = {file.stem: yaml.safe_load(file.read_text()).get("width_m") for file in files}
+    widths_m = {name: round(world_track(name).width_m, 3) for name in all_tracks.TRACKS}
     ordered = sorted(widths_m.keys() - set(left_out), key=lambda name: (widths_m[name], name))
     pairs = [ordered[place : place + 2] for place in range(0, len(ordered), 2)]
     seen = [pair[turn % 2] for turn, pair in enumerate(pairs)]

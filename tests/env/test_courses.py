@@ -223,7 +223,7 @@ def test_gym_cars_are_shared_out_and_each_track_needs_one():
 
 
 def test_all_tracks_drive_together():
-    race = Race(build_setup(compose_experiment(["track=all", "track.direction=alternate"])[0]), 36)
-    drive(race, np.full((3, 36), 2))
+    race = Race(build_setup(compose_experiment(["track=all"])[0]), 63)
+    drive(race, np.full((3, 63), 2))
     assert np.isfinite(race.observation).all()
     assert len(set(race.trace[:, PACKED["track"]])) == len(race.setup.courses)

@@ -24,9 +24,17 @@ def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
     assert ended.code == 0
     assert "AWS console: would take it" in ended.stdout
     assert ended.stdout.splitlines()[-1].startswith("Verdict: can be trained")
-    picture = tmp_path / "progress_gain-reinvent_base.png"
+    picture = tmp_path / "runs/validate/progress_gain-reinvent_base.png"
     assert picture.name in ended.stdout
     assert imread(picture).shape[1] > 400
+
+
+@pytest.mark.parametrize(("track", "own"), [("track=Oval_track", False), ("track.file=square.yaml", True)])
+def test_waypoint_numbers_that_no_world_has_are_noted(call, tmp_path, track, own):
+    (tmp_path / "square.yaml").write_text("width_m: 0.8\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
+    ended = call("validate", "reward=speed_on_track", track)
+    assert ("not as in any world of the service" in ended.stdout) == own
+    assert {path.parent.name for path in tmp_path.rglob("*.png")} == {"validate"}
 
 
 def test_pictures_of_other_rewards_are_other_pictures(call, tmp_path):
@@ -53,7 +61,7 @@ def test_what_cannot_be_used_here_exits_with_2_and_draws_nothing(call, tmp_path)
     assert ended.code == 2
     assert "failed" in ended.stdout
     assert ended.stdout.splitlines()[-1].startswith("Verdict: cannot be used: raised ZeroDivisionError")
-    assert not list(tmp_path.glob("*.png"))
+    assert not list(tmp_path.rglob("*.png"))
 
 
 @pytest.mark.parametrize(
@@ -92,7 +100,7 @@ def test_a_picture_that_cannot_be_written_is_one_line(call):
 def test_open_and_crossing_tracks_are_drawn_too(call, tmp_path, track):
     ended = call("validate", "reward=follow_center_line", f"track={track}", "track.direction=reversed")
     assert ended.code == 0
-    assert (tmp_path / f"follow_center_line-{track}.png").exists()
+    assert (tmp_path / f"runs/validate/follow_center_line-{track}.png").exists()
 
 
 def test_a_continuous_action_space_and_a_single_action_are_fine(call, tmp_path):
