@@ -2,6 +2,7 @@
 
 import html
 import math
+import random
 from collections.abc import Callable, Sequence
 from itertools import accumulate, combinations
 from typing import Any
@@ -17,8 +18,13 @@ from .fates import FATES, fate_of, words
 from .labels import MEASURES, number, objectives_of, short_keys, shown
 
 INK, FAINT, GRID = "#22262b", "#6b727d", "#e9ecef"
-FEWEST_COMPLETE = 8
-"""Complete trials below which a parameter's importance is chance: the best quarter would be one trial."""
+FEWEST_COMPLETE = 20
+"""Complete trials below which a parameter's importance is chance: the best quarter would be less than five trials."""
+_RESAMPLES = 40
+_FAR = 5.0
+"""Times the distance from the best to the median, from which on worse trials stand at the edge of an axis."""
+_NEAR = 0.25
+"""Share of the best value that a trial may be worse by without standing at the edge."""
 _MOST_PARAMETERS = 12
 _STEPS = tuple(step * 10.0**decade for decade in range(-3, 6) for step in (1, 2, 5))
 
@@ -98,22 +104,26 @@ def styled(figure: go.Figure, title: str, height: int, *, legend: bool = True) -
     return figure
 
 
-def ceiling(objective: str, complete: Sequence[float], values: Sequence[float]) -> float | None:
-    """Return where an axis of seconds ends and what is slower stands at its edge; None: all fits.
+def usual_range(complete: Sequence[float], values: Sequence[float], minimize: bool) -> tuple[float, float]:
+    """Return the ends of an axis that trials far worse than the better half do not squeeze: these stand at its edge.
 
     A trial without a lap comes to ten times the seconds of one with laps, beside which all laps look the same.
 
     Args:
-        objective: its name.
-        complete: what the complete trials came to.
-        values: what all trials came to.
+        complete: what the complete trials came to, whose better half says what is usual.
+        values: what all trials came to, one at least.
+        minimize: whether less is better.
     """
-    if not MEASURES[objective].minimize or not complete:
-        return None
-    best = min(complete)
-    usual = sorted(complete)[3 * len(complete) // 4]
-    top = max(best + 2.0 * (usual - best), 1.25 * best)
-    return top if max(values) > 1.2 * top else None
+    sign = 1.0 if minimize else -1.0
+    costs = sorted(sign * value for value in values)
+    judged = sorted(sign * value for value in complete) or costs
+    best, median = judged[0], judged[max((len(judged) - 1) // 2, min(1, len(judged) - 1))]
+    edge = max(median + _FAR * (median - best), best + _NEAR * abs(best))
+    inside = [cost for cost in costs if cost <= edge]
+    # A tenth more than the usual ones, so that the edge is not where the worst of them is.
+    worst = inside[-1] if len(inside) == len(costs) else inside[-1] + 0.1 * (inside[-1] - costs[0])
+    ends = sorted((sign * costs[0], sign * worst))
+    return ends[0], ends[1]
 
 
 class ValueAxis:
@@ -122,33 +132,42 @@ class ValueAxis:
     def __init__(self, objective: str, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> None:
         """Look at the values of all trials."""
         at = objectives.index(objective)
-        self.measure = MEASURES[objective]
+        self.name, self.measure = objective, MEASURES[objective]
         found = {trial.number: value_of(trial, objectives, at) for trial in trials}
         self.values = {trial: value for trial, value in found.items() if value is not None}
         """By the number of the trial, those that have one."""
         complete = [trial.values[at] for trial in trials if trial.state == TrialState.COMPLETE]
-        self.top = ceiling(objective, complete, list(self.values.values()))
+        minimize = self.measure.minimize
+        low, high = usual_range(complete, list(self.values.values()), minimize) if self.values else (0.0, 0.0)
+        self.ends = (low, high) if high > low else (low - 0.5, high + 0.5)
+        """The lowest and highest place."""
+        self.beyond = [value for value in self.values.values() if not self.ends[0] <= value <= self.ends[1]]
+        """Values that stand at its edge."""
 
     def place(self, trial: FrozenTrial) -> float:
         """Return where a trial is drawn."""
-        value = self.values[trial.number]
-        return short(value if self.top is None else min(value, self.top))
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The lowest and highest place."""
-        low, high = min(self.values.values()), self.top or max(self.values.values())
-        return (low, high) if high > low else (low - 0.5, high + 0.5)
+        low, high = self.ends
+        return short(min(max(self.values[trial.number], low), high))
 
     def ticks(self) -> dict[str, Any]:
-        """Return values and texts of ticks, the last of which says that it holds all beyond."""
+        """Return values and texts of ticks; where trials stand at its edge the tick there says so."""
         low, high = self.ends
         step = next(s for s in _STEPS if (high - low) / s <= 6)
         numbers = [step * at for at in range(math.ceil(low / step), math.floor(high / step) + 1)]
-        if self.top is None:
-            return {"tickvals": numbers, "ticktext": [f"{one:g}" for one in numbers]}
-        numbers = [one for one in numbers if high - one > 0.5 * step]
-        return {"tickvals": [*numbers, high], "ticktext": [*(f"{one:g}" for one in numbers), f"≥ {high:.3g}"]}
+        texts = [f"{one:.10g}" for one in numbers]
+        if self.beyond:
+            edge, sign = (high, "≥") if self.measure.minimize else (low, "≤")
+            kept = [at for at, one in enumerate(numbers) if abs(edge - one) > 0.5 * step]
+            numbers, texts = [numbers[at] for at in kept], [texts[at] for at in kept]
+            numbers.append(edge)
+            texts.append(f"{sign} {edge:.4g}")
+        return {"tickvals": numbers, "ticktext": texts}
+
+    def beyond_words(self) -> str:
+        """Return what stands at the edge: ``2 trials at the edge lie beyond it: 226.00 s to 230.00 s``."""
+        ends = dict.fromkeys(shown(self.name, one) for one in (min(self.beyond), max(self.beyond)))
+        plural = "s" * (len(self.beyond) > 1)
+        return f"{len(self.beyond)} trial{plural} at the edge lie{'' if plural else 's'} beyond it: {' to '.join(ends)}"
 
     def layout(self) -> dict[str, Any]:
         """Return the settings of the axis."""
@@ -227,6 +246,12 @@ def history(objectives: Sequence[str], trials: Sequence[FrozenTrial]) -> go.Figu
         )  # fmt: skip
         figure.add_trace(line, row=row, col=1)
         figure.update_yaxes(axis.layout(), row=row, col=1)
+        if axis.beyond:
+            figure.add_annotation(
+                text=axis.beyond_words(), x=1, xref="x domain", xanchor="right", y=1 if axis.measure.minimize else 0,
+                yref="y domain", yanchor="bottom" if axis.measure.minimize else "top", showarrow=False,
+                font={"size": 12, "color": FAINT}, row=row, col=1,
+            )  # fmt: skip
     figure.update_xaxes(tickformat="d", nticks=min(12, len(trials) + 1))
     figure.update_xaxes(title_text="trial", row=len(objectives), col=1)
     title = "What the trials came to" + " (pruned ones: what they had by then)" * (len(objectives) == 1)
@@ -272,11 +297,17 @@ class Parameters:
             self.distributions |= trial.distributions
         complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
         self.importance: dict[str, float] = {}
+        self.interval: dict[str, tuple[float, float]] = {}
+        """90 per cent of the importances that come out of as many trials drawn from these, with replacement."""
         self.complete = len(complete)
         differ = len({tuple(trial.values) for trial in complete}) > 1
         if len(self.distributions) > 1 and differ and len(complete) >= FEWEST_COMPLETE:
             evaluator = PedAnovaImportanceEvaluator(target_quantile=0.25)
             self.importance = get_param_importances(study, evaluator=evaluator)
+            draws = [_importance_again(study, complete, evaluator, seed) for seed in range(_RESAMPLES)]
+            for key in self.importance:
+                shares = sorted(draw.get(key, 0.0) for draw in draws)
+                self.interval[key] = shares[_RESAMPLES // 20], shares[-1 - _RESAMPLES // 20]
         order = sorted(self.distributions, key=lambda key: (-self.importance.get(key, 0.0), key))
         self.shown = order[:_MOST_PARAMETERS]
         """Those that there is room for."""
@@ -312,20 +343,37 @@ class Parameters:
         return low, high if high > low else low + max(abs(low), 1e-9)
 
 
+def _importance_again(
+    study: optuna.Study, complete: Sequence[FrozenTrial], evaluator: PedAnovaImportanceEvaluator, seed: int
+) -> dict[str, float]:
+    """Return the importances in a bootstrap sample of a study's complete trials."""
+    again = optuna.create_study(directions=study.directions)
+    again.add_trials(random.Random(seed).choices(complete, k=len(complete)))
+    return get_param_importances(again, evaluator=evaluator)
+
+
 def importance_bars(parameters: Parameters) -> go.Figure | None:
     """Draw how much each parameter mattered for a trial to be among the best quarter (PED-ANOVA)."""
     if not parameters.importance:
         return None
     keys = [key for key in parameters.shown if key in parameters.importance][::-1]
     shares = [100 * parameters.importance[key] for key in keys]
+    ends = [tuple(100 * end for end in parameters.interval[key]) for key in keys]
     bars = go.Bar(
         x=shares, y=[parameters.labels[key] for key in keys], orientation="h", marker_color="#0072B2",
-        text=[f"{share:.0f} %" for share in shares], textposition="outside", cliponaxis=False,
         hovertext=[plain(key) for key in keys], hoverinfo="text",
+        error_x={
+            "type": "data", "symmetric": False, "color": INK, "thickness": 1.2, "width": 4,
+            "array": [max(high - share, 0.0) for share, (_, high) in zip(shares, ends, strict=True)],
+            "arrayminus": [max(share - low, 0.0) for share, (low, _) in zip(shares, ends, strict=True)],
+        },
     )  # fmt: skip
     figure = styled(go.Figure(bars), "What mattered most", 150 + 34 * len(keys), legend=False)
-    figure.update_xaxes(
-        title_text="importance for being in the best quarter, %", range=[0, 1.08 * max(shares)]
-    )
+    figure.update_xaxes(title_text="importance for being in the best quarter, %", range=[0, 104])
+    for key, share, (low, high) in zip(keys, shares, ends, strict=True):
+        figure.add_annotation(
+            text=f"{share:.0f} % ({low:.0f} to {high:.0f})", x=1, xref="x domain", xanchor="right",
+            y=parameters.labels[key], yshift=12, showarrow=False, font={"size": 12, "color": INK},
+        )  # fmt: skip
     figure.update_yaxes(automargin=True, ticksuffix="  ")
     return figure

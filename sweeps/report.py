@@ -34,11 +34,13 @@ _LONGEST_TRACEBACK = 4000
 _ORDER = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED, TrialState.FAIL, TrialState.WAITING)
 _NOTES = {
     "history": "Complete trials are filled shapes, pruned ones crosses at what they had when they were pruned. "
-    "The line is the best complete trial until then. What is much slower than the others, as a trial without a "
-    "complete lap, stands at the upper edge.",
+    "The line is the best complete trial until then. What is far worse than the better half, as a trial without "
+    "a complete lap, stands at the edge, and a line says how far it is beyond.",
     "pareto": "Complete trials only.",
     "importance": "PED-ANOVA over the complete trials: how much the values of the best quarter differ from those of "
-    "all. A parameter of some trials only is measured among those.",
+    "all. The lines and the numbers in brackets hold 90 % of what comes out when the trials are drawn again from these "
+    "(bootstrap): where two of them overlap, it is not known which mattered more. A parameter of some trials only is "
+    "measured among those.",
     "slice": "A slope or a cloud at one end says where to search next.",
     "parallel": "Drag along an axis to see only the trials in that part, drag a name to move its axis. A dash is a "
     "trial without this parameter.",

@@ -8,6 +8,7 @@ import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.study import Study, StudyDirection
 
+from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.errors import BadInput, nearest
 
@@ -132,8 +133,12 @@ def open_study(
 
 def _differences(stored: dict[str, object], asked: dict[str, object]) -> list[str]:
     found = [f"{key}: {stored.get(key)} -> {asked[key]}" for key in _SAME if stored.get(key) != asked[key]]
-    before, now = stored.get("base"), asked["base"]
-    if before != now and isinstance(before, list) and isinstance(now, list):
+    # With which collector a worker runs a trial does not make it another one.
+    before, now = (
+        [line for line in one if group_of(line) != "collector"] if isinstance(one, list) else []
+        for one in (stored.get("base"), asked["base"])
+    )
+    if before != now:
         gone, new = [one for one in before if one not in now], [one for one in now if one not in before]
         found.append(f"every trial: {' '.join(gone) or 'nothing'} -> {' '.join(new) or 'nothing'}")
     return found

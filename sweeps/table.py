@@ -17,13 +17,15 @@ from deepracer_exp.training.display import sparkline
 
 from .best import cost
 from .fates import words
-from .labels import duration, shown_values
+from .labels import duration, parameter, short_keys, shown_values
 from .ledger import Slot
 from .plan import Plan
 
 NOTHING = "\N{EN DASH}"
 _POINTS = 16
 """Of a sparkline."""
+_LEAST_MADE = 0.05
+"""Trials made here before their pace says how long the others take."""
 _OUTCOMES = {"COMPLETE": "done", "PRUNED": "pruned", "FAIL": "failed"}
 
 
@@ -44,10 +46,8 @@ class SweepView:
         self._plan, self._workers, self._console = plan, workers, console
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._began = time.monotonic()
-        self._before: set[int] | None = None
-        """Slots that had ended before this start."""
-        self._begun_before = 0
-        """Trials that were under way then: the rest of one says nothing of how long a trial takes."""
+        self._made_before: float | None = None
+        """Trials that had been made before this start, those under way counted by their share."""
         self._told: set[int] = set()
         self._courses: dict[int, collections.deque[float]] = {}
         self._evaluated: dict[int, str] = {}
@@ -71,13 +71,13 @@ class SweepView:
     def show(self, slots: Sequence[Slot]) -> None:
         """Draw what the ledger tells."""
         ended = {slot.slot for slot in slots if slot.outcome is not None}
-        if self._before is None:
-            self._before, self._told = set(ended), set(ended)
-            self._begun_before = sum(bool(slot.progress) for slot in slots if slot.outcome is None)
+        if self._made_before is None:
+            self._made_before, self._told = _made(slots), set(ended)
         for slot in slots:
             self._follow(slot)
             if self._live is None and slot.slot in ended - self._told:
-                self._line(_sentence(slot, self._plan.config.objectives))
+                line = _sentence(slot, self._plan.config.objectives)
+                self._line(f"{line}; {len(ended)} of {self._plan.config.trials}, {self._left(slots)}")
         self._told |= ended
         if self._live is not None:
             self._live.update(self._panel(slots), refresh=True)
@@ -109,18 +109,23 @@ class SweepView:
         counts = collections.Counter(slot.outcome for slot in slots)
         ended = sum(counts[one] for one in _OUTCOMES)
         told = ", ".join(f"{counts[one]} {word}" for one, word in _OUTCOMES.items())
-        here = ended - len(self._before or ())
-        hours = (time.monotonic() - self._began) / 3600
-        rate = here / hours if here > self._begun_before else None
         grid = Table.grid(padding=(0, 2))
         grid.add_column(style="dim")
         grid.add_column()
         grid.add_row("trials", ProgressBar(total, min(ended, total), width=40))
         grid.add_row("", f"{ended} of {total}: {told}")
-        left = NOTHING if rate is None else duration(max(total - ended, 0) / rate * 3600)
-        grid.add_row("speed", NOTHING if rate is None else f"{rate:.0f} an hour, {left} left")
+        grid.add_row("time", f"{duration(time.monotonic() - self._began)}, {self._left(slots)}")
         grid.add_row("best", _best(slots, self._plan.config.objectives))
         return grid
+
+    def _left(self, slots: Sequence[Slot]) -> str:
+        """Return how long the rest takes at the pace of this start; trials that end early make it less."""
+        made = _made(slots)
+        here = made - (self._made_before or 0.0)
+        if here < _LEAST_MADE:
+            return "time left not known yet"
+        left = max(self._plan.config.trials - made, 0.0) / here * (time.monotonic() - self._began)
+        return f"about {duration(left)} left"
 
     def _running(self, running: Sequence[Slot]) -> Table:
         table = Table(box=None, pad_edge=False, header_style="dim")
@@ -129,6 +134,7 @@ class SweepView:
             ("evaluated", "left"),
         ):  # fmt: skip
             table.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        table.add_column("draws", ratio=1)
         for slot in running:
             table.add_row(*self._cells(slot))
         return table
@@ -137,9 +143,9 @@ class SweepView:
         row: Mapping[str, Any] = slot.progress
         name = f"{_number(slot)}" + (f" (attempt {slot.attempt})" if slot.attempt > 1 else "")
         if slot.expired:
-            return name, NOTHING, NOTHING, "", NOTHING, "waits for a worker"
-        if not row:
-            return name, NOTHING, NOTHING, "", NOTHING, "starts"
+            return name, NOTHING, NOTHING, "", NOTHING, "waits for a worker", _params(slot)
+        if "env_steps" not in row:
+            return name, NOTHING, NOTHING, "", NOTHING, "starts", _params(slot)
         lap_s, completion = row.get("eval_lap_time_s"), row.get("eval_completion")
         if completion is not None:
             lap = "no lap" if lap_s is None else f"{lap_s:.2f} s"
@@ -151,7 +157,18 @@ class SweepView:
             sparkline(list(self._courses.get(slot.slot, ())), _POINTS),
             f"{row['entropy']:.2f}",
             self._evaluated.get(slot.slot, NOTHING),
+            _params(slot),
         )
+
+
+def _made(slots: Sequence[Slot]) -> float:
+    return sum(1.0 if slot.outcome is not None else slot.progress.get("share", 0.0) for slot in slots)
+
+
+def _params(slot: Slot) -> str:
+    """Return what a trial draws: `lr 0.0003, network mlp`."""
+    params = slot.progress.get("params", {})
+    return ", ".join(f"{short} {parameter(params[key])}" for key, short in short_keys(params).items())
 
 
 def _number(slot: Slot) -> object:
@@ -179,4 +196,5 @@ def _sentence(slot: Slot, objectives: Sequence[str]) -> str:
     told = (
         shown_values(objectives, slot.values) + _drawn(slot) if slot.values else slot.attrs.get("reason", "")
     )
-    return f"trial {_number(slot)} {outcome} ({fate}) after {steps:,} steps: {told}"
+    drew = f" with {params}" if (params := _params(slot)) else ""
+    return f"trial {_number(slot)}{drew} {outcome} ({fate}) after {steps:,} steps: {told}"

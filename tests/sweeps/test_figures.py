@@ -1,4 +1,5 @@
 import itertools
+import math
 import random
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from deepracer_exp.errors import BadInput
 from sweeps.fates import FATES, fate_of
-from sweeps.figures import figures, thinned
+from sweeps.figures import FEWEST_COMPLETE, figures, thinned
 from sweeps.labels import short_keys
 
 from .studies import DISTRIBUTIONS, add, new_study, season
@@ -55,17 +56,62 @@ def test_trials_without_a_lap_do_not_squeeze_the_laps_together(study):
     assert figure.layout.yaxis.ticktext[-1].startswith("≥ ")
 
 
-def test_the_parameter_that_decides_is_the_most_important(study):
-    bars = figures(study)["importance"].data[0]
+@pytest.mark.parametrize(
+    ("objective", "usual", "failed"),
+    [
+        ("race_score", [7.65, 7.7, 7.74, 7.8, 7.85, 7.91], [226.0, 230.5]),
+        ("completion", [99.0, 99.2, 99.5, 99.6, 99.8, 100.0], [5.0]),
+    ],
+)
+def test_a_few_failures_take_no_room_from_the_others_and_are_told_with_their_values(
+    tmp_path, objective, usual, failed
+):
+    study = new_study(tmp_path, objectives=[objective])
+    for value in (*usual[:3], *failed, *usual[3:]):
+        add(study, [value])
+    figure = figures(study)["history"]
+    low, high = figure.layout.yaxis.range
+    assert (max(usual) - min(usual)) / (high - low) > 0.6
+    drawn = {
+        number: y
+        for trace in figure.data
+        if trace.mode == "markers"
+        for number, y in zip(trace.x, trace.y, strict=True)
+    }
+    assert {drawn[3 + at] for at in range(len(failed))} == {
+        max(drawn.values()) if failed[0] > 100 else min(drawn.values())
+    }
+    assert all(low <= y <= high for y in drawn.values())
+    (note,) = [one.text for one in figure.layout.annotations]
+    assert note.startswith(f"{len(failed)} trial")
+    assert f"{failed[-1]:.1f}" in note
+
+
+def test_the_parameter_that_decides_is_the_most_important_and_its_interval_says_how_sure_that_is(study):
+    figure = figures(study)["importance"]
+    (bars,) = figure.data
     assert bars.y[-1] == "lr"
     assert sum(bars.x) == pytest.approx(100, abs=0.1)
+    ends = [
+        (share - below, share + above)
+        for share, below, above in zip(bars.x, bars.error_x.arrayminus, bars.error_x.array, strict=True)
+    ]
+    assert ends[-1][0] > ends[-2][1]
+    assert all(0 <= low < high <= 100 for low, high in ends)
+    assert f"({ends[-1][0]:.0f} to {ends[-1][1]:.0f})" in figure.layout.annotations[-1].text
 
 
 def test_importance_of_a_few_trials_is_not_told(tmp_path):
-    study = new_study(tmp_path)
-    for score in (9.0, 10.0, 11.0):
-        add(study, [score])
-    assert "importance" not in figures(study)
+    study, dice = new_study(tmp_path), random.Random(3)
+    for _ in range(FEWEST_COMPLETE):
+        assert "importance" not in figures(study)
+        lr = 10 ** dice.uniform(-5, -3)
+        add(
+            study,
+            [8 + abs(math.log10(lr) + 3.5)],
+            params={"algorithm.lr": lr, "algorithm.entropy_coeff": dice.uniform(0, 0.05)},
+        )
+    assert "importance" in figures(study)
 
 
 def test_the_pareto_front_is_optunas(tmp_path):

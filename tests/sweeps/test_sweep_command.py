@@ -8,6 +8,7 @@ import pytest
 import yaml
 from optuna.trial import TrialState
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.formats.run_files import read_config, read_object
 from sweeps.storage import open_storage
 
@@ -76,13 +77,18 @@ def test_the_printed_line_trains_the_winner(swept):
     told = read_object(swept.cwd / "runs" / "s" / "best_of_sweep.json")
     trial = study.trials[told["trial"]]
     assert shlex.split(line)[2:] == trial.user_attrs["overrides"]
+    # It says nothing of how a worker runs a trial, and all else that it makes is the trial's experiment.
+    assert not [word for word in shlex.split(line) if word.startswith(("collector=", "report=", "name="))]
+    own = compose_experiment(trial.user_attrs["overrides"])[1].mapping
     config = read_config(swept.cwd / "runs" / "s" / told["run_dir"])
     assert config["algorithm"]["lr"] == trial.params["algorithm.lr"]
+    assert {key for key in config if config[key] != own[key]} <= {"collector", "name", "report", "runs_dir"}
 
 
 def test_a_trial_is_a_run_like_any_other(swept, call, tmp_path):
     run = load(swept.cwd, "s").trials[0].user_attrs["run_dir"]
-    ended = call("train", *load(swept.cwd, "s").trials[0].user_attrs["overrides"], f"runs_dir={tmp_path}")
+    overrides = load(swept.cwd, "s").trials[0].user_attrs["overrides"]
+    ended = call("train", *overrides, "collector=in_process", f"runs_dir={tmp_path}")
     assert ended.code == 0, ended.stderr
     (again,) = [path.parent for path in tmp_path.glob("tiny/*/summary.json")]
     assert (

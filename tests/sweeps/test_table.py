@@ -12,9 +12,10 @@ CONFIG = SimpleNamespace(trials=4, objectives=("race_score",))
 PLAN = SimpleNamespace(study="spring", config=CONFIG, folder="runs/spring")
 
 
-def slot(number, outcome=None, values=None, **attrs):
+def slot(number, outcome=None, values=None, share=0.0, params=None, **attrs):
     state = "claimed" if outcome is None else "told"
     progress = {"number": number, "env_steps": 8192, "completion": 51.0, "entropy": 2.31}
+    progress |= {"share": share, "params": params or {}}
     return Slot(
         number,
         1,
@@ -30,11 +31,12 @@ def slot(number, outcome=None, values=None, **attrs):
     )
 
 
-def shown(slots, is_terminal=True, first=()):
+def shown(slots, is_terminal=True, first=(), after_s=0.0):
     text = io.StringIO()
     console = Console(file=text, force_terminal=is_terminal, width=100, height=30, color_system=None)
     with SweepView(PLAN, 2, console) as view:
         view.show(first)
+        view._began -= after_s
         view.show(slots)
     return text.getvalue()
 
@@ -51,11 +53,22 @@ def test_it_tells_how_many_trials_ended_how_and_which_is_best():
         assert words in view
 
 
-def test_the_rest_of_a_trial_from_before_says_nothing_of_the_time_that_is_left():
-    assert "an hour" in shown([*ENDED, slot(2)])
-    under_way = [slot(0), slot(1)]
-    assert "an hour" not in shown([*ENDED, slot(2)], first=under_way)
-    assert "an hour" in shown([*ENDED, slot(2, "COMPLETE", [9.0])], first=under_way)
+def test_the_time_left_follows_from_what_was_made_in_this_start_only():
+    assert "min left" in shown([*ENDED, slot(2)], after_s=600)
+    assert "not known yet" in shown([*ENDED, slot(2)], first=[*ENDED, slot(2)], after_s=600)
+    # Two of four were there; half of the third in ten minutes: thirty for the rest.
+    half = slot(2, share=0.5)
+    assert "about 30 min left" in shown([*ENDED, half], first=ENDED, after_s=600)
+
+
+def test_it_shows_what_a_trial_draws_from_its_start_on():
+    params = {"algorithm.lr": 0.00031234, "network": "mlp_small"}
+    begun = slot(2)
+    begun.progress.clear()
+    begun.progress.update(number=2, params=params, share=0.0)
+    for view in (shown([begun]), shown([slot(2, params=params)])):
+        assert "lr 0.000312" in view
+        assert "mlp_small" in view
 
 
 def test_before_the_first_trial_it_says_what_is_waited_for():
@@ -66,5 +79,7 @@ def test_without_a_terminal_each_trial_that_ends_is_a_line():
     lines = shown(ENDED, is_terminal=False).splitlines()
     assert lines[0] == "spring: 4 trials, 2 workers; runs in runs/spring"
     assert lines[1].startswith("trial 0 done (converged) after 8,192 steps: race score 8.25 s")
-    assert lines[2] == "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01"
+    assert lines[2].startswith(
+        "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01; 2 of 4, about"
+    )
     assert len(lines) == 3
