@@ -51,8 +51,8 @@ test: $(STAMP)  ## the tests
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each
 	@$(BIN)/python -m pytest -q -m slow
 
-test-faults: $(STAMP)  ## sweeps whose processes are killed and stopped, twenty times each
-	@FAULT_TIMES=20 $(BIN)/python -m pytest -q tests/faults/test_killed_sweeps.py
+test-faults: $(STAMP)  ## runs and sweeps whose processes are killed and stopped, twenty times each; kill_loops.json
+	@FAULT_TIMES=20 KILL_LOOPS=kill_loops.json $(BIN)/python -m pytest -q tests/faults/test_kill_loops.py tests/faults/test_killed_sweeps.py
 
 check: $(STAMP)  ## style, types and import rules
 	@$(BIN)/ruff check .

@@ -19,8 +19,9 @@ from .table import SweepView
 
 OnEnded = Callable[[Sequence[Slot]], None]
 _LOOK_S = 0.5
-_LEAVE_S = 60.0
-"""For a worker that was told to end: it writes a checkpoint and tells MLflow."""
+_LEAVE_S = 6.0
+"""For a worker that was told to end: it writes a checkpoint and tells MLflow. What it has not done by then is done when
+its trial resumes; with what comes after, the whole sweep is gone within ten seconds."""
 _FEW = 3
 """Trials all of which must have failed before a sweep is given up."""
 
@@ -61,11 +62,11 @@ class Driver:
             RunFailed: all trials fail, workers die again and again, or the database stays away.
         """
         self._plan.folder.mkdir(parents=True, exist_ok=True)
-        # What was killed here needs not wait for the end of its lease.
+        # What was killed here, mostly with its driver, need not wait for the end of its lease.
         for owner in {
             slot.owner for slot in self._slots() if slot.outcome is None and process.is_gone(slot.owner)
         }:
-            self._free(owner)
+            self._release(owner)
         try:
             for _ in range(self._launcher.workers):
                 self._start()
@@ -98,7 +99,7 @@ class Driver:
                 self._all_made = True
                 continue
             if one.owner is not None and one.is_seen:
-                self._free(one.owner)
+                self._release(one.owner, is_lost=True)
             if one.exitcode == RunFailed.exit_code:
                 raise RunFailed(f"the study's database does not answer; {self._goes_on()}")
             if self._all_made:
@@ -115,8 +116,10 @@ class Driver:
                 self._running.remove(one)
                 one.kill()
 
-    def _free(self, owner: str) -> None:
-        patiently(lambda: self._ledger.release(owner), self._plan.config.patience_s)
+    def _release(self, owner: str, *, is_lost: bool = False, patience_s: float | None = None) -> None:
+        patiently(
+            lambda: self._ledger.release(owner, is_lost=is_lost), patience_s or self._plan.config.patience_s
+        )
 
     def _slots(self) -> list[Slot]:
         slots = patiently(self._ledger.slots, self._plan.config.patience_s)
@@ -153,8 +156,8 @@ class Driver:
                 continue
             # A database that is away frees the trial by itself, once its lease is over.
             with contextlib.suppress(RunFailed):
-                patiently(lambda owner=one.owner: self._ledger.release(owner), 1.0)  # type: ignore[misc]
+                self._release(one.owner, patience_s=1.0)
         self._running.clear()
 
     def _goes_on(self) -> str:
-        return f"`deepracer-exp sweep study={self._plan.study}` goes on"
+        return f"`deepracer-exp sweep study={self._plan.study}` resumes it"

@@ -347,6 +347,7 @@ def _importance_again(
     study: optuna.Study, complete: Sequence[FrozenTrial], evaluator: PedAnovaImportanceEvaluator, seed: int
 ) -> dict[str, float]:
     """Return the importances in a bootstrap sample of a study's complete trials."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)  # it says of each study that it is made
     again = optuna.create_study(directions=study.directions)
     again.add_trials(random.Random(seed).choices(complete, k=len(complete)))
     return get_param_importances(again, evaluator=evaluator)
@@ -369,11 +370,15 @@ def importance_bars(parameters: Parameters) -> go.Figure | None:
         },
     )  # fmt: skip
     figure = styled(go.Figure(bars), "What mattered most", 150 + 34 * len(keys), legend=False)
-    figure.update_xaxes(title_text="importance for being in the best quarter, %", range=[0, 104])
+    figure.update_xaxes(
+        title_text="importance for being in the best quarter, %",
+        range=[0, 128],
+        tickvals=list(range(0, 101, 20)),
+    )
     for key, share, (low, high) in zip(keys, shares, ends, strict=True):
         figure.add_annotation(
             text=f"{share:.0f} % ({low:.0f} to {high:.0f})", x=1, xref="x domain", xanchor="right",
-            y=parameters.labels[key], yshift=12, showarrow=False, font={"size": 12, "color": INK},
+            y=parameters.labels[key], showarrow=False, font={"size": 12, "color": INK},
         )  # fmt: skip
     figure.update_yaxes(automargin=True, ticksuffix="  ")
     return figure

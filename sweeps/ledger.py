@@ -187,13 +187,21 @@ class Ledger:
         """Write down that Optuna has the result of a slot."""
         self._update({_of.state: _TOLD}, _of.slot == slot, _of.state == _SETTLED)
 
-    def release(self, owner: str) -> int:
-        """End the leases of an owner that is gone, or is about to go; return how many there were."""
+    def release(self, owner: str, *, is_lost: bool = False) -> int:
+        """End the leases of an owner that is gone, or is about to go; return how many there were.
+
+        Args:
+            owner: that holds them.
+            is_lost: its process died and nobody had asked it to: its trial may be the reason, and the tries of its
+                run count. Else they begin again.
+        """
         where = (_of.owner == owner, _of.state == _CLAIMED, _of.expires_s > _RELEASED)
         with self._engine.begin() as connection:
-            mine = connection.execute(sa.select(_of.slot).where(_of.study == self._study, *where)).all()
-            if mine:
-                connection.execute(self._statement({_of.expires_s: _RELEASED}, *where))
+            mine = connection.execute(self._select(*where)).all()
+            for row in mine:
+                runs = [run if is_lost else {**run, "tries": 0} for run in _runs(row)]
+                values = {_of.expires_s: _RELEASED, _of.runs: json.dumps(runs)}
+                connection.execute(self._statement(values, _of.slot == row.slot, *where))
         return len(mine)
 
     def slots(self) -> list[Slot]:

@@ -2,17 +2,15 @@
 
 import logging
 import os
-import signal
 import socket
 import sys
-import threading
-import time
 from typing import TYPE_CHECKING
 
 import psutil
 
 from deepracer_exp.addresses import take_over
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.training.signals import Interruption
 
 if TYPE_CHECKING:
@@ -22,7 +20,6 @@ PRELOADED = "sweeps.worker"
 """What a fork server imports once for all workers."""
 
 _log = logging.getLogger("deepracer_exp")
-_LOOK_S = 0.5
 
 
 def owner_name(pid: int, token: str) -> str:
@@ -62,9 +59,8 @@ def main(plan: "Plan", token: str, log: str) -> None:
         os.dup2(file.fileno(), sys.stdout.fileno())
         os.dup2(file.fileno(), sys.stderr.fileno())
     logging.basicConfig(format="%(asctime)s %(process)d %(message)s", level=logging.WARNING)
+    end_with_owner()
     with Interruption() as interruption:
-        threading.Thread(target=_follow, args=(os.getppid(),), name="parent", daemon=True).start()
-
         import optuna
         import torch
 
@@ -82,11 +78,3 @@ def main(plan: "Plan", token: str, log: str) -> None:
         except KeyboardInterrupt:  # told twice
             sys.exit(interruption.exit_code or 130)
     sys.exit(interruption.exit_code or 0)
-
-
-def _follow(parent: int) -> None:
-    """End with the driver, as if it had said so: with a checkpoint of the trial that is being made."""
-    while os.getppid() == parent:
-        time.sleep(_LOOK_S)
-    _log.warning("the sweep's own process is gone")
-    os.kill(os.getpid(), signal.SIGTERM)

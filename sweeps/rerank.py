@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
-from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import USUAL, Evaluation, Group
 from deepracer_exp.evaluation.run import read_run
 
@@ -48,13 +48,16 @@ def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
     return replace(protocol, trials=trials, seed=_SEED, starts=starts)
 
 
-def rerank(plan: Plan, study: optuna.Study, on_next: Callable[[FrozenTrial], None]) -> list[Reranked]:
+def rerank(
+    plan: Plan, study: optuna.Study, on_next: Callable[[FrozenTrial], None], on_step: OnStep
+) -> list[Reranked]:
     """Let the best trials' best checkpoints drive fresh laps; return them in the order that comes out.
 
     Args:
         plan: of the sweep.
         study: has its trials.
         on_next: called with each trial before it drives.
+        on_step: called after each control step; what it raises ends everything.
 
     Raises:
         RunFailed: a car's state became NaN.
@@ -64,7 +67,7 @@ def rerank(plan: Plan, study: optuna.Study, on_next: Callable[[FrozenTrial], Non
     found = []
     for trial in complete_trials(study)[: config.rerank]:
         on_next(trial)
-        driven = [_driven(Path(run["run_dir"]), protocol) for run in trial.user_attrs["runs"]]
+        driven = [_driven(Path(run["run_dir"]), protocol, on_step) for run in trial.user_attrs["runs"]]
         found.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
     return sorted(found, key=lambda one: cost(config.objectives, one.values))
 
@@ -105,10 +108,10 @@ def _draws(
     return np.where(laps > 0, time_s / np.maximum(laps, 1), nothing)
 
 
-def _driven(run_dir: Path, protocol: EvaluationConfig) -> Evaluation:
+def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evaluation:
     run = read_run(str(run_dir), run_dir.parent, None)
     stored = read_checkpoint(run.experiment, run.checkpoints, run.meant(None))
-    return Evaluator(run.experiment, protocol)(stored.networks.policy)
+    return Evaluator(run.experiment, protocol)(stored.networks.policy, on_step)
 
 
 def _reranked(

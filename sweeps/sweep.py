@@ -41,6 +41,8 @@ from .table import SweepView
 from .telling import tell_settled, tell_strays
 from .trial_run import Interrupted
 
+_DELIVERY_S, _FAREWELL_S = 30.0, 2.0
+"""How long MLflow is waited for when a sweep is over, and when it was interrupted and can resume."""
 REPORT = "sweep.html"
 """A study's page, in the folder of its runs."""
 
@@ -90,12 +92,15 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
         if plan.study_run_id is not None:
             study.set_user_attr("mlflow_run_id", plan.study_run_id)
         status: Status = "FAILED"
+        code = 0
         try:
             code = _driven(plan, storage, study, launcher, console, study_run)
             status = "KILLED" if code else "FINISHED"
+        except KeyboardInterrupt:  # the second one
+            status, code = "KILLED", 130
         finally:
             if study_run is not None:
-                study_run.finish(status)
+                study_run.finish(status, _FAREWELL_S if code else _DELIVERY_S)
         return study, plan.folder, code
 
 
@@ -216,13 +221,16 @@ def _conclude(plan: Plan, study: Study, view: SweepView, ledger: Ledger, interru
 
         torch.set_num_threads(1)
 
-        def tell(trial: FrozenTrial) -> None:
+        def heed(*_: object) -> None:
             if interruption.signum is not None:
                 raise Interrupted
+
+        def tell(trial: FrozenTrial) -> None:
+            heed()
             view.stage = f"trial {trial.number} drives {plan.config.rerank_laps} fresh laps"
             view.show(ledger.slots())
 
-        again = [{**asdict(one), "interval": list(one.interval)} for one in rerank(plan, study, tell)]
+        again = [{**asdict(one), "interval": list(one.interval)} for one in rerank(plan, study, tell, heed)]
         study.set_user_attr("reranked_of", len(complete_trials(study)))
         study.set_user_attr("reranked", again)
         view.stage = ""

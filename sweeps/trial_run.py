@@ -15,6 +15,7 @@ from rich.console import Console
 from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.overrides import key_of
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.checkpoint import kept_checkpoints, read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator
@@ -26,6 +27,7 @@ from deepracer_exp.formats.run_files import read_metrics, read_object, read_run_
 from deepracer_exp.tracking.names import PARENT, trial_metrics
 from deepracer_exp.tracking.study_run import STUDY, TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
+from deepracer_exp.training.budget import Budget
 from deepracer_exp.training.clone import prepare_clone
 from deepracer_exp.training.outcome import Outcome
 from deepracer_exp.training.run import RunEnded, resume, train
@@ -162,6 +164,7 @@ class TrialRun:
 
     def begins(self, run_dir: Path) -> None:
         """Note where the run lies, before it is recorded anywhere."""
+        self._lease.show({"number": self._number, "params": self._trial.params, "share": self._share(0.0)})
         run = {"seed": self._now, "run_dir": str(run_dir.resolve()), "status": None, "value": None}
         known = self._runs[self._now] if self._now < len(self._runs) else {}
         self._note(self._now, run | {key: known[key] for key in ("tries", "tried_at") if key in known})
@@ -171,7 +174,9 @@ class TrialRun:
     def sees(self, row: Mapping[str, Any]) -> str | None:
         """Keep the claim and ask the pruners."""
         self._lease.confirm()
-        self._lease.show({name: row.get(name) for name in _SHOWN} | {"number": self._number})
+        _, spent = self._budget.used(row["env_steps"], row["iteration"], row["wall_clock_s"])
+        known = {"number": self._number, "params": self._trial.params, "share": self._share(spent)}
+        self._lease.show({name: row.get(name) for name in _SHOWN} | known)
         value = value_on_the_way(row, self._plan.config.objectives[0], self._plan.protocol.time_s)
         if value is None or self._now > 0:
             return None
@@ -180,6 +185,10 @@ class TrialRun:
             return None
         self._pruned_by, reason = verdict
         return f"{self._pruned_by}: {reason}"
+
+    def _share(self, spent: float) -> float:
+        """Return how much of the trial is made, 0 to 1, where `spent` is that share of the present run's budget."""
+        return (self._now + min(spent, 1.0)) / self._plan.config.seeds
 
     def _compared(self, value: float) -> Verdict | None:
         """Tell Optuna of an evaluation, and return what the pruners say."""
@@ -222,11 +231,11 @@ class TrialRun:
         if known is not None and (lost := self._lost_again(known)) is not None:
             self._note(index, lost)
             return lost
+        self._budget = Budget(self._composed(list(overrides))[0].budget)
         outcome = None if known is None else self._gone_on(Path(known["run_dir"]))
         if outcome is None:
             outcome = self._trained(index, overrides)
         if outcome.status == "interrupted":
-            self._note(index, self._runs[index] | {"tries": 0})
             raise Interrupted
         decision = outcome.summary.get("stopping") or {}
         run = {
@@ -254,10 +263,10 @@ class TrialRun:
 
     def _trained(self, index: int, overrides: Sequence[str]) -> Outcome:
         own = [*overrides, f"name={self._plan.study}", f"runs_dir={self._plan.runs_dir}"]
-        if not any(override.startswith("collector.threads=") for override in overrides):
-            own.append(f"collector.threads={self._plan.cores}")
-        if not any(override.startswith("report=") for override in overrides):
-            own.append("report=false")
+        # How a worker runs what was drawn: no part of the trial, and left out of the line that repeats it.
+        given = {key_of(override) for override in overrides}
+        usual = ("collector=in_process", f"collector.threads={self._plan.cores}", "report=false")
+        own += [override for override in usual if key_of(override) not in given]
         experiment, composition, start = self._composed(own)
         if index:
             experiment, composition, start = self._composed([*own, f"seed={experiment.seed + index}"])

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +30,10 @@ __all__ = ["postgres", "postgres_server"]
 settings.register_profile("no_deadline", deadline=None)
 settings.load_profile("no_deadline")
 
-PATIENCE_S = 120.0
+PATIENCE_S = 240.0
 """For what must happen, on a machine that may be busy."""
+_MARK = "DEEPRACER_EXP_STARTED_BY"
+"""Variable of the environment that a command hands on to all that it starts."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class Started:
     def __init__(self, arguments: Sequence[str], cwd: Path, env: dict[str, str] | None = None):
         self.cwd = cwd
         self._shm: set[Path] = set()
+        self._mark = uuid.uuid4().hex
         self._out, self._err = cwd / "stdout.txt", cwd / "stderr.txt"
         with self._out.open("w") as out, self._err.open("w") as err:
             self.popen = subprocess.Popen(
@@ -104,13 +108,17 @@ class Started:
                 stderr=err,
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
-                env=os.environ | (env or {}),
+                env=os.environ | {_MARK: self._mark} | (env or {}),
             )
 
+    def processes(self) -> list[psutil.Process]:
+        """Return the command and all that it has started, in whatever session or below whatever parent they are."""
+        return [process for process in psutil.process_iter() if _is_marked(process, self._mark)]
+
     def workers(self) -> list[psutil.Process]:
-        """Return the collector's processes, in the order of their start."""
+        """Return the processes forked for the collector or the sweep, in the order of their start."""
         found = []
-        for process in _session(self.popen.pid):
+        for process in self.processes():
             try:
                 self._shm |= _shared_memory(process)
                 parent = process.parent()
@@ -153,11 +161,11 @@ class Started:
         code = self.popen.wait(timeout_s)
         return Ended(code, self._out.read_text(), self._err.read_text(), self.cwd)
 
-    def assert_nothing_left(self, within_s: float = 5.0) -> None:
-        """No process of the session lives, and nothing of what `workers` saw mapped lies in shared memory."""
+    def assert_nothing_left(self, within_s: float = 10.0) -> None:
+        """Nothing that was started lives, and nothing of what `workers` saw mapped lies in shared memory."""
         give_up_at = time.monotonic() + within_s
         while True:
-            alive, shm = _session(self.popen.pid), [path for path in self._shm if path.exists()]
+            alive, shm = self.processes(), [path for path in self._shm if path.exists()]
             if not alive and not shm:
                 return
             if time.monotonic() > give_up_at:
@@ -165,8 +173,8 @@ class Started:
             time.sleep(0.05)
 
     def destroy(self) -> None:
-        """End whatever is left of the session."""
-        for process in _session(self.popen.pid):
+        """End whatever is left of what was started."""
+        for process in self.processes():
             try:
                 process.kill()
             except psutil.NoSuchProcess:
@@ -185,15 +193,11 @@ def _is_fork(process: psutil.Process) -> bool:
     return "multiprocessing.forkserver" in " ".join(process.cmdline())
 
 
-def _session(leader: int) -> list[psutil.Process]:
-    found = []
-    for pid in psutil.pids():
-        try:
-            if os.getsid(pid) == leader and psutil.Process(pid).status() != "zombie":
-                found.append(psutil.Process(pid))
-        except (ProcessLookupError, psutil.NoSuchProcess):
-            continue
-    return found
+def _is_marked(process: psutil.Process, mark: str) -> bool:
+    try:
+        return process.environ().get(_MARK) == mark and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.Error:
+        return False
 
 
 def _shared_memory(process: psutil.Process) -> set[Path]:

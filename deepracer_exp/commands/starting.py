@@ -8,12 +8,12 @@ from pathlib import Path
 from deepracer_exp.formats.run_files import read_config
 
 
-def start_workers_early(wanted: bool, module: str = "deepracer_exp.training.fork_server") -> None:
+def start_workers_early(wanted: bool, module: str = "deepracer_exp.training.worker") -> None:
     """Let a server process import torch while this one does, so that workers fork from it at once.
 
     Args:
         wanted: whether there will be workers.
-        module: that the server imports.
+        module: what workers need, imported once by the server.
     """
     if not wanted or not sys.platform.startswith("linux"):
         return
@@ -21,7 +21,7 @@ def start_workers_early(wanted: bool, module: str = "deepracer_exp.training.fork
     from multiprocessing import forkserver
 
     multiprocessing.set_start_method("forkserver", force=True)
-    multiprocessing.set_forkserver_preload([module])
+    multiprocessing.set_forkserver_preload(["deepracer_exp.training.fork_server", module])
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import FrameType
 
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.training.lifeline import die_with_parent
+from deepracer_exp.lifeline import die_with_parent
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _ARRIVES_S = 0.1

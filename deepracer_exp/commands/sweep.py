@@ -24,7 +24,7 @@ how
   sweep/executor=ray                                        workers on a Ray cluster (docs/scaling.md)
   parent=RUN                                                trials are clones of RUN
 
-  deepracer-exp sweep study=NAME                            goes on with a study that was interrupted or killed
+  deepracer-exp sweep study=NAME                            resumes a study that was interrupted or killed
   deepracer-exp sweep study=NAME sweep.trials=120           makes more trials
   deepracer-exp sweep report NAME                           writes the study's page and prints where it is
   deepracer-exp sweep best NAME                             prints the winning command
@@ -91,7 +91,7 @@ def _sweep(args: argparse.Namespace) -> int:
     if code:
         where = [one for one in args.overrides if one.startswith(("runs_dir=", "sweep.storage="))]
         line = shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where])
-        print(f"\ninterrupted; `{line}` goes on", file=sys.stderr)
+        print(f"\ninterrupted; resume it with: {line}", file=sys.stderr)
         return code
     if complete_trials(study):
         _tell_best(study)

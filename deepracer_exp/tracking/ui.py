@@ -17,6 +17,7 @@ from typing import IO
 
 from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.lifeline import running
 
 from .lookup import asked
 from .names import VIEW
@@ -26,7 +27,6 @@ from .store import Store, resolve_store
 
 _HOST = "127.0.0.1"
 _START_S = 90.0
-_STOP_S = 10.0
 _ANSWER_S = 10.0
 # A proxy named by the environment does not know this machine's loopback.
 _DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -106,18 +106,14 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
         "MLFLOW_DISABLE_TELEMETRY": "true",
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # six more processes, for judging chats
     }
-    with tempfile.TemporaryFile() as output:
-        # A session of its own: Ctrl-C reaches this process alone, which then ends the whole group.
-        server = subprocess.Popen(
-            command, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-            start_new_session=True,
-        )  # fmt: skip
-        try:
-            url = f"http://{_HOST}:{port}"
-            _wait_until_it_answers(url, server, output)
-            yield url, server
-        finally:
-            _end_group(server)
+    url = f"http://{_HOST}:{port}"
+    # All that it keeps is in a database, which loses nothing when the server is killed.
+    with (
+        tempfile.TemporaryFile() as output,
+        running(command, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output) as server,
+    ):
+        _wait_until_it_answers(url, server, output)
+        yield url, server
 
 
 def runs_page(url: str, uri: str | None, runs_dir: Path) -> str:
@@ -163,19 +159,6 @@ def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO
     output.seek(0)
     lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]
     raise RunFailed(f"MLflow's server did not start at {url}: {redact(lines[-1])}")
-
-
-def _end_group(server: subprocess.Popen[bytes]) -> None:
-    for how in (signal.SIGTERM, signal.SIGKILL):
-        try:
-            os.killpg(server.pid, how)
-        except ProcessLookupError:
-            break
-        try:
-            server.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            continue
-    server.wait()
 
 
 @contextmanager

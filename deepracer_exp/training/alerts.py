@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 from deepracer_exp.config.budget import BudgetConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lifeline import running
 
 _log = logging.getLogger(__name__)
 
@@ -49,12 +50,9 @@ class Alerts:
 
     def _run(self, command: tuple[str, ...], message: str, run_dir: Path) -> None:
         try:
-            done = subprocess.run(
-                [*command, message, str(run_dir.resolve())],
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                timeout=_PATIENCE_S,
-            )
+            line, pipe = [*command, message, str(run_dir.resolve())], subprocess.PIPE
+            with running(line, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe) as done:
+                _, said = done.communicate(timeout=_PATIENCE_S)
         except OSError as error:
             _log.info("budget.alert_command cannot be run: %s", error.strerror or error)
             return
@@ -62,7 +60,7 @@ class Alerts:
             _log.info("budget.alert_command was ended after %.0f s", _PATIENCE_S)
             return
         if done.returncode:
-            last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            last = said.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
             _log.info("budget.alert_command ended with exit code %d: %s", done.returncode, last[0])
 
     def _post(self, address: str, message: str, _: Path) -> None:

@@ -1,14 +1,16 @@
-"""Imported by the process that workers are forked from, and by nothing else.
+"""Imported first by the process that workers are forked from, and by nothing else.
 
-Workers keep the fork server's pipe open, so that on its own it would wait for the last of them when the training
-process is killed, and a worker that hangs would stay for ever. Hence the kernel ends the server with the training
-process, and the workers with the server.
+It ends once all that may ask it for a process are gone. On its own it would look only after it has imported what its
+workers need, which takes many seconds on a busy machine.
 """
 
 import os
+from pathlib import Path
 
-from . import worker  # noqa: F401 - what takes long to import, once for all workers
-from .lifeline import die_with_parent
+from deepracer_exp.lifeline import kill_when_closed
 
-die_with_parent()
-os.register_at_fork(after_in_child=die_with_parent)
+# Its clients hold the other end; it is the only pipe that the server is given (multiprocessing.forkserver).
+(_clients,) = (
+    int(path.name) for path in Path("/proc/self/fd").iterdir() if int(path.name) > 2 and path.is_fifo()
+)
+kill_when_closed(_clients, os.getpid())

@@ -6,7 +6,10 @@ from types import FrameType, TracebackType
 
 
 class Interruption:
-    """Notes a request to end and answers it; the second Ctrl-C ends at once."""
+    """Notes a request to end and answers it; the second Ctrl-C ends at once.
+
+    Where one is entered within another, as a training within a worker of a sweep, both have the same request.
+    """
 
     def __init__(self, answer: Callable[[str], None] | None = None) -> None:
         """Hear nothing yet.
@@ -17,11 +20,15 @@ class Interruption:
         self._answer = answer
         self.signum: int | None = None
         self._before: dict[int, object] = {}
+        self._outer: Interruption | None = None
 
     def __enter__(self) -> "Interruption":
         """Begin to listen."""
         for signum in (signal.SIGINT, signal.SIGTERM):
-            self._before[signum] = signal.signal(signum, self._hear)
+            self._before[signum] = before = signal.signal(signum, self._hear)
+            outer = getattr(before, "__self__", None)
+            if isinstance(outer, Interruption):
+                self._outer, self.signum = outer, outer.signum
         return self
 
     def __exit__(
@@ -39,6 +46,8 @@ class Interruption:
         if self.signum is not None:
             raise KeyboardInterrupt
         self.signum = signum
+        if self._outer is not None:
+            self._outer.signum = signum
         if self._answer is not None:
             self._answer(
                 "stopping: this iteration is finished and its policy evaluated; Ctrl-C again ends at once"

@@ -211,7 +211,10 @@ class Training:
         Raises:
             OSError, RunFailed: the folder takes no more.
         """
-        write_pictures(self.folder.path, self.setup.courses)
+        if (
+            self._watch is None or not exit_code
+        ):  # an interrupted trial of a sweep resumes, and has seconds to end
+            write_pictures(self.folder.path, self.setup.courses)
         return self._end(status, reason, exit_code)
 
     def fail(self, reason: str, error: BaseException) -> Outcome:

@@ -1,10 +1,8 @@
 """What happens inside a collector's process."""
 
-import multiprocessing
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +16,9 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
+from deepracer_exp.lifeline import end_with_owner
 
 from .faults import keep_state, write_fault
-from .lifeline import die_with_parent
 
 PRINTS_FILE = "reward_prints.log"
 
@@ -44,7 +42,10 @@ class EnvFactory:
     def __call__(self) -> RaceEnv:
         """Return the environment, with the process around it made ready."""
         if self.heartbeat is not None:
-            _obey_parent_only()
+            # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes: the training process hears it.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            end_with_owner()
         # Sampling of actions is a worker's own stream, whatever the other workers do.
         torch.manual_seed(int(np.random.SeedSequence([self.setup.seed, self.worker]).generate_state(1)[0]))
         race = Race(
@@ -111,24 +112,3 @@ class _WorkerEnv(_StateKeepingEnv):
             sys.stderr.flush()
             # No traceback from here: the training process prints the one line and holds the exit code.
             os._exit(RunFailed.exit_code)
-
-
-def _obey_parent_only() -> None:
-    """Leave Ctrl-C and SIGTERM to the training process, and never outlive it."""
-    # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes of a run.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-    if sys.platform == "linux":
-        die_with_parent()
-        if not parent.is_alive():
-            os._exit(RunFailed.exit_code)
-    else:
-
-        def follow() -> None:
-            parent.join()
-            os._exit(RunFailed.exit_code)
-
-        threading.Thread(target=follow, daemon=True).start()

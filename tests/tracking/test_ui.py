@@ -1,4 +1,3 @@
-import os
 import signal
 import socket
 import subprocess
@@ -6,6 +5,7 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import psutil
 import pytest
 from mlflow import MlflowClient
 
@@ -83,7 +83,9 @@ def test_the_ui_shows_runs_by_name_and_opens_their_files(store, tmp_path, free_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("signum", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143), (signal.SIGKILL, -9)]
+)
 def test_the_ui_ends_with_its_command_and_leaves_no_process(store, tmp_path, free_port, signum, code):
     script = (
         "from pathlib import Path; from deepracer_exp.tracking.ui import serve_ui\n"
@@ -92,8 +94,9 @@ def test_the_ui_ends_with_its_command_and_leaves_no_process(store, tmp_path, fre
     command = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     assert command.stdout is not None
     assert command.stdout.readline().startswith(f"http://127.0.0.1:{free_port}/")
-    (server,) = Path(f"/proc/{command.pid}/task/{command.pid}/children").read_text().split()
+    below = psutil.Process(command.pid).children(recursive=True)
+    assert below
     command.send_signal(signum)
     assert command.wait(30) == code
-    with pytest.raises(ProcessLookupError):
-        os.killpg(int(server), 0)
+    _, left = psutil.wait_procs(below, 10.0)
+    assert not left

@@ -1,0 +1,130 @@
+"""kill -9 of each process that the program starts, at random moments, again and again.
+
+What the killed one had started is gone within ten seconds, and study and run resume. `FAULT_TIMES=20` kills each of
+them twenty times (`make test-faults`), `KILL_LOOPS=FILE` keeps what was measured.
+"""
+
+import contextlib
+import json
+import os
+import random
+import signal
+import sqlite3
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from deepracer_exp.formats.run_files import read_metrics, read_object
+
+from .test_killed_sweeps import PATIENCE_S, Sweep, assert_every_trial_is_accounted_for_once, slots
+
+KILLS = int(os.environ.get("FAULT_TIMES", "1"))
+GONE_S = 10.0
+MANY = "sweep.trials=10000"
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(60 + 300 * KILLS)]
+
+
+@pytest.fixture
+def kill(request):
+    """Kill a process, wait until all that it had started is gone, and note how long that took."""
+    kills = []
+
+    def go(victim, doomed, moment):
+        victim.kill()
+        began = time.monotonic()
+        while (left := doomed()) and time.monotonic() < began + GONE_S:
+            time.sleep(0.05)
+        told = [" ".join(process.cmdline())[:120] for process in left]
+        kills.append({"moment": moment, "gone_after_s": round(time.monotonic() - began, 2), "left": told})
+        assert not left
+
+    yield go
+    if file := os.environ.get("KILL_LOOPS"):
+        path = Path(file)
+        all_loops = json.loads(path.read_text()) if path.exists() else {}
+        all_loops[request.node.name] = kills
+        path.write_text(json.dumps(all_loops, indent=1) + "\n")
+
+
+def ended(cwd):
+    with contextlib.closing(sqlite3.connect(cwd / "runs" / "sweeps.db")) as study:
+        return study.execute("SELECT count(*) FROM deepracer_slots WHERE outcome IS NOT NULL").fetchone()[0]
+
+
+def rest(start, cwd):
+    """Let the trials that have begun come to their end in a sweep that nobody kills."""
+    begun = max(1, len(slots(cwd)))
+    Sweep(start, cwd, f"sweep.trials={begun}").end()
+    assert_every_trial_is_accounted_for_once(cwd, trials=begun)
+
+
+def alive(processes):
+    return [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+
+
+def test_nothing_outlives_a_killed_driver_and_its_study_resumes(start, tmp_path, kill):
+    for number in range(KILLS):
+        dice = random.Random(number)
+        sweep = Sweep(start, tmp_path, MANY, "sweep.workers=2")
+        if number % 3 == 1:
+            time.sleep(dice.uniform(0.2, 8.0))
+            moment = "while it starts"
+        else:
+            rows = sweep.rows() + dice.randrange(1, 8)
+            sweep.wait_for(lambda: sweep.workers() and sweep.rows() >= rows, f"{rows} rows")  # noqa: B023
+            moment = f"{rows} rows"
+        kill(sweep.driver, sweep.command.processes, moment)
+        sweep.command.popen.wait()
+    rest(start, tmp_path)
+
+
+@pytest.mark.parametrize("what", ["worker", "fork server"])
+def test_a_sweep_survives_a_killed(what, start, tmp_path, kill):
+    sweep = Sweep(start, tmp_path, MANY, "sweep.workers=2")
+    for number in range(KILLS):
+        before = ended(tmp_path) if number else 0
+        sweep.wait_for(lambda: sweep.workers() and sweep.rows() and ended(tmp_path) > before, "trials")  # noqa: B023
+        time.sleep(random.Random(number).uniform(0.0, 1.0))
+        workers = sweep.workers()
+        victim = random.Random(number).choice(workers)
+        server = victim.parent()
+        if what == "worker":
+            kill(victim, lambda: alive([victim]), f"{before} trials")  # noqa: B023
+        else:
+            kill(server, lambda: alive([server, *workers]), f"{before} trials")  # noqa: B023
+    sweep.command.popen.send_signal(signal.SIGINT)
+    assert sweep.command.popen.wait(PATIENCE_S) == 130
+    sweep.command.assert_nothing_left()
+    rest(start, tmp_path)
+
+
+def test_nothing_outlives_a_killed_run_and_it_resumes(start, tmp_path, kill):
+    iterations = 20 * KILLS
+    run = (
+        *("train", "experiment=tiny", "tracking=off", "collector.processes=2", "checkpoints.every=4"),
+        *("episode.max_steps=60", "budget.env_steps=null", f"budget.iterations={iterations}"),
+    )
+    metrics = "runs/tiny/*/metrics.jsonl"
+    folders, rows = [], 0
+    for number in range(KILLS):
+        dice = random.Random(number)
+        started = start("resume", str(folders[0])) if folders else start(*run)
+        rows += dice.randrange(1, 12)
+        started.wait_for(
+            lambda: sum(file.read_bytes().count(b"\n") for file in tmp_path.glob(metrics)) >= rows,  # noqa: B023
+            f"{rows} rows",
+        )
+        time.sleep(dice.uniform(0.0, 0.5))
+        kill(psutil.Process(started.popen.pid), started.processes, f"{rows} rows")
+        started.popen.wait()
+        folders = [path.parent for path in tmp_path.glob("runs/tiny/*/config.yaml")]
+    (folder,) = folders
+    last = start("resume", str(folder)).end(PATIENCE_S)
+    assert last.code == 0, last.stderr
+    assert read_object(folder / "summary.json")["status"] == "finished"
+    assert [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")] == list(
+        range(1, iterations + 1)
+    )
