@@ -14,10 +14,14 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 from plotly.subplots import make_subplots
 
+from deepracer_exp.analysis.chart import INK
+from deepracer_exp.analysis.chart_layout import GRID, SPINE
+from deepracer_exp.analysis.chart_plotly import base_layout
+from deepracer_exp.analysis.chart_plotly_panel import NARROW_WIDTH
+
 from .fates import FATES, fate_of, words
 from .labels import MEASURES, number, objectives_of, short_keys, shown
 
-INK, FAINT, GRID = "#22262b", "#6b727d", "#e9ecef"
 FEWEST_COMPLETE = 20
 """Complete trials below which a parameter's importance is chance: the best quarter would be less than five trials."""
 _RESAMPLES = 40
@@ -26,6 +30,8 @@ _FAR = 5.0
 _NEAR = 0.25
 """Share of the best value that a trial may be worse by without standing at the edge."""
 _MOST_PARAMETERS = 12
+_PANEL, _GAP = 210.0, 62.0
+"""Height of a panel on a narrow screen and the room between two of them, pixels."""
 _STEPS = tuple(step * 10.0**decade for decade in range(-3, 6) for step in (1, 2, 5))
 
 
@@ -90,18 +96,47 @@ def thinned(rows: Sequence[Any], most: int) -> list[Any]:
 def styled(figure: go.Figure, title: str, height: int, *, legend: bool = True) -> go.Figure:
     """Give a figure the look that all share."""
     figure.update_layout(
-        template="plotly_white",
-        title={"text": f"<b>{title}</b>", "x": 0.0, "xref": "container", "font": {"size": 17, "color": INK}},
-        font={"family": "system-ui, sans-serif", "size": 13, "color": INK},
+        base_layout(title),
+        meta={"title": title},
         height=height,
         margin={"l": 70, "r": 20, "t": 60, "b": 60},
         showlegend=legend,
         legend={"itemsizing": "constant", "font": {"size": 13}},
-        hoverlabel={"align": "left"},
     )
-    figure.update_xaxes(gridcolor=GRID, zeroline=False, linecolor="#cdd2d8")
-    figure.update_yaxes(gridcolor=GRID, zeroline=False, linecolor="#cdd2d8")
+    axes = {"gridcolor": GRID, "zeroline": False, "linecolor": SPINE, "title": {"font": {"size": 13}}}
+    figure.update_xaxes(**axes)
+    figure.update_yaxes(**axes)
     return figure
+
+
+def narrowed(figure: go.Figure) -> go.Figure:
+    """Return a figure with a layout for a narrow screen: its panels below each other, the legend below them."""
+    used = {trace.yaxis or "y" for trace in figure.data if "yaxis" in trace}
+    panels = sorted((axis for axis in used), key=lambda axis: int(axis[1:] or 1))
+    layout, narrow = figure.layout, go.Figure(layout=figure.layout)
+    narrow.update_layout(base_layout(layout.meta["title"], NARROW_WIDTH))
+    head = layout.margin.t + 20.0 * narrow.layout.title.text.count("<br>")
+    names = {trace.name for trace in figure.data if trace.name} if layout.showlegend else ()
+    foot = layout.margin.b + 22.0 * len(names)
+    bodies = (
+        len(panels) * (_PANEL + _GAP) - _GAP if panels else layout.height - layout.margin.t - layout.margin.b
+    )
+    if len(panels) > 1:
+        for at, axis in enumerate(panels):
+            top = 1 - at * (_PANEL + _GAP) / bodies
+            narrow.layout[f"yaxis{axis[1:]}"].domain = (max(0.0, top - _PANEL / bodies), top)
+            narrow.layout[f"xaxis{axis[1:]}"].domain = (0.0, 1.0)
+    narrow.update_layout(
+        height=round(head + bodies + foot),
+        margin={"l": 62, "r": 12, "t": head, "b": foot},
+        legend={"orientation": "h", "x": 0, "y": -layout.margin.b / bodies, "yanchor": "top"},
+    )
+    return narrow
+
+
+def least_width(figure: go.Figure) -> int:
+    """Return the pixels below which a figure cannot be read: each of many parallel axes needs room for its values."""
+    return max((95 * len(trace.dimensions) for trace in figure.data if trace.type == "parcoords"), default=0)
 
 
 def usual_range(complete: Sequence[float], values: Sequence[float], minimize: bool) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """One HTML page that tells all of a study, and needs nothing beside it."""
 
+import base64
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,15 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.analysis.page import plot, render
+from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.run_files import read_head
+from deepracer_exp.formats.run_outcome import command, outcome
+from deepracer_exp.formats.user_file import read_bytes
 from deepracer_exp.formats.whole_file import write_whole
 
-from .best import best_line, best_trial, best_values, complete_trials, reranked
+from .best import best_line, best_run, best_trial, best_values, complete_trials, reranked
 from .fates import FATES, fate_of, words
-from .figures import FEWEST_COMPLETE, figures, value_of
+from .figures import FEWEST_COMPLETE, figures, least_width, narrowed, value_of
 from .labels import (
     MEASURES,
     NONE,
@@ -66,7 +71,10 @@ def report(study: optuna.Study) -> str:
     """
     objectives = objectives_of(study)
     trials = study.get_trials(deepcopy=False)
-    plots = [plot(figure, name) for name, figure in figures(study).items()]
+    plots = [
+        plot(figure, name, figure.layout.meta["title"], narrowed(figure), least_width(figure))
+        for name, figure in figures(study).items()
+    ]
     won = any(trial.state == TrialState.COMPLETE for trial in trials)
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
     return render(
@@ -76,7 +84,9 @@ def report(study: optuna.Study) -> str:
         study=study.study_name,
         headline=headline(study),
         fates=fates(trials),
-        line=best_line(study) if won else None,
+        outcome=_outcome(study, objectives, keys) if won else [],
+        steps=_next_steps(study) if won else [("Resume it", command("sweep", f"study={study.study_name}"))],
+        picture=_picture(study) if won else None,
         best=best_trial(study).number if won else None,
         winners=_winners(study, objectives, keys),
         notes=_NOTES,
@@ -118,6 +128,44 @@ def headline(study: optuna.Study) -> list[str]:
         f"steps{share}."
     )
     return sentences
+
+
+def _outcome(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[tuple[str, str]]:
+    """Return what the winner is and what came of it, in names and values."""
+    best = best_trial(study)
+    found = [(f"{keys[key]}", parameter(value)) for key, value in best.params.items()]
+    found.append(("Lap time in evaluation", described("lap_time", best.user_attrs.get("lap_time_s"))))
+    found.append(("Completion in evaluation", described("completion", best.user_attrs.get("completion"))))
+    found.append(("How its training ended", str(best.user_attrs.get("reason") or words(fate_of(best)))))
+    try:
+        run = read_head(best_run(study))
+    except BadInput:  # moved or removed since
+        return found
+    return [pair for pair in outcome(run) if pair[0] in ("Track", "Reward")] + found
+
+
+def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
+    """Return what to do with the winner, each with its command to paste."""
+    winner = f"run=best:{study.study_name}"
+    more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
+    return [
+        ("Train the winner again", best_line(study)),
+        ("Race it on fresh laps, and film the fastest", command("evaluate", winner, "--video", "lap.mp4")),
+        ("Train on from its policy at a tenth of the learning rate", command("clone", winner)),
+        (
+            "Search on with twice the trials",
+            command("sweep", f"study={study.study_name}", f"sweep.trials={more}"),
+        ),
+    ]
+
+
+def _picture(study: optuna.Study) -> str | None:
+    """Return the picture of the winner's fastest lap in base64, None where there is none."""
+    try:
+        picture = read_bytes(best_run(study) / "best_lap.png", "the picture that a training draws")
+    except BadInput:
+        return None
+    return base64.b64encode(picture).decode("ascii")
 
 
 def fates(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:

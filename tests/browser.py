@@ -1,5 +1,6 @@
 """A headless Chromium that opens a page and tells what it did: for pages that must need nothing beside them."""
 
+import base64
 import json
 import os
 import shutil
@@ -52,10 +53,18 @@ class Tab:
         self.wait_for("document.readyState === 'complete'")
 
     def draw_all(self) -> None:
-        """Let all figures be drawn, as for printing, and wait until they are."""
-        self.tell("window.dispatchEvent(new Event('beforeprint'))")
-        left = "[data-plot]:not([data-state=drawn], [data-state=failed])"
-        self.wait_for(f"document.querySelectorAll('{left}').length === 0")
+        """Let all figures be drawn by printing the page."""
+        for event in ("beforeprint", "afterprint"):
+            self.tell(f"window.dispatchEvent(new Event('{event}'))")
+
+    def prefer(self, scheme: str) -> None:
+        """Let pages know that the reader prefers `light` or `dark`."""
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        self.call("Emulation.setEmulatedMedia", features=[feature])
+
+    def print(self) -> bytes:
+        """Return the page as PDF."""
+        return base64.b64decode(self.call("Page.printToPDF")["data"])
 
     def tell(self, expression: str) -> Any:
         """Return what an expression comes to."""
@@ -74,8 +83,6 @@ class Tab:
 
     def picture(self, path: Path, selector: str = "html") -> Path:
         """Write a picture of an element, at once."""
-        import base64
-
         box = self.tell(
             f"(({{x, y, width, height}}) => ({{x: x + scrollX, y: y + scrollY, width, height}}))"
             f"(document.querySelector({json.dumps(selector)}).getBoundingClientRect())"

@@ -12,7 +12,7 @@ BLUE, ORANGE, GREEN, VERMILION = "#0072b2", "#e69f00", "#009e73", "#d55e00"
 PURPLE, SKY, YELLOW, BLACK = "#cc79a7", "#56b4e9", "#f0e442", "#000000"
 CATEGORIES = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK, YELLOW)
 """Colours that colour-blind readers tell apart (Okabe and Ito, 2008)."""
-INK, FAINT, PALE = "#22262b", "#6b727d", "#b9bfc8"
+INK, FAINT, PALE, PAPER = "#22262b", "#6b727d", "#b9bfc8", "#ffffff"
 MOST_POINTS = 5000
 """Points beyond which a page becomes slow: a figure shows a part of them and says so."""
 

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from matplotlib.path import Path
 
-from .chart import Band, Bars, Cells, Chart, Line, Note, Panel, Points, Road, Values
+from .chart import Band, Bars, Cells, Line, Note, Panel, Points, Road, Values
 
 DIVERGING = "PuOr"
 """Readers who see no red or no green tell its ends apart."""
@@ -96,19 +96,19 @@ def extent(panel: Panel) -> tuple[float, float, float, float]:
     return float(left), float(right), float(bottom), float(top)
 
 
-def row_heights(chart: Chart) -> list[float]:
-    """Return the height of the axes of each row, inches, for a figure of 12 inches."""
-    several = len(chart.rows) > 1
+def row_heights(rows: Sequence[Sequence[Panel]], width_in: float = WIDTH_IN) -> list[float]:
+    """Return the height of the axes of each row of a figure so many inches wide, inches."""
+    several = len(rows) > 1
     heights = []
-    for row in chart.rows:
-        room = WIDTH_IN / len(row) - 1.0
-        here = 1.9 if len(chart.rows) > 3 else 2.5 if several else 4.4
+    for row in rows:
+        room = width_in / len(row) - 1.0
+        here = 1.9 if len(rows) > 3 else 2.5 if several or width_in < WIDTH_IN else 4.4
         if maps := [extent(panel) for panel in row if panel.map]:
             shapes = [(top - bottom) / max(right - left, 1e-9) for left, right, bottom, top in maps]
             here = min(max(room * max(shapes), _MAP_ROOM_IN), 4.6 if several else 6.5)
         for panel in row:
-            rows = len(categories(panel, "y"))
-            here = max(here, 0.9 + 0.34 * rows if rows else 0.0)
+            names = len(categories(panel, "y"))
+            here = max(here, 0.9 + 0.34 * names if names else 0.0)
         heights.append(here)
     return heights
 

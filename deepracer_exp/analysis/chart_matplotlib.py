@@ -53,7 +53,7 @@ def draw(chart: Chart) -> Figure:
     feet = [
         0.85 if any(panel.x_label or categories(panel, "x") for panel in row) else 0.35 for row in chart.rows
     ]
-    height = sum(row_heights(chart)) + sum(heads) + sum(feet) + 0.45
+    height = sum(row_heights(chart.rows)) + sum(heads) + sum(feet) + 0.45
     figure = Figure(
         figsize=(WIDTH_IN, height), dpi=150, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.08)
     )
@@ -61,7 +61,7 @@ def draw(chart: Chart) -> Figure:
         chart.title, x=0.012, ha="left", fontsize=15, fontweight="bold", color=INK, linespacing=1.3
     )
     columns = math.lcm(*(len(row) for row in chart.rows))
-    grid = figure.add_gridspec(len(chart.rows), columns, height_ratios=row_heights(chart))
+    grid = figure.add_gridspec(len(chart.rows), columns, height_ratios=row_heights(chart.rows))
     firsts: dict[tuple[int, int], Axes] = {}
     for number, row in enumerate(chart.rows):
         span = columns // len(row)

@@ -2,13 +2,15 @@
 
 import html
 import math
+import textwrap
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from .chart import FAINT, INK, Band, Bars, Cells, Line, Mark, Note, Panel, Points, Road, Values
+from .chart import FAINT, INK, PAPER, Band, Bars, Cells, Line, Mark, Note, Panel, Points, Road, Values
 from .chart_layout import (
     DIVERGING,
     GRID,
@@ -28,34 +30,48 @@ from .chart_layout import (
     wound,
 )
 
-WIDTH = 1040.0
-"""Pixels of the page for which room is laid out; the figure takes what it gets."""
+WIDTH, NARROW_WIDTH = 1040.0, 400.0
+"""Pixels for which room is laid out, on a desk and on a phone; the figure takes what it gets."""
 LEFT = 74.0
 """Beside axes with numbers, pixels."""
+VEIL = "rgba(255,255,255,0.7)"
+"""Behind words that stand on data."""
 _LEGEND_ROW = 21.0
+_TITLE_LETTER = 8.4
+"""Mean width of a letter of a panel's title, pixels."""
 _SYMBOLS = {"circle": "circle", "cross": "x", "diamond": "diamond", "triangle": "triangle-up", "star": "star"}
 
 
-def turned(panel: Panel, columns: int) -> bool:
-    """Return whether the names along x do not fit beside each other."""
+def turned(panel: Panel, width: float) -> bool:
+    """Return whether the names along x do not fit beside each other on a panel of this width, pixels."""
     names = categories(panel, "x")
-    return sum(7.0 * len(name) + 14.0 for name in names) > WIDTH / columns - LEFT
+    return sum(7.0 * len(name) + 14.0 for name in names) > width - LEFT
 
 
-def _upright_legend(panel: Panel, columns: int) -> bool:
+def _legend_rows(panel: Panel, width: float) -> int:
+    """Return the rows of a legend that runs along the panel: one, or columns as wide as the longest name."""
+    widths = [7.0 * len(name) + 46.0 for name in legend_names(panel)]
+    room = width - 60.0
+    return 1 if sum(widths) <= room else math.ceil(len(widths) / max(1.0, room // max(widths)))
+
+
+def _upright_legend(panel: Panel, columns: int, width: float) -> bool:
     """Return whether a legend beside others must go down instead of along the row."""
-    return (
-        columns > 1 and sum(7.0 * len(name) + 46.0 for name in legend_names(panel)) > WIDTH / columns - 60.0
-    )
+    return columns > 1 and _legend_rows(panel, width) > 1
 
 
-def head(panel: Panel, columns: int) -> float:
+def _title_lines(panel: Panel, width: float) -> list[str]:
+    """Return the title of a panel of this width in lines that fit."""
+    return textwrap.wrap(panel.title, round((width - LEFT) / _TITLE_LETTER))
+
+
+def head(panel: Panel, columns: int, width: float) -> float:
     """Return how high title and legend are, pixels."""
     names = legend_names(panel)
     rows = len(names)
-    if names and not _upright_legend(panel, columns):
-        rows = math.ceil(sum(7.0 * len(name) + 46.0 for name in names) / (WIDTH - 60.0))
-    return 10.0 + 24.0 * bool(panel.title) + _LEGEND_ROW * rows
+    if names and not _upright_legend(panel, columns, width):
+        rows = _legend_rows(panel, width)
+    return 10.0 + 24.0 * len(_title_lines(panel, width)) + _LEGEND_ROW * rows
 
 
 class PanelPlace:
@@ -69,9 +85,11 @@ class PanelPlace:
         x: tuple[float, float],
         y: tuple[float, float],
         total: float,
-        column: tuple[float, float],
+        columns: int,
+        width: float,
     ) -> None:
-        self.figure, self.panel, self.x, self.y, self.total, self.column = figure, panel, x, y, total, column
+        self.figure, self.panel, self.x, self.y, self.total = figure, panel, x, y, total
+        self.columns, self.width, self.number = columns, width, number
         suffix = "" if number == 1 else str(number)
         self.x_name, self.y_name, self.legend = f"x{suffix}", f"y{suffix}", f"legend{suffix}"
         axis: dict[str, Any] = {
@@ -89,7 +107,6 @@ class PanelPlace:
         y_axis = {**axis, "domain": y, "anchor": self.x_name}
         figure.update_layout({f"xaxis{suffix}": x_axis, f"yaxis{suffix}": y_axis})
         self.x_axis, self.y_axis = figure.layout[f"xaxis{suffix}"], figure.layout[f"yaxis{suffix}"]
-        self.columns = round(1 / (column[1] - column[0]))
 
     def draw_panel(self) -> None:
         """Draw axes, title, legend and all layers."""
@@ -104,8 +121,9 @@ class PanelPlace:
             self._axes()
         for layer in panel.layers:
             self._layer(layer)
-        upright = _upright_legend(panel, self.columns)
-        room = head(panel, self.columns) - 10.0 - 24.0 * bool(panel.title)
+        width = self.width / self.columns
+        upright, title = _upright_legend(panel, self.columns, width), _title_lines(panel, width)
+        room = head(panel, self.columns, width) - 10.0 - 24.0 * len(title)
         self.figure.update_layout(
             {
                 self.legend: {
@@ -121,9 +139,10 @@ class PanelPlace:
                 }
             }
         )
-        if panel.title:
+        if title:
             self._write(
-                f"<b>{plain(panel.title)}</b>",
+                "<b>" + "<br>".join(map(plain, title)) + "</b>",
+                align="left",
                 x=self.x[0],
                 y=self.y[1] + (room + 6.0) / self.total,
                 xref="paper",
@@ -145,7 +164,7 @@ class PanelPlace:
                 axis.showgrid = False
         if names := categories(panel, "y"):
             self.y_axis.range = (len(names) - 0.5, -0.5)
-        if turned(panel, self.columns):
+        if turned(panel, self.width / self.columns):
             self.x_axis.tickangle = -30
         if panel.x_range is not None:
             self.x_axis.range = panel.x_range
@@ -182,7 +201,7 @@ class PanelPlace:
                     y=_light(layer.height),
                     base=None if layer.base is None else _light(layer.base),
                     width=bar_width(layer, x),
-                    marker={"color": layer.color, "line": {"width": 0.5, "color": "white"}},
+                    marker={"color": layer.color, "line": {"width": 0.5, "color": PAPER}},
                 )
             case Cells():
                 self._cells(layer)
@@ -197,7 +216,7 @@ class PanelPlace:
                     y=layer.y,
                     xref=self.x_name,
                     yref=self.y_name,
-                    bgcolor="rgba(255,255,255,0.7)",
+                    bgcolor=VEIL,
                     font={"size": 12, "color": INK},
                 )
 
@@ -223,8 +242,10 @@ class PanelPlace:
             marker |= {"color": points.color, "opacity": 0.45 if len(points.x) > 500 else 0.9}
         else:
             low, high = color_range(points)
-            marker |= {"color": _light(points.values), "cmin": low, "cmax": high, "colorscale": SCALE}
-            marker |= {"showscale": True, "colorbar": self._bar(points.scale or "")}
+            marker |= {
+                "color": _light(points.values),
+                "coloraxis": self._scale(low, high, SCALE, points.scale or ""),
+            }
         extra: dict[str, Any] = {}
         if points.values is not None and points.hover is None:
             extra["hovertemplate"] = f"%{{marker.color:.6~g}}<extra>{plain(points.scale or '')}</extra>"
@@ -266,10 +287,7 @@ class PanelPlace:
             x=_light(places(cells.x, x)),
             y=_light(places(cells.y, y)),
             z=_light(cells.values),
-            zmin=low,
-            zmax=high,
-            colorscale=DIVERGING if cells.diverging else SCALE,
-            colorbar=self._bar(cells.scale),
+            coloraxis=self._scale(low, high, DIVERGING if cells.diverging else SCALE, cells.scale),
             hoverongaps=False,
             hovertemplate=f"%{{z:.6~g}} {plain(cells.scale)}<extra></extra>",
             texttemplate="%{z:.3~g}" if cells.written else None,
@@ -296,11 +314,12 @@ class PanelPlace:
             line={"color": ROAD_CENTER, "width": 1, "dash": "dash"},
         )
 
-    def _bar(self, label: str) -> dict[str, Any]:
-        """Return the colour bar beside the panel."""
-        return {
+    def _scale(self, low: float, high: float, colors: str | Sequence[str], label: str) -> str:
+        """Add a colour bar beside the panel to the layout, and return its name."""
+        name = f"coloraxis{len(self.figure.data) + 1}"
+        bar = {
             "title": {"text": plain(label), "side": "right", "font": {"size": 12}},
-            "x": self.x[1] + 6.0 / WIDTH,
+            "x": self.x[1] + 6.0 / self.width,
             "xanchor": "left",
             "y": sum(self.y) / 2,
             "len": 0.96 * (self.y[1] - self.y[0]),
@@ -310,6 +329,9 @@ class PanelPlace:
             "ypad": 0,
             "tickfont": {"size": 11, "color": FAINT},
         }
+        axis = {"cmin": low, "cmax": high, "colorscale": colors, "colorbar": bar}
+        self.figure.update_layout({name: axis})
+        return name
 
     def _mark(self, mark: Mark) -> None:
         line = {"color": mark.color, "width": 1.8, "dash": "dash"}
@@ -327,7 +349,7 @@ class PanelPlace:
                 xanchor="right",
                 yanchor="bottom",
                 font={"size": 12, "color": INK},
-                bgcolor="rgba(255,255,255,0.7)",
+                bgcolor=VEIL,
                 borderpad=0,
             )
             return
@@ -354,7 +376,7 @@ class PanelPlace:
             yanchor="top",
             textangle=-90,
             font={"size": 12, "color": INK},
-            bgcolor="rgba(255,255,255,0.7)",
+            bgcolor=VEIL,
             borderpad=0,
         )
 
@@ -363,7 +385,7 @@ class PanelPlace:
         marks = [layer for layer in self.panel.layers if isinstance(layer, Mark) and not layer.horizontal]
         marks = sorted((other for other in marks if other.label), key=lambda other: other.at)
         left, right = self.panel.x_range or self._ends()
-        room = 20.0 / (WIDTH * (self.x[1] - self.x[0])) * (right - left)
+        room = 20.0 / (self.width * (self.x[1] - self.x[0])) * (right - left)
         return word_places([other.at for other in marks], left, right, room)[marks.index(mark)]
 
     def _ends(self) -> tuple[float, float]:

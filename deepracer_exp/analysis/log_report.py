@@ -7,11 +7,15 @@ from typing import Any
 
 import pandas as pd
 
+from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import Recording, readable
+from deepracer_exp.formats.run_files import RunRecord, read_head
+from deepracer_exp.formats.run_outcome import next_steps, outcome
 from deepracer_exp.formats.whole_file import write_whole
 
 from .chart import Chart
 from .chart_plotly import draw
+from .chart_plotly_panel import NARROW_WIDTH
 from .charts import Section, draw_sections
 from .findings import Finding, findings
 from .log_tables import (
@@ -28,6 +32,7 @@ from .log_tables import (
 from .log_view import LogView, prepare
 from .page import Plot, plot, render
 from .reward_comparison import RewardComparison
+from .run_folders import run_folder
 
 
 def write_report(
@@ -87,6 +92,7 @@ def html(page: LogPage) -> str:
         sections = [Section("Another reward function", page.replay.charts), *sections]
     drawn = [(section.title, [_Figure.of(chart) for chart in section.charts]) for section in sections]
     figures = {figure.name: figure for _, some in drawn for figure in some}
+    run = _run(view)
     files = [readable(str(file)) for file in recording.files]
     return render(
         __package__,
@@ -94,6 +100,9 @@ def html(page: LogPage) -> str:
         [figure.plot for figure in figures.values()],
         name=view.name,
         headline=headline(view),
+        outcome=outcome(run) if run is not None else facts(view),
+        steps=next_steps(run) if run is not None else _submission(page.findings),
+        picture=figures["lap_line"].plot if "lap_line" in figures else None,
         findings=[_finding(one, figures) for one in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
         names=set(figures),
@@ -112,6 +121,20 @@ def html(page: LogPage) -> str:
     )
 
 
+def _run(view: LogView) -> RunRecord | None:
+    """Return the files of a run of ours; None of other recordings and of a run whose files cannot be read."""
+    folder = run_folder(view)
+    try:
+        return read_head(folder) if folder is not None else None
+    except BadInput:
+        return None
+
+
+def _submission(found: Sequence[Finding]) -> list[tuple[str, str]]:
+    """Return what to do with a training of the service, whose checkpoints no command of ours takes."""
+    return [(one.sentence, "") for one in found if one.rule == "submit"]
+
+
 @dataclass(frozen=True)
 class _Figure:
     """A figure as the template takes it."""
@@ -123,7 +146,8 @@ class _Figure:
 
     @classmethod
     def of(cls, chart: Chart) -> "_Figure":
-        return cls(chart.name, chart.title, chart.caption, plot(draw(chart), chart.name))
+        packed = plot(draw(chart), chart.name, chart.title, draw(chart, NARROW_WIDTH))
+        return cls(chart.name, chart.title, chart.caption, packed)
 
 
 def _finding(one: Finding, figures: Mapping[str, _Figure]) -> dict[str, Any]:

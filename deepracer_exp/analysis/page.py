@@ -16,7 +16,7 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 from plotly.utils import PlotlyJSONEncoder
 
-_DEFAULT_HEIGHT = 450
+from .chart_plotly import DARK
 
 
 @dataclass(frozen=True)
@@ -25,21 +25,32 @@ class Plot:
 
     name: str
     """Letters, digits, - and _."""
+    title: str
     height: int
     """Pixels it takes, kept free until it is drawn."""
+    phone_height: int
+    """The same on a narrow screen."""
+    least_width: int
+    """Pixels below which it scrolls in itself; 0: it gets as narrow as the page."""
     packed: str
     """Its JSON, gzip in base64."""
 
 
-def plot(figure: Figure, name: str) -> Plot:
+def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int = 0) -> Plot:
     """Pack a figure.
 
     Args:
-        figure: its layout may have a height.
+        figure: its layout has a height.
         name: of the element and of the picture that a reader saves.
+        title: as text.
+        narrow: the same traces with a layout for a narrow screen.
+        least_width: pixels below which it scrolls in itself.
     """
-    text = json.dumps(figure.to_plotly_json(), cls=PlotlyJSONEncoder, separators=(",", ":"))
-    return Plot(name, int(figure.layout.height or _DEFAULT_HEIGHT), packed(text))
+    whole = figure.to_plotly_json()
+    layout = narrow.layout.to_plotly_json()
+    whole["narrow"] = {key: value for key, value in layout.items() if value != whole["layout"].get(key)}
+    text = json.dumps(whole, cls=PlotlyJSONEncoder, separators=(",", ":"))
+    return Plot(name, title, int(figure.layout.height), int(narrow.layout.height), least_width, packed(text))
 
 
 def packed(text: str) -> str:
@@ -52,7 +63,7 @@ def render(package: str, template: str, plots: Sequence[Plot], **values: Any) ->
 
     Args:
         package: where the template is.
-        template: its file; it includes `plot.html.j2` with `plot` where a figure stands.
+        template: its file; its sections are the macro `part`, which enters them into `contents`.
         plots: all figures of the page.
         values: for the template.
     """
@@ -65,14 +76,22 @@ def render(package: str, template: str, plots: Sequence[Plot], **values: Any) ->
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
+    environment.filters["themed"] = _themed
     script = _script()
     return environment.get_template(template).render(
         policy=_policy(script, get_plotlyjs()),
+        contents=[],
         plots=plots,
+        dark=Markup(json.dumps(DARK)),  # our own colours
         plotly=_packed_plotly() if plots else "",
         script=Markup(script),  # our own file
         **values,
     )
+
+
+def _themed(color: str) -> str:
+    """Return a colour of a figure for CSS."""
+    return f"light-dark({color}, {DARK.get(color.lower(), color)})"
 
 
 def _policy(*scripts: str) -> str:

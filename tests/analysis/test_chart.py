@@ -223,5 +223,5 @@ def test_no_word_of_any_three_marks_covers_another(at: list[float]) -> None:
 
 def test_a_map_is_as_high_as_its_course() -> None:
     wide = Road(rings=[CIRCLE * [6.0, 2.0]], center=CIRCLE * [5.0, 1.5])
-    high = row_heights(chart([Panel(map=True, layers=[ROAD])]))[0]
-    assert row_heights(chart([Panel(map=True, layers=[wide])]))[0] < 0.7 * high
+    high = row_heights(chart([Panel(map=True, layers=[ROAD])]).rows)[0]
+    assert row_heights(chart([Panel(map=True, layers=[wide])]).rows)[0] < 0.7 * high

@@ -1,0 +1,175 @@
+"""Laws of the two pages, that of a training and that of a sweep, in a real browser."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.analysis.log_report import write_report as write_log_report
+from sweeps.report import write_report as write_sweep_report
+from tests.browser import Tab, browser, needs_chromium
+from tests.page_html import Html
+from tests.sweeps.studies import season as study
+
+from .test_log_report import season as recording
+
+pytestmark = needs_chromium
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("pages")
+
+
+@pytest.fixture(scope="module", params=["training", "sweep"])
+def page(request, folder) -> Path:
+    path = folder / f"{request.param}.html"
+    if request.param == "training":
+        return write_log_report(recording(), path)
+    return write_sweep_report(study(folder / "runs", 60), path)
+
+
+@pytest.fixture(scope="module")
+def chromium(folder):
+    with browser(folder / "profile") as tab:
+        yield tab
+
+
+@pytest.fixture
+def tab(chromium) -> Tab:
+    chromium.prefer("light")
+    return chromium
+
+
+def test_the_contents_lead_to_every_section_and_every_figure(page):
+    read = Html(page.read_text(encoding="utf-8"))
+    contents = read.links[: read.links.index("findings") + 1] if "findings" in read.links else read.links
+    assert set(read.links) <= set(read.ids)
+    parts = [
+        name
+        for name in read.ids
+        if not name.startswith(("figure-", "data-")) and name not in ("plotly", "dark")
+    ]
+    figures = [name for name in read.ids if name.startswith("figure-")]
+    assert contents
+    assert len(parts) > 4
+    assert len(figures) >= 5
+    assert set(parts) | set(figures) <= set(read.links)
+
+
+def test_the_contents_stay_in_sight_wherever_one_reads(page, tab):
+    for width in (1400, 420):
+        tab.open(page, width=width)
+        tab.tell("scrollTo(0, document.body.scrollHeight)")
+        assert tab.tell("document.querySelector('.contents').getBoundingClientRect().top") >= 0
+        assert tab.tell(
+            "document.querySelector('.contents summary').getBoundingClientRect().bottom <= innerHeight"
+        )
+        assert tab.tell("document.querySelector('.contents > details').open") == (width == 1400)
+
+
+def test_no_page_is_wider_than_a_phone(page, tab):
+    tab.open(page, width=420)
+    tab.draw_all()
+    assert tab.tell("document.documentElement.scrollWidth") <= 420
+    wider = (
+        "[...document.querySelectorAll('main *')].filter(one => one.getBoundingClientRect().right > innerWidth"
+        " && !one.closest('.wide')).map(one => one.outerHTML.slice(0, 200))"
+    )
+    assert tab.tell(wider) == []
+    narrow = "[...document.querySelectorAll('[data-plot]')].filter(one => !one.style.minWidth)"
+    assert max(tab.tell(f"{narrow}.map(one => one.layout.width)")) <= 420
+
+
+CONTRAST = """
+(() => {
+  const shine = (color) => {
+    const [red, green, blue] = color.match(/[\\d.]+/g).map(Number)
+      .map((one) => (one /= 255) <= 0.04045 ? one / 12.92 : ((one + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue;
+  };
+  const behind = (one) => {
+    for (; one; one = one.parentElement) {
+      const color = getComputedStyle(one).backgroundColor;
+      if (!/, 0\\)|transparent/.test(color)) return color;
+    }
+  };
+  const found = {};
+  for (const one of document.querySelectorAll("h1, h2, p, dt, dd, a, td, th, summary, button, code, svg text")) {
+    // Values in a heat map stand on its cells.
+    if (!one.textContent.trim() || !one.checkVisibility() || one.closest(".heatmap-label")) continue;
+    const color = one instanceof SVGElement ? getComputedStyle(one).fill : getComputedStyle(one).color;
+    const paper = one.closest("[data-plot]")?.querySelector("svg.main-svg")?.style.background || behind(one);
+    const [light, dim] = [shine(color), shine(paper)].sort((a, b) => b - a);
+    found[`${one.tagName} ${color} on ${paper}`] = (light + 0.05) / (dim + 0.05);
+  }
+  return found;
+})()
+"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_of_page_and_figures_can_be_read_in_light_and_in_the_dark(page, tab, scheme):
+    tab.prefer(scheme)
+    tab.open(page)
+    tab.draw_all()
+    background = tab.tell("getComputedStyle(document.body).backgroundColor")
+    assert (max(map(int, re.findall(r"\d+", background))) < 60) == (scheme == "dark")
+    found = tab.tell(CONTRAST)
+    assert any(name.startswith("text ") for name in found)
+    # WCAG 2.2, 1.4.3; it leaves out what is no text to read.
+    assert {name: ratio for name, ratio in found.items() if ratio < 4.5} == {}
+
+
+def test_figures_follow_when_the_reader_goes_from_light_to_dark(page, tab):
+    tab.open(page, height=3000)
+    paper = "document.querySelector('[data-state=drawn]').layout.paper_bgcolor"
+    assert tab.tell(paper) == "#ffffff"
+    tab.prefer("dark")
+    tab.wait_for(f"{paper} !== '#ffffff'")
+
+
+def test_a_printed_page_has_every_figure_and_what_was_folded_though_nobody_scrolled(page, tab):
+    tab.prefer("dark")
+    tab.open(page, height=300)
+    drawn = "document.querySelectorAll('[data-state=drawn]').length"
+    assert tab.tell(drawn) < tab.tell("document.querySelectorAll('[data-plot]').length")
+    tab.tell("document.querySelectorAll('main details').forEach(one => { one.open = false })")
+    tab.tell(
+        "addEventListener('beforeprint', () => {"
+        " window.printed = [...document.querySelectorAll('[data-plot]')]"
+        " .map(one => [one.dataset.state, one.layout.paper_bgcolor, one.getBoundingClientRect().height > 100]);"
+        " window.closed = document.querySelectorAll('main details:not([open])').length })"
+    )
+    assert tab.print().startswith(b"%PDF")
+    assert {tuple(one) for one in tab.tell("window.printed")} == {("drawn", "#ffffff", True)}
+    assert tab.tell("window.closed") == 0
+    assert tab.tell("document.querySelectorAll('main details[open]').length") == 0
+    assert tab.complaints == []
+
+
+def test_a_section_that_was_folded_stays_so_when_the_page_is_loaded_again(page, tab):
+    tab.open(page)
+    part = "document.querySelectorAll('details.part')[1]"
+    tab.tell(f"{part}.open = true")
+    height = f"{part}.getBoundingClientRect().height"
+    before = tab.tell(height)
+    tab.tell(f"{part}.querySelector('summary').click()")
+    tab.wait_for(f"!{part}.open && history.state?.open?.includes(false)")
+    assert tab.tell(height) < min(before, 60)
+    tab.call("Page.reload")
+    tab.wait_for(f"document.readyState === 'complete' && !{part}.open")
+    tab.tell(f"{part}.open = true")
+
+
+def test_the_button_beside_a_command_copies_it(tab, folder):
+    page = write_sweep_report(study(folder / "copied", 12), folder / "copied.html")
+    tab.call("Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"])
+    tab.open(page)
+    tab.call("Page.bringToFront")
+    lines = tab.tell("[...document.querySelectorAll('.command code')].map(one => one.textContent)")
+    assert any(line.startswith("deepracer-exp train ") for line in lines)
+    for at, line in enumerate(lines):
+        tab.tell(f"document.querySelectorAll('.command button')[{at}].click()")
+        tab.wait_for(f"document.querySelectorAll('.command button')[{at}].textContent === 'Copied'")
+        assert tab.tell("navigator.clipboard.readText()") == line
