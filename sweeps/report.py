@@ -1,6 +1,7 @@
 """One HTML page that tells all of a study, and needs nothing beside it."""
 
 import base64
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,10 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from deepracer_exp.analysis.next_steps import COMMAND, outcome
 from deepracer_exp.analysis.page import plot, render
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.run_files import read_head
-from deepracer_exp.formats.run_outcome import command, outcome
 from deepracer_exp.formats.user_file import read_bytes
 from deepracer_exp.formats.whole_file import write_whole
 
@@ -85,7 +86,7 @@ def report(study: optuna.Study) -> str:
         headline=headline(study),
         fates=fates(trials),
         outcome=_outcome(study, objectives, keys) if won else [],
-        steps=_next_steps(study) if won else [("Resume it", command("sweep", f"study={study.study_name}"))],
+        steps=_next_steps(study) if won else [(_resume(study), "search on")],
         picture=_picture(study) if won else None,
         best=best_trial(study).number if won else None,
         winners=_winners(study, objectives, keys),
@@ -145,18 +146,19 @@ def _outcome(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str
 
 
 def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
-    """Return what to do with the winner, each with its command to paste."""
-    winner = f"run=best:{study.study_name}"
+    """Return what to do with the winner: commands, each with what it does."""
+    winner = shlex.quote(f"run=best:{study.study_name}")
     more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
     return [
-        ("Train the winner again", best_line(study)),
-        ("Race it on fresh laps, and film the fastest", command("evaluate", winner, "--video", "lap.mp4")),
-        ("Train on from its policy at a tenth of the learning rate", command("clone", winner)),
-        (
-            "Search on with twice the trials",
-            command("sweep", f"study={study.study_name}", f"sweep.trials={more}"),
-        ),
+        (best_line(study), "train the winner again"),
+        (f"{COMMAND} evaluate {winner} --video lap.mp4", "race it, and film its fastest lap"),
+        (f"{COMMAND} clone {winner}", "train on from it, at a tenth of the learning rate"),
+        (f"{_resume(study)} sweep.trials={more}", "search on, with twice the trials"),
     ]
+
+
+def _resume(study: optuna.Study) -> str:
+    return shlex.join([COMMAND, "sweep", f"study={study.study_name}"])
 
 
 def _picture(study: optuna.Study) -> str | None:

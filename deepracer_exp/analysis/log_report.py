@@ -9,8 +9,7 @@ import pandas as pd
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import Recording, readable
-from deepracer_exp.formats.run_files import RunRecord, read_head
-from deepracer_exp.formats.run_outcome import next_steps, outcome
+from deepracer_exp.formats.run_files import read_head
 from deepracer_exp.formats.whole_file import write_whole
 
 from .chart import Chart
@@ -30,6 +29,7 @@ from .log_tables import (
     settings,
 )
 from .log_view import LogView, prepare
+from .next_steps import next_steps, outcome
 from .page import Plot, plot, render
 from .reward_comparison import RewardComparison
 from .run_folders import run_folder
@@ -92,7 +92,7 @@ def html(page: LogPage) -> str:
         sections = [Section("Another reward function", page.replay.charts), *sections]
     drawn = [(section.title, [_Figure.of(chart) for chart in section.charts]) for section in sections]
     figures = {figure.name: figure for _, some in drawn for figure in some}
-    run = _run(view)
+    came_of_it, steps = _first_screen(page)
     files = [readable(str(file)) for file in recording.files]
     return render(
         __package__,
@@ -100,8 +100,8 @@ def html(page: LogPage) -> str:
         [figure.plot for figure in figures.values()],
         name=view.name,
         headline=headline(view),
-        outcome=outcome(run) if run is not None else facts(view),
-        steps=next_steps(run) if run is not None else _submission(page.findings),
+        outcome=came_of_it,
+        steps=steps,
         picture=figures["lap_line"].plot if "lap_line" in figures else None,
         findings=[_finding(one, figures) for one in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
@@ -121,18 +121,19 @@ def html(page: LogPage) -> str:
     )
 
 
-def _run(view: LogView) -> RunRecord | None:
-    """Return the files of a run of ours; None of other recordings and of a run whose files cannot be read."""
-    folder = run_folder(view)
+def _first_screen(page: LogPage) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Return what came of a training, in names and values, and what to do next: commands, each with what it does.
+
+    No command of ours takes a checkpoint of the service: what to do with those is to submit one of them.
+    """
+    folder = run_folder(page.view)
     try:
-        return read_head(folder) if folder is not None else None
+        run = read_head(folder) if folder is not None else None
+        if run is not None:
+            return outcome(run), next_steps(run.path, run.summary) if run.summary else []
     except BadInput:
-        return None
-
-
-def _submission(found: Sequence[Finding]) -> list[tuple[str, str]]:
-    """Return what to do with a training of the service, whose checkpoints no command of ours takes."""
-    return [(one.sentence, "") for one in found if one.rule == "submit"]
+        pass  # the page lists which files could not be read
+    return facts(page.view), [("", one.sentence) for one in page.findings if one.rule == "submit"]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What to do next with a run, as commands to paste."""
+"""What came of a run, and what to do next with it, as commands to paste."""
 
 import math
 import shlex
@@ -6,7 +6,42 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.formats.run_files import RunRecord
+from deepracer_exp.formats.run_result import FIGURES, read_result
+
 COMMAND = "deepracer-exp"
+
+
+def outcome(run: RunRecord) -> list[tuple[str, str]]:
+    """Return what was driven, how good the best policy is in evaluation and how the run ended, in names and values.
+
+    Raises:
+        BadInput: its summary.json is not what a training writes.
+    """
+    tracks, reward = run.config.get("track") or {}, run.config.get("reward") or {}
+    courses = [
+        one for one in ([tracks] if "title" in tracks else tracks.values()) if isinstance(one, Mapping)
+    ]
+    names = [f"{one.get('title')}, {one.get('direction', 'forward')}" for one in courses]
+    found = [
+        ("Track", "; ".join(name.removesuffix(", forward") for name in names)),
+        ("Reward", str(reward.get("name") or reward.get("file"))),
+    ]
+    result = read_result(run.path)
+    if result is not None and result.evaluated:
+        known = [(name, getattr(result, key), form) for name, key, form, _ in FIGURES]
+        found += [
+            (f"{name[0].upper()}{name[1:]}", form.format(value))
+            for name, value, form in known
+            if value is not None
+        ]
+        found.append(("Evaluated, the best", f"checkpoint {result.iteration:06d}"))
+    elif run.summary:
+        found.append(("Evaluated", "never"))
+    ended = (
+        f"{run.summary['status']}: {run.summary['reason']}" if run.summary else "not yet, or it was killed"
+    )
+    return [*found, ("How it ended", ended)]
 
 
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
