@@ -14,7 +14,7 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 from plotly.subplots import make_subplots
 
-from deepracer_exp.analysis.chart import INK
+from deepracer_exp.analysis.chart import FAINT, INK
 from deepracer_exp.analysis.chart_layout import GRID, SPINE
 from deepracer_exp.analysis.chart_plotly import base_layout
 from deepracer_exp.analysis.chart_plotly_panel import NARROW_WIDTH
