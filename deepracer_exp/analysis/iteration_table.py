@@ -24,6 +24,7 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "policy_loss": "surrogate loss",
     "value_loss": "mean squared or Huber, as the training has it",
     "lr": "learning rate",
+    "checkpoint": "the service's name of the checkpoint that drove it; empty where not told",
     "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
 }
@@ -36,7 +37,7 @@ def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.Data
 
     Episodes whose end is not recorded are left out: those under way when a run ended would pass for bad ones.
     """
-    groups = episodes[episodes["ended"]].groupby("iteration")
+    groups = pd.concat([episodes[episodes["ended"]], _told_alone(recording, episodes)]).groupby("iteration")
     laps = groups["lap_time_s"]
     table = pd.DataFrame(
         {
@@ -54,31 +55,43 @@ def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.Data
     driven = np.bincount(steps["iteration"].to_numpy()) if len(steps) else np.zeros(0, np.int64)
     told = recording.updates.groupby("iteration")[list(_TOLD)].mean()
     known = pd.Index(np.flatnonzero(driven)).union(table.index).union(told.index)
-    table = table.reindex(known).join(told).join(_evaluated(recording, episodes))
+    table = table.reindex(known).join(told).join(_evaluated(recording))
     table["steps"] = [int(driven[k]) if k < len(driven) else 0 for k in known]
     counts = table[["episodes", "complete"]].fillna(0).astype(np.int64)
     table = table.assign(episodes=counts["episodes"], complete=counts["complete"])
     table.index.name = "iteration"
+    table["checkpoint"] = [recording.checkpoints.get(k, "") for k in known]
     return table.reset_index()[list(ITERATION_COLUMNS)].astype({"iteration": np.int64})
 
 
-def _evaluated(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean completion of each iteration's evaluation, of our own runs or told of single episodes.
+def _told_alone(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
+    """Return the training episodes that only metrics files tell of: their traces are not there."""
+    told = recording.told
+    told = told[(told["phase"] == "training") & (told["stream"] == "training")]
+    told = told[~told["episode"].isin(episodes["episode"])]
+    complete = told["completion"] >= 100.0
+    return pd.DataFrame(
+        {
+            "iteration": told["iteration"],
+            "episode": told["episode"],
+            "progress": told["completion"],
+            "reward": told["reward"],
+            "complete": complete,
+            "lap_time_s": told["time_s"].where(complete),
+            "speed_mps": np.nan,
+        }
+    ).astype({"complete": bool})
 
-    Episodes of an evaluation have the number of the last training episode before them.
-    """
+
+def _evaluated(recording: Recording) -> pd.DataFrame:
+    """Return the mean completion of each iteration's evaluation, of our own runs or told of single episodes."""
     if len(recording.evaluated):
         own = recording.evaluated.groupby("iteration")[["completion", "held_out_completion"]].last()
         return own.rename(columns={"completion": "eval_completion"})
     told = recording.told
     told = told[(told["phase"] == "evaluation") & (told["stream"] == "training")]
-    before = np.searchsorted(episodes["episode"].to_numpy(), told["episode"].to_numpy(), side="right") - 1
-    known = before >= 0
-    iteration = episodes["iteration"].to_numpy()[before[known]]
-    completion = told["completion"].to_numpy()[known]
     return (
-        pd.Series(completion, index=pd.Index(iteration, name="iteration"), dtype=np.float64)
-        .groupby(level=0)
+        told.groupby("iteration")["completion"]
         .mean()
         .to_frame("eval_completion")
         .assign(held_out_completion=np.nan)

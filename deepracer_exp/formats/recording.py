@@ -58,6 +58,7 @@ UPDATE_COLUMNS: Mapping[str, tuple[str, str]] = {
 TOLD_COLUMNS: Mapping[str, tuple[str, str]] = {
     "stream": ("category", "as in the steps"),
     "worker": ("int16", "as in the steps"),
+    "iteration": ("int32", "as in the steps; of an evaluation that of the training episodes before it"),
     "episode": ("int32", "counted from 0; the file counts from 1"),
     "trial": ("int32", "counted from 1 within the iteration"),
     "phase": ("category", "`training` or `evaluation`"),
@@ -148,5 +149,7 @@ class Recording:
     """What was read; members of an archive stand below its path."""
     best: RunResult | None = None
     """Of a run of ours: its best checkpoint. None: a log of the service, whose iterations each have a checkpoint."""
+    checkpoints: Mapping[int, str] = field(default_factory=dict)
+    """Name of the service's checkpoint that drove each iteration, as its text logs prove it: `309_Step-8349`."""
     rounds: tuple[Round, ...] = ()
     """The trainings in the order of `steps`; empty where there is only one."""

@@ -69,6 +69,12 @@ def in_degrees(table: pa.Table) -> pa.Table:
 def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int) -> Ints:
     """Return the iteration of each row of a text log: what it says itself, or by counting episodes."""
     episode = table["episode"].to_numpy().astype(np.int64)
+    driven = [(first, checkpoint_number(name)) for first, name in log.checkpoints if first is not None]
+    if driven:
+        starts, number = np.array(sorted(driven), np.int64).T
+        return number[np.maximum(np.searchsorted(starts, episode, side="right") - 1, 0)] - first_checkpoint(
+            log
+        )
     if not any(log.iteration_of.values()):
         return episode // _episodes_between(log, episodes_per_iteration)
     known = np.array(sorted(log.iteration_of))
@@ -82,6 +88,18 @@ def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int
     return np.where(place < len(known), told[np.minimum(place, len(known) - 1)], beyond)
 
 
+def checkpoint_number(name: str) -> int:
+    """Return the number of a checkpoint `309_Step-8349`."""
+    return int(name.partition("_")[0])
+
+
+def first_checkpoint(log: TrainingLog) -> int:
+    """Return the number of the checkpoint that a training began with: a clone counts on from its parent's."""
+    names = [*log.saved, *(name for _, name in log.checkpoints)]
+    fresh = (name for name in names if name.endswith("_Step-0"))
+    return checkpoint_number(next(fresh, names[0])) if names else 0
+
+
 def _episodes_between(log: TrainingLog, usual: int) -> int:
     """Return how many episodes an iteration has: as many as lie between two evaluations."""
     ends = log.evaluated_after
@@ -91,7 +109,10 @@ def _episodes_between(log: TrainingLog, usual: int) -> int:
 
 
 def rows_also_in(log: Drives, other: Drives) -> Flags:
-    """Tell of each row of a log whether the other drives have it, which may tell it in more digits."""
+    """Tell of each row of a log whether the other drives have it, which may tell it in more digits.
+
+    Two races begin at the same place and time: drives are the same only if most of their common steps are.
+    """
     mine, theirs = log.key, other.key
     if not len(mine) or not len(theirs):
         return np.zeros(len(mine), np.bool_)
@@ -101,9 +122,10 @@ def rows_also_in(log: Drives, other: Drives) -> Flags:
         order = np.argsort(theirs, kind="stable")
         match = order[np.minimum(np.searchsorted(theirs[order], mine), len(theirs) - 1)]
     same = theirs[match] == mine
+    common = int(same.sum())
     for name, near in (("tstamp", _NEAR_S), ("X", _NEAR_M), ("Y", _NEAR_M)):
         same &= np.abs(log.table[name].to_numpy() - other.table[name].to_numpy()[match]) <= near
-    return same
+    return same if same.sum() > common / 2 else np.zeros(len(mine), np.bool_)
 
 
 def repeated(drives: Drives) -> Flags:

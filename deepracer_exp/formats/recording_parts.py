@@ -21,7 +21,7 @@ from .recording import TRAINING, LogProblem
 from .rolled_logs import piece_of
 from .sim_trace_csv import read_trace_csv
 from .step_tables import StepTables
-from .training_log import MARKER, TrainingLog, read_training_log
+from .training_log import MARKER, TrainingLog, read_training_logs
 from .user_file import SETTINGS_BYTES, read_yaml
 
 Result = TypeVar("Result")
@@ -240,11 +240,13 @@ def _read_csv(parts: Parts, file: LogFile) -> bool:
 
 def _read_log(parts: Parts, file: LogFile) -> bool:
     with file.open() as stream:
-        log = read_training_log(stream)
-    parts.refuse(file, log.refused)
-    if not log.tells and not log.refused:
-        raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
-    parts.logs.append((file, log))
+        logs = read_training_logs(stream)
+    for log in logs:
+        parts.refuse(file, log.refused)
+        if not log.tells and not log.refused:
+            raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
+        parts.logs.append((file, log))
+    log = logs[0]  # all workers print the same settings
     if log.metadata is not None:
         try:
             raw = json.dumps(log.metadata).encode()

@@ -28,8 +28,11 @@ from .recording import (
 from .recording_drives import (
     EPISODES_PER_ITERATION,
     Drives,
+    Ints,
     Rows,
+    checkpoint_number,
     concatenated,
+    first_checkpoint,
     in_degrees,
     iterations_of,
     number_episodes,
@@ -42,6 +45,7 @@ from .rolled_logs import join_rolled
 from .training_log import TrainingLog, Update
 
 _KINDS = (TRAINING, "evaluation", "leaderboard")
+_NEARLY = 0.75
 Numbers = Mapping[tuple[int, int, int], int]
 
 
@@ -76,13 +80,20 @@ class _Assembly:
         self.problems = list(parts.problems)
         # Of several files of settings the one nearest to the top counts, files before logs.
         self.settings = _uppermost(parts.hyperparameters) or {}
+        self.iteration_of: dict[int, int] = {}
+        """Iteration of each training episode of the recording."""
         self.logs = join_rolled(parts.logs)
         self.drives = [*self._drives_of_csv()]
         self.roots: dict[int, tuple[str, ...]] = {}
+        self.jobs: dict[tuple[str, ...], tuple[str, ...]] = {}
+        """Folder of the CSVs by what the text logs of the same training have in common."""
         self.copies: dict[tuple[str, ...], Drives] = {}
         """Trainings that stand in another place, too, by their folders."""
         for number, (files, log) in enumerate(self.logs):
             self._add_log(number, files, log)
+        for one in self.drives:
+            one.place = replace(one.place, root=self.jobs.get(one.place.root, one.place.root))
+        self.roots = {number: self.jobs.get(root, root) for number, root in self.roots.items()}
         self._without_copies()
         self._without_repeats()
         self.training = [one for one in self.drives if one.place.kind == TRAINING]
@@ -106,7 +117,7 @@ class _Assembly:
             name=name,
             steps=steps_of([*rows, *self._evaluation_rows()]),
             updates=self._updates({number: begin[0] for number, begin in first.items()}),
-            told=self._told(numbers),
+            told=self._told(numbers, {number: begin[0] for number, begin in first.items()}),
             evaluated=empty(EVALUATED_COLUMNS),
             metadata=_uppermost(parts.metadata),
             hyperparameters=self.settings or None,
@@ -114,6 +125,7 @@ class _Assembly:
             track=worlds[0] if worlds else parts.worlds.get(TRAINING),
             problems=tuple(self.problems),
             files=tuple(file.path for file in parts.files),
+            checkpoints=self._checkpoints({number: begin[0] for number, begin in first.items()}),
             rounds=tuple(rounds) if len(rounds) > 1 else (),
         )
 
@@ -146,7 +158,12 @@ class _Assembly:
         place = place_of(file.parts)
         if place.kind == TRAINING:
             name = place.name.replace(str(place.worker), "#") if place.worker else place.name
-            place = replace(place, root=(*place.root, name))
+            if log.job:
+                # Workers of one job began with the same checkpoint; the next job in the same place with another.
+                name = f"{log.job}, {first_checkpoint(log)}"
+            worker = place.worker if log.worker is None else log.worker
+            place = replace(place, root=(*place.root, name), worker=worker)
+        job = place.root
         self.roots[number] = place.root
         if not log.steps.rows:
             return
@@ -165,17 +182,19 @@ class _Assembly:
                 other.world = log.world or other.world
                 other.names.append(place.name)
                 self.roots[number] = other.place.root
+                if place.kind == TRAINING:
+                    self.jobs[job] = other.place.root
         if left.all():
             mine.world = mine.world or self.parts.worlds.get(place.kind, "")
             self.drives.append(mine)
         elif left.any():
-            self._add_rest(file, mine.choose(left), self.roots[number], int(mine.iteration.max()))
+            self._add_rest(file, mine.choose(left), self.roots[number], _finished(mine))
 
-    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], last: int) -> None:
-        """Add iterations that only the log tells; the last one was not finished, or there would be its CSV."""
+    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], finished: Ints) -> None:
+        """Add the finished iterations that only the log has."""
         others = [one for one in self.drives if one.place.root == root and one.place.kind == rest.place.kind]
         known = np.unique(np.concatenate([one.iteration for one in others]))
-        whole = ~np.isin(rest.iteration, known) & (rest.iteration < last)
+        whole = ~np.isin(rest.iteration, known) & np.isin(rest.iteration, finished)
         if rest.place.kind == TRAINING and whole.any():
             more, into = rest.choose(whole), others[0]
             iteration = np.concatenate([into.iteration, more.iteration])
@@ -234,14 +253,44 @@ class _Assembly:
         so_far = 0
         for number in np.unique(rounds).tolist():
             of = rounds == number
+            # Iterations have the numbers of the checkpoints that drove them, unless a round before has these.
+            so_far = max(so_far, self._base(number))
             iteration[of] += so_far
             first[number] = (so_far, int(episode[of].min()))
             so_far = int(iteration[of].max()) + 1
+        self.iteration_of = dict(zip(episode.tolist(), iteration.tolist(), strict=True))
         worlds = [
             next((one.world for one in drives if one.place.root == root and one.world), "")
             for root in self.rounds
         ]
         return [Rows(TRAINING, table, worker, iteration, episode, worlds, rounds)], numbers, first
+
+    def _logs_of(self, number: int) -> list[TrainingLog]:
+        """Return the logs of a round that name its checkpoints."""
+        return [
+            log
+            for at, (files, log) in enumerate(self.logs)
+            if (
+                log.saved
+                or (log.checkpoints and log.steps.rows and place_of(files[0].parts).kind == TRAINING)
+            )
+            and self._round(files[0], self.roots[at]) == number
+        ]
+
+    def _base(self, number: int) -> int:
+        """Return the number of the checkpoint that drove a round's first iteration."""
+        return max(map(first_checkpoint, self._logs_of(number)), default=0)
+
+    def _checkpoints(self, first: Mapping[int, int]) -> dict[int, str]:
+        """Return the names of checkpoints by the iteration that they drove."""
+        found: dict[int, str] = {}
+        for number, begin in first.items():
+            base = self._base(number)
+            for log in self._logs_of(number):
+                for name in (*log.saved, *(name for _, name in log.checkpoints)):
+                    if checkpoint_number(name) >= base:  # a clone's parent stands there, too
+                        found[checkpoint_number(name) - base + begin] = name
+        return dict(sorted(found.items()))
 
     def _evaluation_rows(self) -> list[Rows]:
         found = []
@@ -310,7 +359,7 @@ class _Assembly:
         reason = f"{count} {what}: the steps they tell of are left out"
         self.problems.append(LogProblem(str(file.path), None, reason, lines=count))
 
-    def _told(self, numbers: Numbers) -> pd.DataFrame:
+    def _told(self, numbers: Numbers, first: Mapping[int, int]) -> pd.DataFrame:
         rows: list[dict[str, Any]] = []
         evaluated: set[tuple[str, str]] = set()
         begins: dict[tuple[int, int], int] = {}
@@ -328,14 +377,22 @@ class _Assembly:
                 gone = sum(row["episode"] < begin for row in metrics.rows)
                 if gone:
                     self._leave_out(file, "episodes", gone)
-                for row in metrics.rows:
+                counted = _iterations_by_trial(metrics.rows)
+                known = [
+                    self.iteration_of[numbers[key]] - at
+                    for row, at in zip(metrics.rows, counted, strict=True)
+                    if row["phase"] == TRAINING and (key := (number, worker, row["episode"])) in numbers
+                ]
+                shift = int(np.median(known)) if known else first.get(number, 0)
+                for row, at in zip(metrics.rows, counted, strict=True):
                     if row["episode"] < begin:
                         continue
                     key = (number, worker, row["episode"])
                     episode = numbers.get(key)
                     if episode is None:
                         episode = _behind(numbers, key)
-                    rows.append({**row, "stream": TRAINING, "worker": worker, "episode": episode})
+                    own_row = {"stream": TRAINING, "worker": worker, "iteration": at + shift}
+                    rows.append({**row, **own_row, "episode": episode})
             else:
                 stream = label(file.name)
                 for name, one in evaluations.items():
@@ -346,9 +403,33 @@ class _Assembly:
                 if (stream, repr(metrics.rows)) in evaluated:
                     continue
                 evaluated.add((stream, repr(metrics.rows)))
-                rows += [{**row, "stream": stream, "worker": 0} for row in metrics.rows]
+                rows += [{**row, "stream": stream, "worker": 0, "iteration": 0} for row in metrics.rows]
         rows.sort(key=lambda row: (0, row["episode"]) if row["stream"] == TRAINING else (1, 0))
         return _table(rows, TOLD_COLUMNS)
+
+
+def _finished(log: Drives) -> Ints:
+    """Return the iterations of a log that were driven to their end.
+
+    Those are all but the last, and the last where nearly as many episodes ended in it as in the one before: a job
+    ends within an episode.
+    """
+    iterations = np.unique(log.iteration)
+    done = log.table["done"].to_numpy()
+    counts = [int(done[log.iteration == one].sum()) for one in iterations[-2:]]
+    return iterations if len(counts) > 1 and counts[1] >= _NEARLY * counts[0] else iterations[:-1]
+
+
+def _iterations_by_trial(rows: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Return the iteration of each episode of a metrics file, from 0: trials are counted within one."""
+    found: list[int] = []
+    iteration, trial = 0, 0
+    for row in rows:
+        if row["phase"] == TRAINING:
+            iteration += row["trial"] <= trial
+            trial = row["trial"]
+        found.append(iteration)
+    return found
 
 
 def _behind(numbers: Numbers, key: tuple[int, int, int]) -> int:

@@ -18,10 +18,13 @@ def piece_of(name: str) -> tuple[str, int]:
 
 def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[LogFile], TrainingLog]]:
     """Put the pieces of rolled logs together, the earliest first: by their episodes, or else by their numbers."""
-    groups: dict[tuple[str, ...], list[tuple[LogFile, TrainingLog]]] = {}
+    groups: dict[tuple[str | int, ...], list[tuple[LogFile, TrainingLog]]] = {}
+    of_file: dict[LogFile, int] = {}
     for file, log in logs:
         name, _ = piece_of(file.name)
-        groups.setdefault((*file.parts[:-1], name), []).append((file, log))
+        # One text may hold the logs of several workers.
+        of_file[file] = of_file.get(file, -1) + 1
+        groups.setdefault((*file.parts[:-1], name, of_file[file]), []).append((file, log))
     joined = []
     for pieces in groups.values():
         pieces.sort(key=_time_of_piece)
@@ -32,6 +35,10 @@ def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[
             iteration_of={key: value for _, log in pieces for key, value in log.iteration_of.items()},
             hyperparameters=next((log.hyperparameters for _, log in pieces if log.hyperparameters), None),
             world=next((log.world for _, log in pieces if log.world), None),
+            worker=next((log.worker for _, log in pieces if log.worker is not None), None),
+            job=next((log.job for _, log in pieces if log.job), None),
+            checkpoints=[one for _, log in pieces for one in log.checkpoints],
+            saved=[name for _, log in pieces for name in log.saved],
         )
         joined.append(([file for file, _ in pieces], whole))
     return joined

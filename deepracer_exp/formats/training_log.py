@@ -27,6 +27,12 @@ _SENSORS = re.compile(
     rb"Sensor list (\[[^\]\n]*\]), network (\w+), simapp_version ([\d.]+)"
     rb"(?:, training_algorithm (\w+), action_space_type (\w+))?(?: lidar_config (\{[^}\n]*\}))?"
 )
+_WORKER = re.compile(rb"--rollout_idx (\d{1,3})")
+_JOB = re.compile(rb"S3 prefix: ([^\s\x1b]+)")
+_RESTORED = re.compile(rb"Restoring from path[^\n]*?(\d{1,9}_Step-\d{1,12})\.ckpt")
+_SAVED = re.compile(rb"Saving in path=\[[^\n]*?(\d{1,9}_Step-\d{1,12})\.ckpt")
+# What docker puts before the lines of each of several containers.
+_TAG = re.compile(rb"(?m)^([^\s|]+) +\| [^\n]*SIM_TRACE_LOG:")
 _LONGEST_SETTINGS = 10_000
 
 
@@ -57,6 +63,14 @@ class TrainingLog:
     sensors: dict[str, Any] | None = None
     """Keys of a model_metadata.json but for the action space."""
     world: str | None = None
+    worker: int | None = None
+    """Number of the simulation worker that wrote it, from 0."""
+    job: str | None = None
+    """Where the training's files are stored; all its workers have the same."""
+    checkpoints: list[tuple[int | None, str]] = field(default_factory=list)
+    """First episode driven with each checkpoint (None: none was yet) and its name, `309_Step-8349`."""
+    saved: list[str] = field(default_factory=list)
+    """Names of the checkpoints that a trainer wrote; the first is that which drives the first episodes."""
     refused: list[tuple[int | None, str]] = field(default_factory=list)
     """Line (None: from somewhere on) and reason of what cannot be read."""
 
@@ -70,6 +84,7 @@ class TrainingLog:
             self.hyperparameters,
             self.sensors,
             self.world,
+            self.saved,
         )
         return any(map(bool, told))
 
@@ -81,17 +96,71 @@ class TrainingLog:
         )
 
 
-def read_training_log(stream: IO[bytes]) -> TrainingLog:
-    """Read a log block by block; lines of other programs are passed over."""
-    log, blocks = TrainingLog(), Blocks(stream)
-    before: int | None = None
+def read_training_logs(stream: IO[bytes]) -> list[TrainingLog]:
+    """Read a text block by block; lines of other programs are passed over.
+
+    Returns:
+        The log in it, or those of several workers that were written into one text: line by line, each with the
+        container's name before it, or one after the other.
+    """
+    blocks = Blocks(stream)
+    logs: dict[bytes, TrainingLog] = {b"": TrainingLog()}
+    before: dict[bytes, int | None] = {}
+    last = b""
     for block in blocks:
-        if MARKER in block:
-            before = _read_trace(log, block, blocks.lines, before)
-        _read_updates(log, block, blocks.lines)
-        _read_job(log, block)
-    log.refused += blocks.refused
-    return log
+        for key, part, lines in _parts(block, blocks.lines, last, logs):
+            last = key
+            log = logs.setdefault(key, TrainingLog())
+            _read_checkpoints(log, part)
+            if MARKER in part:
+                before[key] = _read_trace(log, part, lines, before.get(key))
+            _read_updates(log, part, lines)
+            _read_job(log, part)
+    found = [log for log in logs.values() if log.tells or log.refused] or [logs[b""]]
+    found[0].refused += blocks.refused
+    return found
+
+
+def _parts(
+    block: bytes, lines: int, key: bytes, logs: dict[bytes, TrainingLog]
+) -> Iterator[tuple[bytes, bytes, int]]:
+    """Yield the parts of a block by the log they belong to, each with the number of lines before it."""
+    tags = list(dict.fromkeys(_TAG.findall(block)))
+    if tags:
+        rows = block.split(b"\n")
+        for tag in tags:
+            begins = tag + b" "
+            yield tag, b"\n".join(row if row.startswith(begins) else b"" for row in rows), lines
+        return
+    start = 0
+    for found in _WORKER.finditer(block):
+        worker, at = found[1], block.rfind(b"\n", 0, found.start()) + 1
+        told = logs[key].worker if key in logs else None
+        # A worker says its number once, at its beginning.
+        if (told is not None or start) and str(told).encode() != worker and at > start:
+            yield key, block[start:at], lines + block.count(b"\n", 0, start)
+            key, start = b"worker " + worker, at
+        elif told is None and key in logs:
+            logs[key].worker = int(worker)
+    yield key, block[start:], lines + block.count(b"\n", 0, start)
+
+
+def _read_checkpoints(log: TrainingLog, block: bytes) -> None:
+    """Note which checkpoint drives from which episode on."""
+    marks = sorted(
+        [(found.start(), found[1].decode()) for found in _RESTORED.finditer(block)]
+        + ([(0, "")] if log.checkpoints and log.checkpoints[-1][0] is None else [])
+    )
+    for start, name in marks:
+        at = block.find(MARKER, start) + len(MARKER)
+        episode = block[at : at + 12].partition(b",")[0] if at >= len(MARKER) else b""
+        first = int(episode) if episode.isdigit() else None
+        if not name:
+            name = log.checkpoints.pop()[1]
+        if log.checkpoints and log.checkpoints[-1][0] in (first, None):
+            log.checkpoints.pop()
+        log.checkpoints.append((first, name))
+    log.saved += [found[1].decode() for found in _SAVED.finditer(block)]
 
 
 def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
@@ -132,6 +201,10 @@ def _read_updates(log: TrainingLog, block: bytes, lines_before: int) -> None:
 
 
 def _read_job(log: TrainingLog, block: bytes) -> None:
+    if log.worker is None and (worker := _WORKER.search(block)):
+        log.worker = int(worker[1])
+    if log.job is None and (job := _JOB.search(block)):
+        log.job = job[1].decode("utf-8", "replace").strip("/")
     if log.hyperparameters is None:
         for start, _ in _find(block, b"Using the following hyper-parameters"):
             text = block[start : start + _LONGEST_SETTINGS].partition(b"}")[0]

@@ -91,6 +91,16 @@ def log_text(rows: pd.DataFrame, fields: int = 17, prefix: str = "", world: str 
     )
 
 
+def worker_text(worker: int, first: int = 308, tag: str = "", iterations: int = 2, seed: int = 1) -> str:
+    """Return the log of one of several simulation workers: two episodes with each checkpoint."""
+    lines = [f"+ python3 -m markov.rollout_worker --rollout_idx {worker}", "S3 prefix: my-model", ""]
+    for number in range(iterations):
+        lines.append(f"Checkpoint> Restoring from path=./agent/{first + number}_Step-{number * 24}.ckpt")
+        rows = drives([2 * number, 2 * number + 1], seed=10 * worker + number + seed)
+        lines += [line(row) for row in rows.itertuples()]
+    return "".join(f"{tag}{one}\n" for one in lines)
+
+
 def trainer_text(iterations: int, epochs: int = 2, first: int = 0, per_iteration: int = 2) -> str:
     """Return the log of a trainer."""
     lines = ["Using the following hyper-parameters", json.dumps(HYPERPARAMETERS, indent=2)]

@@ -117,6 +117,93 @@ def test_episodes_of_several_workers_are_numbered_by_iteration_and_worker(place)
     assert rows["iteration"].is_monotonic_increasing
 
 
+@pytest.mark.parametrize("how", ["files", "one after the other", "line by line"])
+def test_text_logs_of_several_workers_are_one_training_with_the_iterations_of_its_checkpoints(tmp_path, how):
+    tags = [f"robomaker.{worker + 1}.ab{worker}@host    | " for worker in range(3)]
+    texts = [
+        made.worker_text(worker, tag=tags[worker] if how == "line by line" else "") for worker in range(3)
+    ]
+    if how == "files":
+        for worker, text in enumerate(texts):
+            (tmp_path / f"deepracer-0_robomaker.{worker + 1}.ab{worker}c.log").write_text(text)
+    elif how == "one after the other":
+        (tmp_path / "all.log").write_text("".join(texts))
+    else:
+        mixed = zip(*(text.splitlines(keepends=True) for text in texts), strict=True)
+        (tmp_path / "all.log").write_text("".join(one for lines in mixed for one in lines))
+    recording = read_recording(tmp_path)
+    rows = made.training(recording)
+    of = rows.groupby("episode")[["iteration", "worker"]].first()
+    assert of.to_numpy().tolist() == [[i, w] for i in (308, 309) for w in (0, 0, 1, 1, 2, 2)]
+    assert recording.checkpoints == {308: "308_Step-0", 309: "309_Step-24"}
+    assert not recording.rounds
+    assert not recording.problems
+
+
+def test_jobs_in_one_place_that_began_with_other_checkpoints_are_trainings_of_their_own(tmp_path):
+    for number, first in enumerate((10, 12)):
+        (tmp_path / f"robomaker.1.{number}.log").write_text(made.worker_text(0, first, seed=first))
+        (tmp_path / f"robomaker.2.{number}.log").write_text(made.worker_text(1, first, seed=first))
+    recording = read_recording(tmp_path)
+    assert [one.first_iteration for one in recording.rounds] == [10, 12]
+    assert sorted(recording.checkpoints) == [10, 11, 12, 13]
+    assert set(made.training(recording)["worker"]) == {0, 1}
+
+
+def test_checkpoints_of_a_clone_count_the_iterations_of_its_csvs(tmp_path):
+    files = made.training_csvs("training-simtrace", iterations=2)
+    files["logs/training/x-robomaker.log"] = made.worker_text(0, first=50)
+    files["logs/training/x-sagemaker.log"] = made.trainer_text(2) + "".join(
+        f"Checkpoint> Saving in path=['./agent/{number}_Step-{24 * (number - 50)}.ckpt']\n"
+        for number in (50, 51, 52)
+    )
+    recording = read_recording(made.write_folder(files, tmp_path))
+    assert set(made.training(recording)["iteration"]) == {50, 51}
+    assert recording.checkpoints == {50: "50_Step-0", 51: "51_Step-24", 52: "52_Step-48"}
+    assert set(recording.updates["iteration"]) == {50, 51}
+
+
+def test_races_that_begin_with_the_same_rows_are_both_kept(tmp_path):
+    race, other = made.drives([0], seed=60, steps=12), made.drives([0], seed=61, steps=12)
+    begin = ["X", "Y", "tstamp"]
+    other.loc[:2, begin] = race.loc[:2, begin]
+    files = {
+        f"logs/leaderboard/leaderboard-2024020210101{number}-XyZ{number}-robomaker.log": made.log_text(rows)
+        for number, rows in enumerate((race, other))
+    }
+    recording = read_recording(made.write_folder(files, tmp_path))
+    assert recording.steps["stream"].nunique() == 2
+    assert len(recording.steps) == 24
+    assert not recording.problems
+
+
+def test_an_iteration_of_the_log_alone_is_used_though_the_job_ended_within_its_last_episode(tmp_path):
+    drives = [made.drives(range(4 * number, 4 * number + 4), seed=number + 1) for number in range(3)]
+    files = {f"training-simtrace/{number}-iteration.csv": made.csv_text(drives[number]) for number in (0, 1)}
+    lines = []
+    for number, rows in enumerate((*drives[:2], drives[2].iloc[:-3])):
+        lines.append(f"Checkpoint> Restoring from path=./agent/{number}_Step-{24 * number}.ckpt")
+        lines += [made.line(row) for row in rows.itertuples()]
+    files["logs/training/x-robomaker.log"] = "\n".join(lines) + "\n"
+    recording = read_recording(made.write_folder(files, tmp_path))
+    assert made.training(recording).groupby("iteration")["episode"].nunique().tolist() == [4, 4, 4]
+    assert not recording.problems
+
+
+def test_metrics_tell_the_iterations_of_episodes_whose_traces_are_missing(place):
+    files = made.drfc_single()
+    for number in (0, 2):
+        del files[f"training-simtrace/{number}-iteration.csv"]
+    items = json.loads(files["metrics/TrainingMetrics.json"])
+    for number, item in enumerate(items["metrics"]):
+        item["trial"] = number % 2 + 1
+    files["metrics/TrainingMetrics.json"] = json.dumps(items)
+    recording = read_recording(place(files))
+    told = recording.told[recording.told["stream"] == "training"]
+    assert set(made.training(recording)["iteration"]) == {1}
+    assert told["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
+
+
 def test_clones_go_on_where_the_one_before_ended(place):
     files = {}
     for number, name in enumerate(("first", "first-1", "first-2", "first-10")):
