@@ -45,6 +45,18 @@ SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
 """Charts of one recording."""
 
 
+RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
+    "How it raced": (evaluations,),
+    _BESIDE: (),
+    "Lap times": (lap_time_histogram, lap_delta),
+    "The line it drives": (lap_line, sector_times, speed_steering_by_waypoint, racing_line),
+    "Where it goes wrong": (episode_ends_map,),
+    _PAID: (),
+    "The course": (waypoint_map,),
+}
+"""Charts of a recording without a training: nothing of iterations."""
+
+
 @dataclass(frozen=True)
 class Section:
     """Charts that belong together."""
@@ -63,7 +75,8 @@ def draw_sections(
         others: what stands beside it.
         terms: of its reward function, as `reward_terms` takes them.
     """
-    drawn = {title: _drawn(one(view) for one in some) for title, some in SECTIONS.items()}
+    sections = SECTIONS if view.trained else RACES
+    drawn = {title: _drawn(one(view) for one in some) for title, some in sections.items()}
     if terms is not None:
         drawn[_PAID] += _drawn([reward_terms(view, terms)])
     views = [view, *others]

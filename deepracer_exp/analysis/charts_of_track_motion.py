@@ -42,9 +42,10 @@ def lap_line(view: LogView) -> Chart | None:
     mean = view.course.length_m / float(row["lap_time_s"])
     return Chart(
         name="lap_line",
-        title=f"The fastest lap: {row['lap_time_s']:.3f} s, iteration {row['iteration']}, episode "
-        f"{row['episode']}",
-        caption="One dot a control step of the fastest complete lap of the training, coloured by how fast "
+        title=f"The fastest lap: {row['lap_time_s']:.3f} s, "
+        + (f"iteration {row['iteration']}" if view.trained else str(row["stream"]))
+        + f", episode {row['episode']}",
+        caption="One dot a control step of the fastest complete lap, coloured by how fast "
         f"the car moved; {mean:.2f} m/s would lap the centre line in the same time. Dots close "
         "together are slow: look where the car slows down and ask whether the bend needs it.",
         rows=[[map_panel(view.course, [path, dots])]],

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
 from deepracer_exp.formats.run_result import RunResult
 
@@ -20,7 +21,9 @@ from .sectors import Sectors, sector_times, sectors_of, theoretical_best_s
 LATE_SHARE = 1 / 3
 """Share of the iterations, the last ones, that say how the car drives now."""
 LEAST_LAPS = 5
-"""Complete laps in them below which all laps of the log are looked at."""
+"""Complete laps in them below which all laps of the log are looked at, and below which nothing is said of chances."""
+CRASH_PLACE_M = 1.0
+"""Crashes no further than this from one place are at one object."""
 MOST_LOST = 3
 WORTH_S = 0.02
 """Time lost in a sector that is worth a word."""
@@ -48,10 +51,16 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
         target_s: lap time wanted; None: the fastest lap driven.
     """
     found: list[Finding | None] = []
-    if len(view.episodes):
+    if view.trained:
         found += [_converged(view), _submit(view)]
     laps = _Laps.of(view)
-    found += [_chance(laps, target_s), _time_lost(view, laps), *_runs_off(view), _overfits(view)]
+    found += [
+        _chance(laps, target_s),
+        _time_lost(view, laps),
+        _crashes(view),
+        *_runs_off(view),
+        _overfits(view),
+    ]
     return [one for one in found if one is not None]
 
 
@@ -65,16 +74,22 @@ class _Laps:
 
     @classmethod
     def of(cls, view: LogView) -> "_Laps":
-        if not len(view.episodes):
-            return cls(
-                view.evaluations, view.evaluation_episodes["lap_time_s"].to_numpy(), "of the evaluations"
-            )
+        if not view.trained:
+            return cls(view.steps, view.episodes["lap_time_s"].to_numpy(), "of the evaluations")
         late = _late(view)
         times = late["lap_time_s"].to_numpy()
         if np.isfinite(times).sum() >= LEAST_LAPS:
             steps = view.steps[view.steps["episode"].isin(late["episode"])]
             return cls(steps, times, f"since iteration {late['iteration'].min()}")
         return cls(view.steps, view.episodes["lap_time_s"].to_numpy(), "of the training")
+
+
+def _now(view: LogView) -> tuple[pd.DataFrame, str]:
+    """Return the episodes that say how the car drives now, and which these are."""
+    if not view.trained:
+        return view.episodes, "in the evaluations"
+    late = _late(view)
+    return late, f"since iteration {late['iteration'].min()}"
 
 
 def _late(view: LogView) -> pd.DataFrame:
@@ -155,7 +170,7 @@ def _submit(view: LogView) -> Finding:
     thresholds = {"least_laps": chosen.LEAST_LAPS, "dense": chosen.DENSE}
     if not len(best):
         farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
-        laps = int(view.episodes["complete"].sum())
+        laps = int(view.iterations["complete"].sum())
         sentence = (
             f"Nothing to submit yet: no iteration has {chosen.LEAST_LAPS} complete laps ({_count(laps, 'lap')} in "
             f"all); the farthest episode came to {farthest['progress']:.0f} % of the lap in iteration "
@@ -170,13 +185,15 @@ def _submit(view: LogView) -> Finding:
             thresholds=thresholds,
         )
     first = best.iloc[0]
+    low, high = _range(int(first["complete"]), int(first["episodes"]))
+    which = f"the checkpoint {first['checkpoint']}, which" if first["checkpoint"] else "the checkpoint that"
     sentence = (
-        f"Submit the checkpoint that drove iteration {first['iteration']:.0f}: a quarter of its laps are below "
-        f"{first['lap_time_p25_s']:.2f} s, and {first['lap_share']:.0%} of its episodes are complete laps "
-        f"({first['complete']:.0f} of {first['episodes']:.0f})."
+        f"Submit {which} drove iteration {first['iteration']:.0f}: a quarter of its laps are below "
+        f"{first['lap_time_p25_s']:.2f} s, and {first['complete']:.0f} of its {first['episodes']:.0f} episodes are "
+        f"complete laps ({_share(low)} to {_share(high)} with 95 % confidence)."
     )
     others = [
-        f"{row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
+        f"{row.checkpoint or row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
         for row in best.iloc[1:].itertuples()
     ]
     if others:
@@ -192,6 +209,19 @@ def _chance(laps: _Laps, target_s: float | None) -> Finding | None:
     known = laps.lap_times_s[np.isfinite(laps.lap_times_s)]
     if not len(known):
         return None
+    if len(known) < LEAST_LAPS:
+        driven = f"{len(known)} of {_count(len(laps.lap_times_s), 'episode')} {laps.whose}"
+        sentence = (
+            f"{driven} {'is a complete lap' if len(known) == 1 else 'are complete laps'}, the fastest in "
+            f"{known.min():.2f} s: too few to say how likely the next one is."
+        )
+        return Finding(
+            rule="chance",
+            sentence=sentence,
+            figure="lap_time_histogram",
+            values={"laps": len(known), "best_s": float(known.min())},
+            thresholds={"least_laps": LEAST_LAPS},
+        )
     target = float(known.min()) if target_s is None else target_s
     found = lap_chance(known, target)
     assert found is not None
@@ -229,6 +259,8 @@ def _time_lost(view: LogView, laps: _Laps) -> Finding | None:
         if places
         else "No sector loses time to its best."
     )
+    if len(times) < LEAST_LAPS:
+        sentence += f" From {len(times)} laps this is a hint at most."
     return Finding(
         rule="time_lost",
         sentence=sentence,
@@ -244,13 +276,40 @@ def _place(sectors: Sectors, name: str) -> str:
     return f"{name} (waypoints {part.first_waypoint} to {part.last_waypoint})"
 
 
-def _runs_off(view: LogView) -> list[Finding]:
-    if len(view.episodes):
-        late = _late(view)
-        steps = view.steps[view.steps["episode"].isin(late["episode"])]
-        when = f"since iteration {late['iteration'].min()}"
+def _crashes(view: LogView) -> Finding | None:
+    """Say how many episodes of the whole log ended in a crash, and how many of them at one object."""
+    status = view.steps["episode_status"].astype(str).to_numpy()
+    begins = (status == "crashed") & (np.append([""], status[:-1]) != "crashed")
+    rows = view.steps[begins]
+    if not len(rows):
+        return None
+    places = rows[["X", "Y"]].to_numpy(np.float64)
+    near = np.linalg.norm(places[:, None] - places[None], axis=2) <= CRASH_PLACE_M
+    centre = int(near.sum(axis=1).argmax())
+    here = rows[near[centre]]
+    crashed, episodes = rows["episode"].nunique(), len(view.episodes)
+    waypoint = int(here["closest_waypoint"].median())
+    x_m, y_m = here[["X", "Y"]].median()
+    sentence = f"The car crashed in {crashed} of {_count(episodes, 'episode')}"
+    if len(here) >= off_track.LEAST:
+        sentence += (
+            f", {len(here)} times at one place: waypoint {waypoint} (x {x_m:.2f} m, y {y_m:.2f} m), where an "
+            "object stands or drives."
+        )
     else:
-        steps, when = view.evaluations, "in the evaluations"
+        sentence += ", at no place often."
+    return Finding(
+        rule="crashes",
+        sentence=sentence,
+        figure="episode_ends_map",
+        values={"crashed": crashed, "episodes": episodes, "here": len(here), "waypoint": waypoint},
+        thresholds={"place_m": CRASH_PLACE_M, "least": off_track.LEAST},
+    )
+
+
+def _runs_off(view: LogView) -> list[Finding]:
+    late, when = _now(view)
+    steps = view.steps[view.steps["episode"].isin(late["episode"])]
     thresholds = {"least": off_track.LEAST, "place_m": off_track.PLACE_M}
     places = off_track_places(steps)
     if not places:
@@ -273,7 +332,7 @@ def _runs_off(view: LogView) -> list[Finding]:
     sectors = sectors_of(view.course) if view.course is not None else None
     where = [
         f"at waypoint {one.waypoint}{_in(sectors, one)} to the {one.side} "
-        f"({one.count} of {one.passes} passes, {_share(one.risk)})"
+        f"({one.count} of {one.passes} passes: a risk of {_share(one.low)} to {_share(one.high)})"
         for one in places
     ]
     found = Finding(
@@ -288,10 +347,12 @@ def _runs_off(view: LogView) -> list[Finding]:
 
 
 def _steering(places: list[OffTrackPlace]) -> Finding:
-    words = [
-        f"at waypoint {one.waypoint} {JUDGEMENTS[one.judgement] if one.judgement else 'now this, now that'}"
-        for one in places
-    ]
+    # What holds at several places is said once.
+    at: dict[str, list[str]] = {}
+    for one in places:
+        said = JUDGEMENTS[one.judgement] if one.judgement else "it does now this, now that"
+        at.setdefault(said, []).append(str(one.waypoint))
+    words = [f"at waypoint{'s' * (len(some) > 1)} {_and(some)} {said}" for said, some in at.items()]
     return Finding(
         rule="steering",
         sentence=f"Before it runs off, {'; '.join(words)}.",
@@ -357,6 +418,16 @@ def _share(share: float) -> str:
     return (
         f"{share:.0%}" if share >= 0.1 or share == 0 else f"{share:.1%}" if share >= 0.001 else "below 0.1%"
     )
+
+
+def _range(hits: int, tries: int) -> tuple[float, float]:
+    """Return the 95 per cent interval of a share (Wilson 1927)."""
+    low, high = binomtest(hits, tries).proportion_ci(method="wilson")
+    return float(low), float(high)
+
+
+def _and(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _times(number: int) -> str:

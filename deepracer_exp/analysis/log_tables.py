@@ -33,7 +33,11 @@ class Table:
 def iteration_rows(view: LogView) -> Table:
     """Return how each iteration drove and learned; of very many, every second, third, ... and the last."""
     table = view.iterations
-    told = {name: column for name, column in _ITERATION_COLUMNS.items() if table[name].notna().any()}
+    told = {
+        name: column
+        for name, column in _ITERATION_COLUMNS.items()
+        if (table[name] != "" if name == "checkpoint" else table[name].notna()).any()
+    }
     every = math.ceil(len(table) / MOST_ITERATIONS) or 1
     shown = table.iloc[::-1].iloc[::every].iloc[::-1]
     return _table(shown, told, len(table) - len(shown))
@@ -47,7 +51,10 @@ def candidate_rows(view: LogView) -> Table:
 def best_laps(view: LogView) -> Table:
     """Return the fastest complete laps of the training, the fastest first."""
     laps = view.episodes.dropna(subset="lap_time_s").sort_values("lap_time_s", kind="stable")
-    return _table(laps.head(MOST_LAPS), _LAP_COLUMNS, max(0, len(laps) - MOST_LAPS))
+    columns = _LAP_COLUMNS
+    if not view.trained:
+        columns = {"stream": ("Race", "")} | {k: v for k, v in columns.items() if k != "iteration"}
+    return _table(laps.head(MOST_LAPS), columns, max(0, len(laps) - MOST_LAPS))
 
 
 def problem_rows(view: LogView) -> Table:
@@ -91,19 +98,23 @@ def settings(values: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 def headline(view: LogView) -> str:
     """Return in one sentence how much was driven, and how well; an episode cut off by the end is not counted."""
-    laps = view.episodes["lap_time_s"].dropna()
-    parts = [
-        count(len(view.steps), "control step"),
-        count(int(view.episodes["ended"].sum()), "finished episode"),
-    ]
-    parts.append(count(len(view.iterations), "iteration"))
-    sentence = f"{parts[0]} in {parts[1]} and {parts[2]}"
-    if not len(view.steps):
-        sentence = f"No training steps; {count(len(view.evaluations), 'control step')} of evaluations"
-    if not int(view.episodes["complete"].sum()):
+    finished = count(int(view.episodes["ended"].sum()), "finished episode")
+    laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
+    if view.trained:
+        sentence = f"{count(len(view.steps), 'control step')} in {finished} and "
+        sentence += count(len(view.iterations), "iteration")
+        more = int(view.iterations["episodes"].sum()) - int(view.episodes["ended"].sum())
+        if more > 0:
+            sentence += f"; {count(more, 'more episode')} known from metrics files only"
+            laps = int(view.iterations["complete"].sum())
+            best_s = view.iterations["lap_time_best_s"].min()
+    else:
+        races = count(view.episodes["stream"].nunique(), "evaluation or race")
+        sentence = f"No training; {count(len(view.steps), 'control step')} in {finished} of {races}"
+    if not laps:
         return f"{sentence}; no complete lap."
-    best = f", the best in {laps.min():.2f} s" if len(laps) else ""
-    return f"{sentence}; {count(int(view.episodes['complete'].sum()), 'complete lap')}{best}."
+    best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
+    return f"{sentence}; {count(laps, 'complete lap')}{best}."
 
 
 def count(number: int, what: str) -> str:
@@ -140,6 +151,7 @@ _ITERATION_COLUMNS = {
     "entropy": ("Entropy, nats", ".3f"),
     "kl": ("KL, nats", ".2g"),
     "lr": ("Learning rate", ".2g"),
+    "checkpoint": ("Checkpoint", ""),
     "eval_completion": ("Evaluated, %", ".1f"),
     "held_out_completion": ("Held out, %", ".1f"),
 }

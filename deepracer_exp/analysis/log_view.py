@@ -29,6 +29,9 @@ class LogView:
     """None: not known; what needs its shape is then left out."""
     track_name: str
     """Name of the course as logged, "" where it is neither told nor found."""
+    trained: bool
+    """Whether a training is recorded; else `steps` and `episodes` are those of the evaluations and races, numbered
+    through."""
     steps: pd.DataFrame
     """Training steps on the course, ordered by episode and time, prepare rows among them; columns
     `recording.STEP_COLUMNS` and `step_columns.DERIVED_COLUMNS`."""
@@ -90,16 +93,23 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     episodes = episode_table(trained, first)
     evaluation_episodes = episode_table(driven, evaluation_first)
     streams = driven["stream"].to_numpy()[np.flatnonzero(evaluation_first)]
+    evaluation_episodes = evaluation_episodes.assign(stream=streams)
+    iterations = iteration_table(recording, trained, episodes)
+    if not training.any():
+        number = np.cumsum(evaluation_first) - 1
+        trained = driven.assign(episode=number)
+        episodes = evaluation_episodes.assign(episode=np.arange(len(evaluation_episodes)))
     return LogView(
         name=recording.name,
+        trained=bool(training.any()),
         recording=recording,
         course=course,
         track_name=name or (course.name if course is not None else ""),
         steps=trained,
         episodes=episodes,
-        iterations=iteration_table(recording, trained, episodes),
+        iterations=iterations,
         evaluations=driven,
-        evaluation_episodes=evaluation_episodes.assign(stream=streams),
+        evaluation_episodes=evaluation_episodes,
         problems=(*recording.problems, *problems),
         discount=discount,
     )

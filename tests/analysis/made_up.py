@@ -228,6 +228,7 @@ def _told(drives: Sequence[Drive], evaluated: Sequence[float]) -> pd.DataFrame:
         (
             "training",
             0,
+            iteration,
             last[iteration],
             trial + 1,
             "evaluation",

@@ -4,13 +4,16 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from deepracer_exp.analysis.candidates import candidates, lap_chance
+from deepracer_exp.analysis.charts import draw_sections
 from deepracer_exp.analysis.findings import Finding, findings
 from deepracer_exp.analysis.learning import PATIENCE, convergence
+from deepracer_exp.analysis.log_tables import best_laps, headline
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
@@ -105,7 +108,9 @@ def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
     assert candidates(view.iterations)["iteration"].tolist() == [2, 1]
     found = of(view, "submit")
     assert found.sentence.startswith("Submit the checkpoint that drove iteration 2:")
-    assert "80% of its episodes" in found.sentence
+    assert "8 of its 10 episodes are complete laps (49% to 94% with 95 % confidence)" in found.sentence
+    named = replace(view.recording, checkpoints={2: "2_Step-4711"})
+    assert of(prepare(named), "submit").sentence.startswith("Submit the checkpoint 2_Step-4711, which drove")
     assert found.values["p25_s"] == pytest.approx(COURSE.length_m / 2.5)
 
 
@@ -231,7 +236,64 @@ def test_a_race_without_training_is_judged_by_its_laps() -> None:
     race = recording.steps[recording.steps["stream"] == "race"].reset_index(drop=True)
     view = prepare(replace(recording, steps=race))
     assert [one.rule for one in findings(view)] == ["chance", "time_lost", "runs_off"]
-    assert "3 complete laps of the evaluations" in of(view, "chance").sentence
+    assert of(view, "chance").sentence.startswith("3 of 3 episodes of the evaluations are complete laps")
+    assert headline(view).startswith("No training; ")
+    assert "3 complete laps, the best in 8.85 s" in headline(view)
+    drawn = {chart.name for section in draw_sections(view) for chart in section.charts}
+    assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn
+    assert [row[:2] for row in best_laps(view).rows] == [
+        ("race", "8.85"),
+        ("race", "9.84"),
+        ("race", "11.81"),
+    ]
+
+
+@pytest.mark.parametrize("laps", [1, 3])
+def test_a_few_laps_say_nothing_of_chances_and_only_hint_at_lost_time(laps: int) -> None:
+    view = laps_of((laps, 4, 2.0))
+    sentence = of(view, "chance").sentence
+    assert "too few to say how likely the next one is" in sentence
+    assert "normal fit" not in sentence
+    lost = [one.sentence for one in findings(view) if one.rule == "time_lost"]
+    assert [f"From {laps} laps this is a hint at most." in one for one in lost] == [True] * (laps > 1)
+
+
+def test_laps_that_only_metrics_tell_of_can_be_submitted() -> None:
+    recording = laps_of((0, 5, 2.0)).recording
+    episodes = np.arange(100, 108)
+    told = pd.DataFrame(
+        {
+            "stream": "training",
+            "worker": 0,
+            "iteration": 7,
+            "episode": episodes,
+            "trial": 1,
+            "phase": "training",
+        }
+        | {"reward": 1.0, "completion": 100.0, "time_s": 9.5, "episode_status": "lap_complete", "resets": 0.0}
+    )
+    view = prepare(replace(recording, told=told))
+    assert of(view, "submit").sentence.startswith("Submit the checkpoint that drove iteration 7:")
+    assert "8 more episodes known from metrics files only; 8 complete laps, the best in 9.50 s" in headline(
+        view
+    )
+    assert [section.title for section in draw_sections(view)]
+
+
+def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
+    recording = off_at((35, 6, False), (85, 2, False)).recording
+    status = recording.steps["episode_status"].astype(str).replace("off_track", "crashed")
+    view = prepare(replace(recording, steps=recording.steps.assign(episode_status=status.astype("category"))))
+    found = of(view, "crashes")
+    assert found.sentence.startswith("The car crashed in 8 of 14 episodes, 6 times at one place: waypoint 3")
+    assert "crashes" not in [one.rule for one in findings(off_at((35, 6, False)))]
+
+
+def test_what_the_car_does_at_several_places_is_said_once() -> None:
+    view = off_at((35, 6, False), (85, 4, False))
+    sentence = of(view, "steering").sentence
+    assert sentence.count("understeers") == 1
+    assert "at waypoints 35 and 85 it understeers" in sentence
 
 
 def test_without_a_course_only_what_needs_its_shape_is_left_out() -> None:
