@@ -29,6 +29,8 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
 }
 """Names of the columns, with meaning and unit."""
+FINISHED = 0.75
+"""Share of the usual episodes below which the last iteration of a metrics file was not finished."""
 _TOLD = ("entropy", "kl", "policy_loss", "value_loss", "lr")
 
 
@@ -68,6 +70,9 @@ def _told_alone(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
     """Return the training episodes that only metrics files tell of: their traces are not there."""
     told = recording.told
     told = told[(told["phase"] == "training") & (told["stream"] == "training")]
+    counts = told.groupby("iteration").size()
+    if len(counts) > 1 and counts.iloc[-1] < FINISHED * counts.median():
+        told = told[told["iteration"] != counts.index[-1]]  # the job ended within it
     told = told[~told["episode"].isin(episodes["episode"])]
     complete = told["completion"] >= 100.0
     return pd.DataFrame(
