@@ -6,6 +6,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from deepracer_exp import __version__
 from deepracer_exp.addresses import redact, without_passwords
@@ -22,11 +23,12 @@ from deepracer_exp.commands import (
     stopping,
     sweep,
 )
+from deepracer_exp.commands.checking import check_files, check_run
 from deepracer_exp.commands.ending import tell, tell_all
 from deepracer_exp.commands.starting import start_workers_early
 from deepracer_exp.commands.stderr_warnings import warnings_on_stderr
 from deepracer_exp.commands.supervised import supervised
-from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.errors import BadInput, RunFailed, nearest
 
 _TRAIN_EPILOG = """\
 An experiment is one option of each group, and any value in it can be set:
@@ -78,14 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: of the command line; None: those of this process, in which no reward function runs then.
     """
-    parser = _parser()
-    if arguments is None:
-        sys.argv[1:] = without_passwords(sys.argv[1:])  # which the run's folder keeps
-    args, rest = parser.parse_known_args(None if arguments is None else without_passwords(list(arguments)))
-    if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if rest:  # argparse takes no positional arguments after an option between them
-        args.overrides += rest
+    args = argparse.Namespace()
+    try:
+        args = _parsed(arguments)
+    except BadInput as error:
+        sys.exit(_fail(error, BadInput.exit_code, args))
     if arguments is None and getattr(args, "runs_rewards", False):
         sys.exit(supervised(lambda: _call(args)))
     sys.exit(_call(args))
@@ -109,8 +108,36 @@ def _call(args: argparse.Namespace) -> int:
         return 141
 
 
+class _Parser(argparse.ArgumentParser):
+    """Argparse that complains in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise BadInput(f"{message}; `{self.prog} --help` tells more")
+
+    def _check_value(self, action: argparse.Action, value: str) -> None:
+        # Newer versions of argparse suggest the nearest word themselves.
+        choices = list(action.choices or ())
+        if choices and value not in choices:
+            name = action.option_strings[0] if action.option_strings else str(action.metavar).lower()
+            raise BadInput(
+                f"{value}: no such {name}{nearest(value, choices)}; accepted: {', '.join(choices)}"
+            )
+
+
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = _parser()
+    if arguments is None:
+        sys.argv[1:] = without_passwords(sys.argv[1:])  # which the run's folder keeps
+    args, rest = parser.parse_known_args(None if arguments is None else without_passwords(list(arguments)))
+    if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:  # argparse takes no positional arguments after an option between them
+        args.overrides += rest
+    return args
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = _Parser(
         prog="deepracer-exp",
         description="Hundreds of DeepRacer-style racing experiments a day, on one machine.",
         epilog="`deepracer-exp COMMAND --help` tells more. Results go to runs/ in the current folder.",
@@ -219,7 +246,9 @@ def _train(args: argparse.Namespace) -> int:
     from deepracer_exp.config.options import options_of
 
     if args.options is not None:
-        print("\n".join(options_of(args.options)))
+        described = options_of(args.options)
+        for name, what in described.items():
+            print(f"{name:{max(map(len, described))}}  {what}".rstrip())
         return 0
     grid = expand_grid(args.overrides) if args.multirun else [list(args.overrides)]
     # All combinations are checked, and their files read, before the first one runs.
@@ -229,6 +258,8 @@ def _train(args: argparse.Namespace) -> int:
     if args.cfg:
         print("---\n".join(composition.yaml() for _, composition in composed), end="")
         return 0
+    for experiment, _ in composed:
+        check_files(experiment)
     # The imports to come take seconds, and the first start after an installation compiles for longer.
     print("starting", file=sys.stderr, flush=True)
     start_workers_early(any(experiment.collector.forks for experiment, _ in composed))
@@ -269,6 +300,7 @@ def _validate(args: argparse.Namespace) -> int:
     args.debug = experiment.debug
     _tell_notes(composition.notes)
     trial = None if seconds is None else compose_experiment([*overrides, *trial_overrides(seconds)])
+    check_files(experiment)
     if trial is not None:
         start_workers_early(experiment.collector.forks)
 
@@ -287,6 +319,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         return 0
     config, _ = compose_evaluation(args.overrides)
     args.debug = config.debug
+    check_run(config.run, config.runs_dir, config.tracking_uri, config.checkpoint)
     if args.video is not None:
         # MuJoCo looks at this once, when it is imported.
         from deepracer_exp.evaluation.graphics import choose_graphics

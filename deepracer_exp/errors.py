@@ -55,7 +55,7 @@ def _reason(error: Exception) -> str:
     mark = getattr(error, "problem_mark", None)
     if mark is not None:  # YAML's errors have several lines, most of which say where
         return f"{getattr(error, 'problem', None)} in line {mark.line + 1}"
-    if type(error).__module__ != "builtins" or isinstance(error, ValueError | OSError):
+    if type(error).__module__ != "builtins" or isinstance(error, ValueError | OSError | RuntimeError):
         return str(error) or type(error).__name__
     return f"{type(error).__name__}: {error}"
 

@@ -16,7 +16,7 @@ from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_de
 from tenacity.wait import wait_exponential_jitter
 
 from deepracer_exp.addresses import redact
-from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.errors import BadInput, RunFailed, reading
 from deepracer_exp.tracking.store import one_line
 
 from .database import Database, resolve_database
@@ -55,10 +55,11 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> St
         BadInput: unknown kind, missing driver, unreachable, not writable, or used by another program.
     """
     database = resolve_database(url, runs_dir)
-    try:
-        optuna = _waiting(lambda: _open(database), patience_s)
-    except (DBAPIError, StorageInternalError) as error:
-        raise BadInput(f"{database.shown}: {_reason(error)}") from None
+    with reading(database.shown, "a place where files can be written, or a server"):
+        try:
+            optuna = _waiting(lambda: _open(database), patience_s)
+        except (DBAPIError, StorageInternalError) as error:
+            raise BadInput(f"{database.shown}: {_reason(error)}") from None
     return Storage(optuna, optuna.engine, redact(str(database.url)))
 
 

@@ -17,11 +17,12 @@ from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import key_of
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.evaluation.checkpoint import kept_checkpoints, read_checkpoint
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.report import write_json
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
 from deepracer_exp.evaluation.run import read_run
+from deepracer_exp.formats.checkpoint_files import kept_checkpoints
 from deepracer_exp.formats.lineage_file import Lineage
 from deepracer_exp.formats.run_files import read_metrics, read_object, read_run_id
 from deepracer_exp.tracking.names import PARENT, trial_metrics

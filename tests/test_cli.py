@@ -66,15 +66,6 @@ def test_help_of_train_names_every_group(call):
     assert set(groups()) <= set(listed)
 
 
-def test_options_lists_a_groups_options_one_a_line(call):
-    for group in groups():
-        assert call("train", "--options", group).stdout.split("\n")[:-1] == options(group)
-
-
-def test_options_of_no_group_names_the_nearest(call):
-    call("train", "--options", "trak").assert_bad_input("trak", "did you mean track?")
-
-
 def test_cfg_prints_the_experiment_and_runs_nothing(call, tmp_path):
     ended = call("train", "experiment=tiny", "seed=5", "--cfg")
     assert ended.code == 0

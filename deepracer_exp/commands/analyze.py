@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, reading
+from deepracer_exp.formats.user_file import LOG_BYTES, open_user_file
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
@@ -59,6 +60,15 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 def _analyze(args: argparse.Namespace) -> int:
     target_s = None if args.target is None else _seconds(args.target)
 
+    place = _place(args.what, args)
+    beside = [_place(what, args) for what in args.compare]
+    if args.out is not None and not Path(args.out).absolute().parent.is_dir():
+        raise BadInput(f"--out {args.out}: its folder is not there; accepted: a file in a folder")
+    if args.reward is not None:
+        from deepracer_exp.env.reward_source import named_reward_source
+
+        named_reward_source(args.reward)
+
     from deepracer_exp.analysis.findings import findings
     from deepracer_exp.analysis.log_report import LogPage, write_page
     from deepracer_exp.analysis.log_tables import count, headline
@@ -68,8 +78,6 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.evaluation.run_terms import run_terms
     from deepracer_exp.formats.recording_reader import read_recording
 
-    place = _place(args.what, args)
-    beside = [_place(what, args) for what in args.compare]
     recording = read_recording(place)
     view, terms = run_terms(prepare(recording, args.track))
     others = [_light(prepare(read_recording(other))) for other in beside]
@@ -104,9 +112,12 @@ def _place(what: str, args: argparse.Namespace) -> Path:
     Raises:
         BadInput: there is none, or it is a run's name that several have.
     """
-    path = Path(what).expanduser()
-    if path.exists():
-        return path
+    with reading(what, "logs of the service, or a run"):
+        path = Path(what).expanduser()
+        if path.exists():
+            if not path.is_dir():
+                open_user_file(path, "logs of the service, or a run", LOG_BYTES).close()
+            return path
     from deepracer_exp.evaluation.run import find_run
 
     try:

@@ -39,6 +39,8 @@ def _checkpoints(args: argparse.Namespace) -> int:
     from deepracer_exp.config.overrides import group_of, override_line
     from deepracer_exp.errors import BadInput
 
+    from .checking import check_run
+
     runs = [given for given in args.overrides if "=" not in given]
     overrides = [given for given in args.overrides if given not in runs]
     if len(runs) > 1:
@@ -55,6 +57,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
     config, _ = compose_evaluation([*overrides, *own])
     own_trials = not any(group_of(given) == "evaluation" for given in overrides)
     args.debug = config.debug
+    check_run(config.run, config.runs_dir, config.tracking_uri, None)
 
     from rich.console import Console
 

@@ -38,14 +38,18 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 
 def _clone(args: argparse.Namespace) -> int:
-    from deepracer_exp.evaluation.references import resolve
-
+    from .checking import check_changes, check_files, check_run
     from .starting import has_workers, start_workers_early
 
     run = next((given.partition("=")[2] for given in args.overrides if given.startswith("run=")), "")
     if not run:
         raise BadInput("run: missing; write run=RUN: a run's folder, its name or the beginning of it")
-    parent = resolve(run, Path(args.runs_dir), args.tracking_uri).path
+    checkpoint = next(
+        (one.partition("=")[2] for one in args.overrides if one.startswith("checkpoint=")), None
+    )
+    parent = check_run(run, args.runs_dir, args.tracking_uri, checkpoint).path
+    changes = [one for one in args.overrides if not one.startswith(("run=", "checkpoint="))]
+    check_files(check_changes(parent, changes))
     print("starting", file=sys.stderr, flush=True)
     start_workers_early(has_workers(parent))
 

@@ -37,7 +37,6 @@ def _compare(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from deepracer_exp.analysis.comparison_figure import comparison_figure
     from deepracer_exp.errors import BadInput
     from deepracer_exp.evaluation.run import find_run
     from deepracer_exp.formats.run_files import read_run
@@ -49,6 +48,9 @@ def _compare(args: argparse.Namespace) -> int:
     for record in records:
         if not record.rows:
             raise BadInput(f"{record.path / 'metrics.jsonl'}: has no iteration; there is nothing to compare")
+
+    from deepracer_exp.analysis.comparison_figure import comparison_figure
+
     figure = comparison_figure(dict(zip(ascii_uppercase, records, strict=False)))
     try:
         figure.savefig(args.output)

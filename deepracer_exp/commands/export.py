@@ -1,6 +1,7 @@
 """`deepracer-exp export`: a trained policy, or what it was trained with, for other programs."""
 
 import argparse
+from pathlib import Path
 
 from .stderr_warnings import warnings_on_stderr
 
@@ -34,12 +35,19 @@ def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 
 def _export(args: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from deepracer_exp.config.compose import compose_export
+    from deepracer_exp.evaluation.references import resolve
+
+    from .checking import check_run
 
     config, _ = compose_export(args.overrides)
     args.debug = config.debug
+    if config.format == "onnx":
+        check_run(config.run, config.runs_dir, config.tracking_uri, config.checkpoint)
+    else:
+        resolve(config.run, Path(config.runs_dir), config.tracking_uri)
+
+    from rich.console import Console
 
     from deepracer_exp.export.export import export
 

@@ -45,9 +45,11 @@ def _resume(args: argparse.Namespace) -> int:
 
     from deepracer_exp.evaluation.references import resolve
 
+    from .checking import check_changes
     from .starting import has_workers, start_workers_early
 
     run_dir = resolve(args.run, Path(args.runs_dir), args.tracking_uri).path
+    check_changes(run_dir, args.overrides)
     print("starting", file=sys.stderr, flush=True)
     start_workers_early(has_workers(run_dir))
 

@@ -5,7 +5,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, reading
 
 _EPILOG = """\
 what is searched, in Hydra's grammar
@@ -64,14 +64,17 @@ def _sweep(args: argparse.Namespace) -> int:
     from deepracer_exp.config.sweep import compose_sweep
     from sweeps.process import PRELOADED
 
+    from .checking import check_sweep
     from .starting import start_workers_early
 
     request = compose_sweep(args.overrides)
     args.debug = request.entry.debug
+    check_sweep(request)
     if args.cfg:
-        from sweeps.sweep import whole_request
+        if not request.space:  # that of a study that is there
+            from sweeps.sweep import whole_request
 
-        _, request, _ = whole_request(args.overrides)
+            _, request, _ = whole_request(args.overrides)
         # What the command line says of the training stands where a ready-made sweep has it.
         request.composition.mapping["sweep"] |= {"train": list(request.base), "space": dict(request.space)}
         print(request.composition.yaml(), end="")
@@ -106,18 +109,25 @@ def _told(args: argparse.Namespace) -> int:
     if len(names) != 1:
         raise BadInput(f"sweep {word}: one study is accepted, as in `deepracer-exp sweep {word} lr_entropy`")
 
-    from sweeps.report import write_report
-    from sweeps.storage import open_storage
-    from sweeps.study import load_study
-    from sweeps.sweep import REPORT
+    from deepracer_exp.config.experiment import safe_name
 
+    with reading(f"sweep {word} {names[0]}"):
+        safe_name(names[0])
     runs_dir = Path(args.runs_dir or "runs")
     if args.storage is None and not (runs_dir / "sweeps.db").is_file():
         raise BadInput(f"--runs-dir {runs_dir}: has no sweeps.db; give the folder, or --storage URL")
+
+    from sweeps.storage import open_storage
+    from sweeps.study import load_study
+
     study = load_study(names[0], open_storage(args.storage, runs_dir))
     if word == "best":
         _tell_best(study)
         return 0
+
+    from sweeps.report import write_report
+    from sweeps.sweep import REPORT
+
     print(write_report(study, runs_dir / study.study_name / REPORT))
     return 0
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .bounds import Count, Finite, NonNegative, Positive
+from .bounds import Finite, NonNegative, Positive, UpTo100, UpTo1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +57,11 @@ class CarConfig:
     max_speed_mps: Positive
 
     control_hz: Positive
-    substeps: Count
+    substeps: UpTo100
     integrator: Literal["euler", "implicitfast", "discrete"]
     solver: Literal["newton", "cg"]
-    solver_iterations: Count
-    line_search_iterations: Count
+    solver_iterations: UpTo1000
+    line_search_iterations: UpTo1000
     solver_tolerance: NonNegative
     wheel_contact: Literal["sphere", "ellipsoid", "cylinder"]
     contact_time_s: Positive

@@ -3,37 +3,48 @@
 import difflib
 import itertools
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.types import Glob, Override
+from hydra.core.override_parser.types import Glob, Override, RangeSweep
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.addresses import without_passwords
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, nearest, reading
 
-from . import custom_files
+from . import (
+    custom_files,
+    option_files,  # noqa: F401 - how Hydra reads them
+)
+from deepracer_exp.formats.worlds import find_world
+
 from .contradictions import check_together
 from .custom_files import Beneath, beneath, read_custom_files
-from .evaluation import EvaluateConfig
+from .dimension import length
+from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
 from .export import ExportConfig
 from .options import conf_dirs, find, groups, listed, options
-from .overrides import line_for_hydra, override_line, parse_single, parse_sweep
+from .overrides import PLAIN_TEXT, line_for_hydra, override_line, parse_single, parse_sweep
+from .track_options import ALL, by_world_name, complete, in_own_words, register_worlds, several_tracks
 from .track_options import GROUP as TRACK
-from .track_options import by_world_name, complete, in_own_words, register_worlds, several_tracks
 
 Config = TypeVar("Config")
 
-_UNREADABLE = (yaml.YAMLError, UnicodeDecodeError, RecursionError)
-"""What reading an option file that is no YAML raises, and one that holds itself."""
+MOST_RUNS = 1000
+"""Of one `-m`; one after the other they take a day."""
+
+_FILES = (".json", ".npy", ".py", ".yaml", ".yml")
+_NO_EXPERIMENT = ("experiment", None)
 
 _adapters: dict[type, TypeAdapter[Any]] = {}
 
@@ -74,7 +85,9 @@ def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Compositio
         BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
     """
     composition = compose_entry("train", overrides)
-    return validate(composition.mapping), composition
+    experiment = validate(composition.mapping)
+    _check_names(experiment.evaluation)
+    return experiment, composition
 
 
 def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Composition]:
@@ -85,7 +98,9 @@ def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Compos
     """
     composition = compose_entry("evaluate", overrides)
     _require_run(composition)
-    return typed(composition.mapping, EvaluateConfig), composition
+    config = typed(composition.mapping, EvaluateConfig)
+    _check_names(config.evaluation)
+    return config, composition
 
 
 def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]:
@@ -127,22 +142,19 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         rest = [override for override in own if override.key_or_group.partition(".")[0] != TRACK]
         own = [*map(parse_single, several.choosing), *rest, *several.changing]
     parsed = [*map(parse_single, files.lines), *own]
-    try:
-        config = _composed(entry, [line_for_hydra(override) for override in parsed])
-        choices = {
-            str(group): str(option).removesuffix(".yaml")
-            for group, option in config.hydra.runtime.choices.items()
-            if option is not None
-        }
-        with open_dict(config):
-            del config["hydra"]
-        mapping = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise BadInput(_explain(entry, parsed, error)) from error
-    except _UNREADABLE as error:
-        why = "it holds itself" if isinstance(error, RecursionError) else " ".join(str(error).split())
-        raise BadInput(f"{_unreadable_file()}: no YAML that can be read: {why}") from error
-    assert isinstance(mapping, dict)
+    with reading(" ".join(overrides) or entry):
+        try:
+            config = _composed(entry, [line_for_hydra(override) for override in parsed])
+            choices = {
+                str(group): str(option).removesuffix(".yaml")
+                for group, option in config.hydra.runtime.choices.items()
+                if option is not None
+            }
+            with open_dict(config):
+                del config["hydra"]
+            mapping = _plain(config)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise BadInput(_explain(entry, parsed, error)) from error
     if has_tracks and TRACK in mapping and TRACK not in choices:
         raise BadInput("track: a list of tracks in a file; several are chosen as an override: track=[A,B]")
     if several is None and has_tracks and isinstance(mapping.get(TRACK), dict):
@@ -154,7 +166,7 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         overrides=tuple(overrides),
         choices={group: option for group, option in choices.items() if group in groups(entry)},
         # An option file of the user may hold an address, too.
-        mapping={str(key): without_passwords(value) for key, value in mapping.items()},
+        mapping=without_passwords(mapping),
         names=files.names,
         notes=files.notes,
     )
@@ -176,21 +188,66 @@ def compose_option(group: str, option: str, kind: type[Config]) -> Config:
     Raises:
         BadInput: there is no such option, or its values are not accepted or refer to other groups.
     """
-    known = options(group)
-    if option not in known:
-        raise BadInput(_no_such_option(group, option, known))
+    check_option(group, option)
+    with reading(f"{group}={option}"):
+        mapping = _plain(_composed(None, [f"+{override_line(group, option)}"])[group])
     try:
-        mapping = OmegaConf.to_container(
-            _composed(None, [f"+{override_line(group, option)}"])[group], resolve=True
-        )
-    except (*_UNREADABLE, HydraException, OmegaConfBaseException) as error:
-        raise BadInput(f"{group}={option}: {' '.join(str(error).split())}") from error
-    if not isinstance(mapping, dict):
-        raise BadInput(f"{group}={option}: {_short(mapping)} is no mapping of keys to values")
-    try:
-        return typed({str(key): value for key, value in mapping.items()}, kind)
+        return typed(mapping, kind)
     except BadInput as error:
         raise BadInput(f"{group}={option}: {error}") from error
+
+
+def check_option(group: str, name: object, key: str | None = None) -> None:
+    """Refuse what is no name of a group's options: a name never becomes a path.
+
+    Args:
+        group: of the options.
+        name: as it was given.
+        key: where, if not as an override of the group.
+
+    Raises:
+        BadInput: there is no such option.
+    """
+    known, key = options(group), key or group
+    if not isinstance(name, str):
+        raise BadInput(f"{override_line(key, name)}: no such {group}; options: {listed(group, known)}")
+    if name.removesuffix(".yaml") in known or (group == TRACK and find_world(name)):
+        return
+    hint = nearest(name, known)
+    if key == group and f"{group}.file" in PLAIN_TEXT and Path(name).suffix in _FILES:
+        hint = f" (did you mean {group}.file={name}?)"
+    raise BadInput(f"{key}={name}: no such {group}{hint}; options: {listed(group, known)}")
+
+
+def check_choice(group: str, value: object) -> None:
+    """Refuse an override of a whole group that names no options of it.
+
+    Raises:
+        BadInput: there is no such option.
+    """
+    # Of all groups `experiment` alone may be left out; `several_tracks` looks at lists of tracks.
+    if (group, value) in (_NO_EXPERIMENT, (TRACK, ALL)) or (group == TRACK and isinstance(value, list)):
+        return
+    for name in value if isinstance(value, list) else [value]:
+        check_option(group, name)
+
+
+def _check_names(evaluation: EvaluationConfig) -> None:
+    """Refuse names of options that an evaluation would not find."""
+    tracks = [evaluation.tracks] if isinstance(evaluation.tracks, str) else evaluation.tracks or ()
+    for name in tracks:
+        if name != ALL:
+            check_option(TRACK, name, "evaluation.tracks")
+    for key in ("usual", "held_out"):
+        if (name := getattr(evaluation, key)) is not None:
+            check_option("randomization", name, f"evaluation.{key}")
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    """Return composed values as plain Python: all keys text, and text for what JSON does not know."""
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
+    return plain
 
 
 def validate(mapping: dict[str, Any]) -> Experiment:
@@ -232,15 +289,21 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     """
     axes: list[list[str]] = []
     for override in map(parse_sweep, overrides):
+        line, value = override.input_line or "", override.value()
         if not override.is_sweep_override():
-            axes.append([override.input_line or ""])
-        elif override.is_discrete_sweep() and not isinstance(override.value(), Glob):
-            key = override.get_key_element()
-            axes.append([f"{key}={value}" for value in override.sweep_string_iterator()])
-        else:
-            raise BadInput(
-                f"{override.input_line}: no plain grid; -m takes lists and ranges (seed=0,1,2 or seed=range(3))"
-            )
+            axes.append([line])
+            continue
+        if not override.is_discrete_sweep() or isinstance(value, Glob):
+            raise BadInput(f"{line}: no plain grid; -m takes lists and ranges (seed=0,1,2 or seed=range(3))")
+        count = length(value, line) if isinstance(value, RangeSweep) else 1
+        if math.prod(map(len, axes)) * count > MOST_RUNS:
+            raise BadInput(f"{line}: more than {MOST_RUNS:,} runs; accepted with -m: up to {MOST_RUNS:,}")
+        key = override.get_key_element()
+        axes.append([f"{key}={one}" for one in override.sweep_string_iterator()])
+    if math.prod(map(len, axes)) > MOST_RUNS:
+        raise BadInput(
+            f"{' '.join(overrides)}: {math.prod(map(len, axes)):,} runs; accepted with -m: up to {MOST_RUNS:,}"
+        )
     return [list(combination) for combination in itertools.product(*axes)]
 
 
@@ -261,8 +324,8 @@ def _check_key(entry: str, override: Override) -> None:
         )
     if override.package is not None:
         raise BadInput(f"{key}@{override.package}: an option's place is its group's; write {key}=OPTION")
-    if key in groups(entry) and not override.is_delete() and not isinstance(value, str | list | None):
-        raise BadInput(f"{override.input_line}: no such {key}; options: {listed(key, options(key))}")
+    if key in groups(entry) and not override.is_delete():
+        check_choice(key, value)
 
 
 def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
@@ -280,33 +343,21 @@ def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
     if missing and groups_within:
         group = max(groups_within, key=len)  # sweep/executor rather than sweep
         option = missing[1].removeprefix(f"{group}/")
-        known = options(group)
-        return _no_such_option(group, option, known)
+        return f"{group}={option}: no such {group}{nearest(option, options(group))}"
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
         known = groups(entry)
-        chosen = [o.input_line or "" for o in parsed if o.key_or_group in known and o.package is None]
+        chosen = [
+            o.input_line or ""
+            for o in parsed
+            if o.key_or_group in known and o.package is None and o.key_or_group != unknown[1]
+        ]
         return _unknown_key(entry, unknown.group(1), compose_entry(entry, chosen))
     loaded = re.search(r"in the defaults list", text)
     if loaded:
         key = next((o.key_or_group for o in parsed if o.key_or_group in text), parsed[0].key_or_group)
         return f"{key}: no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
-    return f"{entry}: " + " ".join(text.split())
-
-
-def _unreadable_file() -> str:
-    """Return the option file that cannot be read, as far as it can be found; the project's own can."""
-    for folder in conf_dirs()[1:]:
-        for path in sorted(folder.rglob("*.yaml")):
-            try:
-                json.dumps(yaml.safe_load(path.read_bytes()), default=str)
-            except (*_UNREADABLE, ValueError):  # a mapping that holds itself
-                return str(path)
-    return "an option file"
-
-
-def _no_such_option(group: str, option: str, known: Sequence[str]) -> str:
-    return f"{group}={option}: no such {group}{nearest(option, known)}; options: {listed(group, known)}"
+    return f"{getattr(error, 'full_key', None) or entry}: {text.partition('full_key:')[0]}"
 
 
 def _unknown_key(entry: str, key: str, chosen: Composition) -> str:

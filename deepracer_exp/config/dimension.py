@@ -22,6 +22,7 @@ from deepracer_exp.errors import BadInput, nearest
 from .options import groups, options
 from .overrides import override_line, parse_single, parse_sweep
 
+_MOST_VALUES = 100_000
 Number = int | float
 Choice = str | int | float | bool | None
 """A number, a truth value or null as it is; anything else in the words of an override, quotes included."""
@@ -46,10 +47,18 @@ class Range:
     """Search it by orders of magnitude."""
 
     def values(self) -> list[Number] | None:
-        """Return all values in ascending order; None where there is no end of them."""
+        """Return all values in ascending order; None where there is no end of them.
+
+        Raises:
+            BadInput: they are too many.
+        """
         if self.step is None:
             return None
         last = round((_exact(self.high) - _exact(self.low)) / _exact(self.step))
+        if last >= _MOST_VALUES:
+            raise BadInput(
+                f"from {self.low} to {self.high}: more than {_MOST_VALUES:,} values to try one by one"
+            )
         return [_at(self.low, self.step, at) for at in range(last + 1)]
 
 
@@ -114,9 +123,7 @@ def _dimension(override: Override) -> Choices | Range:
         assert value.end is not None
         return _interval(line, value.start, value.end, "log" in value.tags)
     assert isinstance(value, RangeSweep)
-    assert value.start is not None
-    assert value.stop is not None
-    return _range(line, value.start, value.stop, value.step, "log" in value.tags)
+    return _range(line, value, "log" in value.tags)
 
 
 def _options(override: Override, glob: Glob) -> list[str]:
@@ -159,11 +166,31 @@ def _interval(line: str, low: Number, high: Number, log: bool) -> Range:
     return Range(low, high, 1 if isinstance(low, int) and isinstance(high, int) else None, log)
 
 
-def _range(line: str, start: Number, stop: Number, step: Number, log: bool) -> Range:
-    _check_finite(line, start, stop, step)
-    count = 0 if step == 0 else math.ceil((_exact(stop) - _exact(start)) / _exact(step))
+def length(sweep: RangeSweep, line: str) -> int:
+    """Return how many values a `range()` has.
+
+    Args:
+        sweep: the range.
+        line: the override, for messages.
+
+    Raises:
+        BadInput: it has none, or no ends.
+    """
+    assert sweep.start is not None
+    assert sweep.stop is not None
+    _check_finite(line, sweep.start, sweep.stop, sweep.step)
+    count = 0
+    if sweep.step != 0:
+        count = math.ceil((_exact(sweep.stop) - _exact(sweep.start)) / _exact(sweep.step))
     if count < 1:
         raise BadInput(f"{line}: holds no value; accepted: range(FROM,BELOW,STEP)")
+    return count
+
+
+def _range(line: str, sweep: RangeSweep, log: bool) -> Range:
+    count = length(sweep, line)
+    start, step = sweep.start, sweep.step
+    assert start is not None
     first, last = _at(start, step, 0), _at(start, step, count - 1)
     low, high = min(first, last), max(first, last)
     _check_log(line, low, log)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .bounds import Count, Finite, Fraction, Natural, NonNegative, Positive
+from .bounds import Finite, Fraction, Natural, NonNegative, Positive, Seconds, UpTo100
 
 SpeedMps = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 SteeringDeg = Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
@@ -41,7 +41,7 @@ class DiscreteActionSpace:
     """A list of actions; the position in the list is the action's number."""
 
     kind: Literal["discrete"]
-    actions: tuple[DiscreteAction, ...]
+    actions: Annotated[tuple[DiscreteAction, ...], Field(max_length=1000)]
     file: str | None
     """A model_metadata.json that takes the place of this whole group."""
 
@@ -52,9 +52,9 @@ class GridActionSpace:
 
     kind: Literal["grid"]
     steering_angle: SteeringRange
-    steering_levels: Count
+    steering_levels: UpTo100
     speed: SpeedRange
-    speed_levels: Count
+    speed_levels: UpTo100
     file: str | None
 
 
@@ -77,7 +77,7 @@ ActionSpaceConfig = Annotated[
 class ObservationConfig:
     """The features the policy sees, each divided by its scale."""
 
-    lookahead_m: tuple[Positive, ...]
+    lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
     """Distances along the centre line at which the road ahead is seen."""
     lookahead_scale_m: Positive
     speed_scale_mps: Positive
@@ -111,5 +111,5 @@ class RewardConfig:
     """A Python file with `reward_function(params)`; takes the place of `name`."""
     constants: dict[str, Finite]
     """Values for UPPERCASE constants of the module."""
-    time_limit_s: Positive
+    time_limit_s: Seconds
     """Seconds of CPU that one control step's reward calls may take before the run is failed."""

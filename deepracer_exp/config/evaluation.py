@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from .bounds import Count, Natural, NonNegative
+from .bounds import Natural, NonNegative, UpTo1000
 
 Trials = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
@@ -34,7 +34,7 @@ class PenaltyConfig:
 class EvaluationConfig:
     """What a trial is, how many there are and on what."""
 
-    laps: Count | None
+    laps: UpTo1000 | None
     """Completed laps that end a trial; null: as many as fit into `time_s`."""
     time_s: Seconds
     """Race clock of a trial, penalties included; a lap that is not complete by then does not count."""
@@ -45,7 +45,7 @@ class EvaluationConfig:
     penalty_s: PenaltyConfig
     trials: Trials
     """On each track, on each of `usual` and `held_out`."""
-    starts: Annotated[tuple[Share, ...], Field(min_length=1)] | None
+    starts: Annotated[tuple[Share, ...], Field(min_length=1, max_length=4096)] | None
     """Where laps begin, as shares of the lap, the trials taking them in turn; null: spread evenly."""
     tracks: Annotated[tuple[str, ...], Field(min_length=1)] | str | None
     """Options of `track`, or `all`; null: those of the run."""

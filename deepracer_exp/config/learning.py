@@ -5,8 +5,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .bounds import Count, Fraction, NonNegative, Positive
+from .bounds import Fraction, NonNegative, Positive, UpTo1000
 
+# 16 layers of so many fit into 4 GB with their optimizer.
+Units = Annotated[int, Field(ge=1, le=4096)]
+Steps = Annotated[int, Field(ge=1, le=10**7)]
 By = Literal["iteration", "fraction"]
 """Unit of a schedule's lengths: training iterations, or fractions of the budget (0 to 1)."""
 
@@ -15,7 +18,7 @@ By = Literal["iteration", "fraction"]
 class NetworkConfig:
     """A multi-layer perceptron for policy and value."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)]
+    hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=16)]
     """Units of each hidden layer."""
     activation: Literal["tanh", "relu", "elu", "silu"]
     shared_trunk: bool
@@ -29,9 +32,9 @@ class AlgorithmConfig:
     """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them."""
 
     lr: Positive
-    batch_size: Count
+    batch_size: Annotated[int, Field(ge=1, le=10**6)]
     """Steps per gradient step (minibatch)."""
-    epochs: Count
+    epochs: UpTo1000
     """Passes over the collected steps per iteration (`num_epochs`)."""
     discount: Fraction
     """`discount_factor`, per control step of 1/15 s."""
@@ -44,9 +47,9 @@ class AlgorithmConfig:
     """Loss of the value network."""
     max_grad_norm: NonNegative
     """Largest norm of a gradient step (0: unlimited)."""
-    frames_per_iteration: Count | None
+    frames_per_iteration: Steps | None
     """Control steps, over all cars, between two updates; null when episodes_per_iteration is used."""
-    episodes_per_iteration: Count | None
+    episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
     """Finished episodes between two updates (`num_episodes_between_training`); null when frames are used."""
 
 

@@ -1,5 +1,6 @@
 """Where option files lie: the project's `conf/`, and `./conf` of the working folder beside it."""
 
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import yaml
 
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.formats.user_file import read_bytes, read_text
 from deepracer_exp.formats.worlds import worlds
 
 MOST_LISTED = 24
@@ -32,7 +34,7 @@ def conf_dirs() -> list[Path]:
         for group in sorted(str(path.relative_to(project)) for path in project.rglob("*/") if path.is_dir()):
             for path in sorted((own / group).glob("*.yaml")):
                 namesake = project / group / path.name
-                another = namesake.is_file() and namesake.read_bytes() != path.read_bytes()
+                another = namesake.is_file() and namesake.read_bytes() != read_bytes(path, "an option")
                 if another or (group == "track" and path.stem in worlds() and not namesake.is_file()):
                     raise BadInput(f"{path}: the project has another {group} of that name; rename the file")
         return [project, own.resolve()]
@@ -68,12 +70,25 @@ def listed(group: str, known: Sequence[str]) -> str:
     return f"{len(known)}, `deepracer-exp train --options {group}` lists them"
 
 
-def options_of(group: str) -> list[str]:
-    """Return the names of a group's options, sorted.
+def options_of(group: str) -> dict[str, str]:
+    """Return the first sentence about each of a group's options by its name, sorted.
 
     Raises:
         BadInput: there is no such group.
     """
     if group not in groups():
         raise BadInput(f"{group}: no such group{nearest(group, groups())}; groups: {', '.join(groups())}")
-    return options(group)
+    return {name: _first_sentence(Path(find(f"{group}/{name}.yaml"))) for name in options(group)}
+
+
+def _first_sentence(file: Path) -> str:
+    """Return the first sentence of the comment at the beginning of an option file, nothing where there is none."""
+    if not file.is_file():
+        return ""
+    words: list[str] = []
+    for line in read_text(file, "an option").splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @"):  # Hydra's
+            words += line.lstrip("# ").split()
+    return re.split(r"(?<=[.:]) ", " ".join(words), maxsplit=1)[0].rstrip(".:")

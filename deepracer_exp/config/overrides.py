@@ -8,7 +8,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import OverrideParseException
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, reading
 
 # Keys of these mappings are the user's own, so an override may add to them.
 OPEN_MAPPINGS = ("reward.constants",)
@@ -25,6 +25,8 @@ PLAIN_TEXT = (
 )
 _KEYS = "|".join((*map(re.escape, PLAIN_TEXT), r"(?:track|several_tracks)\.[\w-]+\.file"))
 _PLAIN = re.compile(rf"(\+{{0,2}}(?:{_KEYS})=)(.+)", re.DOTALL)
+_LONGEST = 20_000
+"""Characters of an override; Hydra's parser takes a minute for many more."""
 # A track may be called 2022_summit_speedway; Hydra's keys begin with a letter.
 _DIGIT = re.compile(r"([+~]*track\.)(?=\d)")
 
@@ -84,15 +86,20 @@ def _expression(value: object) -> str:
 
 
 def _parse(override: str) -> Override:
-    try:
-        parsed: Sequence[Override] = OverridesParser.create().parse_overrides([_DIGIT.sub(r"\1_", override)])
-    except OverrideParseException as error:
-        reason = str(error).splitlines()[0]
-        key, equals, value = override.partition("=")
-        quotes = f"; a value with special characters needs quotes: \"{key}='{value}'\"" if equals else ""
-        raise BadInput(
-            f"{override or repr('')}: not an override ({reason}); write GROUP=OPTION or KEY=VALUE{quotes}"
-        ) from error
+    if len(override) > _LONGEST:
+        raise BadInput(f"{override[:60]}...: {len(override):,} characters; accepted: up to {_LONGEST:,}")
+    with reading(override):
+        try:
+            parsed: Sequence[Override] = OverridesParser.create().parse_overrides(
+                [_DIGIT.sub(r"\1_", override)]
+            )
+        except OverrideParseException as error:
+            reason = str(error).splitlines()[0]
+            key, equals, value = override.partition("=")
+            quotes = f"; a value with special characters needs quotes: \"{key}='{value}'\"" if equals else ""
+            raise BadInput(
+                f"{override or repr('')}: not an override ({reason}); write GROUP=OPTION or KEY=VALUE{quotes}"
+            ) from error
     if not parsed[0].key_or_group:
         raise BadInput(f"{override}: no key before the equals sign; write GROUP=OPTION or KEY=VALUE")
     if _DIGIT.match(override):
@@ -107,7 +114,8 @@ def _quoted(value: str) -> str:
         return value
     if value.startswith("~"):
         # The shell does so at the beginning of a word only.
-        value = str(Path(value).expanduser())
+        with reading(value):
+            value = str(Path(value).expanduser())
     return _in_quotes(value)
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .bounds import Count, Natural
+from .bounds import UpTo1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,11 +14,11 @@ class CollectorConfig:
 
     mode: Literal["in_process", "sync", "async", "ray"]
     """Cars in this process; in several, all waited for; in several, whichever is ready; as sync, on a Ray cluster."""
-    processes: Count | None
+    processes: UpTo1000 | None
     """Worker processes; null: one per core, which `ray` does not know."""
-    cars: Count
+    cars: Annotated[int, Field(ge=1, le=100_000)]
     """Cars per process, stepped together."""
-    threads: Natural
+    threads: Annotated[int, Field(ge=0, le=1024)]
     """Physics threads per process (0: in_process one per core, else one)."""
     hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
     """Seconds without a control step after which a worker process counts as hanging."""

@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput
 
-from .bounds import Count, Natural, Positive
-from .compose import Composition, compose_entry, typed
-from .dimension import dimension, plain_expression
+from .bounds import Count, Natural, Seconds, UpTo100, UpTo1000
+from .compose import Composition, check_choice, check_option, compose_entry, typed
+from .dimension import Choices, as_override, dimension, plain_expression, value_of
 from .experiment import SafeName
-from .options import groups, options
+from .options import groups
 from .overrides import PLAIN_TEXT, key_of, parse_sweep
 
 Objective = Literal["race_score", "lap_time", "completion"]
@@ -55,17 +55,17 @@ ExecutorConfig = Annotated[LocalExecutor | RayExecutor, Field(discriminator="kin
 class SweepConfig:
     """What is searched, by what, and how far."""
 
-    trials: Count
+    trials: Annotated[int, Field(ge=1, le=100_000)]
     """In total, over all starts of the study."""
-    workers: Count | None
+    workers: UpTo1000 | None
     """Processes; null: one a core, on a cluster as many as it has room for."""
-    seeds: Count
+    seeds: UpTo100
     """With how many seeds a trial is trained; its value is their mean."""
     protocol: str
     """Option of `evaluation` by which trials are judged."""
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1)]
     """Several give a Pareto front instead of one best trial."""
-    rerank: Natural
+    rerank: Annotated[int, Field(ge=0, le=1000)]
     """How many of the best are put to the test anew at the end."""
     rerank_laps: Annotated[int, Field(ge=1, le=4096)]
     """Trials of that test."""
@@ -81,9 +81,9 @@ class SweepConfig:
     """Evaluations of a trial before it is compared."""
     patience: Natural | None
     """Evaluations without growth before it is compared; null: no matter whether it grows."""
-    lease_s: Positive
+    lease_s: Seconds
     """Seconds without a sign of life after which a worker's trial is anyone's."""
-    patience_s: Positive
+    patience_s: Seconds
     """Seconds for which a database that does not answer is waited for."""
     storage: Annotated[str, Field(min_length=1)] | None
     """Address of the database; null: a file in `runs_dir`."""
@@ -155,12 +155,7 @@ def compose_sweep(overrides: Sequence[str]) -> SweepRequest:
         _check_own(override)
     composition = compose_entry(_ENTRY, own)
     entry = typed(composition.mapping, SweepEntry)
-    protocols = options("evaluation")
-    if entry.sweep.protocol not in protocols:
-        raise BadInput(
-            f"sweep.protocol={entry.sweep.protocol}: no such evaluation{nearest(entry.sweep.protocol, protocols)}; "
-            f"options: {', '.join(protocols)}"
-        )
+    check_option("evaluation", entry.sweep.protocol, "sweep.protocol")
     plan = _Plan()
     for override in entry.sweep.train:
         if parse_sweep(override).is_sweep_override():
@@ -194,7 +189,10 @@ class _Plan:
         if parsed.is_sweep_override():
             _check_searched(key, override)
             self.space[key] = plain_expression(parsed, override.partition("=")[2])
-            dimension(key, self.space[key])
+            found = dimension(key, self.space[key])
+            if key in groups() and isinstance(found, Choices):
+                for value in found.values:
+                    check_choice(key, value_of(as_override(key, value)))
         elif not (parsed.is_delete() and searched):
             self.base.append(override)
         return key

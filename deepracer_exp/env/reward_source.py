@@ -56,6 +56,17 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
     return RewardSource(name, path, text, hashlib.sha256(data).hexdigest(), constants, overrides)
 
 
+def named_reward_source(reward: str) -> RewardSource:
+    """Read a reward function of the zoo by its name, or any by its file.
+
+    Raises:
+        BadInput: as for `load_reward_source`.
+    """
+    is_file = reward not in zoo_names() and (reward.endswith(".py") or Path(reward).exists())
+    file = reward if is_file else None
+    return load_reward_source(RewardConfig(name=reward, file=file, constants={}, time_limit_s=1.0))
+
+
 def source_with_constants(source: RewardSource) -> str:
     """Return the text of the module with the overriding values written in place; all else is untouched."""
     lines = source.text.encode().split(b"\n")

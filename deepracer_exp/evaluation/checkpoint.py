@@ -15,7 +15,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.checkpoint_files import HASHES, verify
+from deepracer_exp.formats.checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, verify
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -23,7 +23,6 @@ _AGENT, _TRAINING = "agent", "training"
 _MANIFEST = "manifest.json"
 _STATE = {"state.json", "state.tdz"}
 _MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
-LINKS = ("best", "last")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +65,7 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
         BadInput: there is no such checkpoint, it lies elsewhere, or it is torn and none can take its place. Whatever
             could hold a pickle is refused unread.
     """
-    path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
-    kept = kept_checkpoints(folder)
-    if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
-        known = ", ".join(
-            [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
-        )
-        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known or 'none'}")
-    if path.exists() and path.resolve().parent != folder.resolve():
-        raise BadInput(
-            f"checkpoint={name}: {path} leads out of its folder to {path.resolve()}; give a number"
-        )
+    path, kept = find_checkpoint(folder, name), kept_checkpoints(folder)
     try:
         return check(path, resumable=resumable)
     except BadInput as error:
@@ -99,16 +88,6 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
         )
         return found
     raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; none in {folder} is intact")
-
-
-def kept_checkpoints(folder: Path) -> list[Path]:
-    """Return the checkpoints of a run, not the links to them, newest first."""
-    if not folder.is_dir():
-        return []
-    own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    # `best` is a folder of its own where links were followed as the run was copied.
-    known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
-    return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
 
 
 def check(path: Path, *, resumable: bool = False) -> Path:

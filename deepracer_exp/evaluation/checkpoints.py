@@ -9,8 +9,8 @@ from rich.console import Console
 from deepracer_exp.analysis.checkpoints_figure import Lap, Point, checkpoints_figure
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.formats.checkpoint_files import LINKS, kept_checkpoints
 
-from .checkpoint import LINKS, kept_checkpoints
 from .evaluator import Evaluator
 from .run import read_run
 from .standings import Figures, Recommendation, Standing, recommend, standings

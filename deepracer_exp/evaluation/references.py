@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.experiment import safe_name
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.formats.best_of_sweep import run_of_sweep
 from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, verify
 from deepracer_exp.formats.run_files import read_config
@@ -46,9 +46,10 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> Reference:
     """
     if run.startswith(BEST):
         return Reference(best_of(run.removeprefix(BEST), runs_dir))
-    for folder in (Path(run).expanduser(), runs_dir / run):
-        if (folder / "config.yaml").is_file():
-            return Reference(folder)
+    with reading(f"run={run}", ACCEPTED):
+        for folder in (Path(run).expanduser(), runs_dir / run):
+            if (folder / "config.yaml").is_file():
+                return Reference(folder)
     if is_run_id(run):
         return Reference(_present(run, folder_of(run, tracking_uri, runs_dir), runs_dir))
     if "@" in run and "/" not in run:

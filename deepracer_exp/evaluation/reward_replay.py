@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,11 +11,10 @@ from scipy.stats import spearmanr
 from deepracer_exp.analysis.log_course import find_courses
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment, validate
-from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.env.params import rows, scalar_params, select
 from deepracer_exp.env.reward import RewardFailed, RewardFunction
 from deepracer_exp.env.reward_guard import Guard, Misconduct
-from deepracer_exp.env.reward_source import RewardSource, load_reward_source, zoo_names
+from deepracer_exp.env.reward_source import RewardSource, named_reward_source
 from deepracer_exp.errors import BadInput
 from deepracer_exp.formats.recording import LogProblem, Recording
 from deepracer_exp.formats.run_files import read_config
@@ -80,7 +78,7 @@ def replay_reward(
         BadInput: there is no such function or it cannot be loaded; it raised, hung or paid no finite number: one line
             with the episode and step; no course of the recording is known.
     """
-    source = _source(reward, time_limit_s)
+    source = named_reward_source(reward)
     found = find_courses(recording) if courses is None else None
     courses = found.tracks if found is not None else courses or {}
     steps, order = recording.steps, _order(recording.steps)
@@ -103,13 +101,6 @@ def replay_reward(
         correlations=_correlations(laps),
         waypoints=_waypoints(ordered, params, paid),
         problems=_problems(recording, params, found.problems if found is not None else ()),
-    )
-
-
-def _source(reward: str, time_limit_s: float) -> RewardSource:
-    is_file = reward not in zoo_names() and (reward.endswith(".py") or Path(reward).exists())
-    return load_reward_source(
-        RewardConfig(name=reward, file=reward if is_file else None, constants={}, time_limit_s=time_limit_s)
     )
 
 

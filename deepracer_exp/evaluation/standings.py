@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.checkpoint_files import pinned
+from deepracer_exp.formats.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.formats.run_result import CRITERIA
 
-from .checkpoint import LINKS, check, kept_checkpoints, read_policy
+from .checkpoint import check, read_policy
 from .evaluator import Evaluator
 from .result import HELD_OUT, USUAL, Evaluation, Group, Metric, Rank
 from .run import StoredRun

@@ -9,6 +9,7 @@ from deepracer_exp.errors import BadInput
 from .whole_file import write_whole
 
 HASHES = "hashes.json"
+LINKS = ("best", "last")
 _PINNED = "pinned.json"
 
 
@@ -32,6 +33,40 @@ def verify(folder: Path) -> None:
     if found != wanted:
         changed = sorted(set(found.items()) ^ set(wanted.items()))
         raise BadInput(f"{folder}: torn: {changed[0][0]} is not as it was written")
+
+
+def find_checkpoint(folder: Path, name: str) -> Path:
+    """Return the folder of a checkpoint, or the link to it; a `last` that is missing has others in its place.
+
+    Args:
+        folder: `checkpoints/` of a run.
+        name: `best`, `last` or the number of an iteration.
+
+    Raises:
+        BadInput: there is no such checkpoint, or it lies elsewhere.
+    """
+    path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
+    kept = kept_checkpoints(folder)
+    if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
+        known = ", ".join(
+            [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
+        )
+        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known or 'none'}")
+    if path.exists() and path.resolve().parent != folder.resolve():
+        raise BadInput(
+            f"checkpoint={name}: {path} leads out of its folder to {path.resolve()}; give a number"
+        )
+    return path
+
+
+def kept_checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run, not the links to them, newest first."""
+    if not folder.is_dir():
+        return []
+    own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
+    # `best` is a folder of its own where links were followed as the run was copied.
+    known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
+    return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
 
 
 def checkpoint_sha256(folder: Path) -> str:

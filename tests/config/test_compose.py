@@ -352,8 +352,8 @@ def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
         ("friction_scale: [0.3, wet]", ["randomization=mine", "friction_scale", "wet"]),
         ("friction: [0.3, 0.4]", ["randomization=mine", "friction", "no such key"]),
         ("friction_scale: ${car.nothing}", ["randomization=mine", "car.nothing"]),
-        ("x: [1", ["randomization=mine", "mine.yaml"]),
-        ("a: &a [*a]", ["randomization=mine"]),
+        ("x: [1", ["randomization/mine.yaml"]),
+        ("a: &a [*a]", ["randomization/mine.yaml"]),
     ],
 )
 def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, monkeypatch):

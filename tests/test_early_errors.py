@@ -1,0 +1,124 @@
+"""What is wrong with a command line is said at once, and in one line."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from deepracer_exp.config.options import groups, options
+
+HEAVY = ("torch", "mujoco", "mlflow", "optuna", "pandas")
+CASES = {
+    ("tarin",): "did you mean train?",
+    ("train", "--fats"): "unrecognized arguments: --fats",
+    ("train", "seed=now"): "seed",
+    ("train", "track=../../x"): "track=../../x",
+    ("train", "reward.file=pipe"): "pipe: is a pipe",
+    ("train", "track.file=nothing.npy"): "nothing.npy",
+    ("train", "action_space.file=pipe"): "pipe: is a pipe",
+    ("train", "custom_files=nowhere"): "nowhere",
+    ("train", "evaluation.tracks=[../x]"): "evaluation.tracks=../x",
+    ("train", "evaluation.held_out=../x"): "evaluation.held_out=../x",
+    ("train", "-m", "seed=range(1,1000000)"): "more than 1,000 runs",
+    ("train", "-m", "seed=range(0,5,0)"): "range(0,5,0)",
+    ("train", "--options", "trak"): "did you mean track?",
+    ("import", "nowhere", "--name", "mine"): "nowhere",
+    ("validate", "reward.file=nothing.py"): "nothing.py",
+    ("validate", "reward=racing"): "reward=racing",
+    ("evaluate", "run=nobody"): "run=nobody",
+    ("evaluate", "run=runs/a/run", "checkpoint=120"): "checkpoint=120",
+    ("evaluate", "run=runs/a/run", "evaluation=sumit"): "did you mean summit?",
+    ("resume", "nobody"): "run=nobody",
+    ("resume", "~no_such_user"): "~no_such_user",
+    ("resume", "a" * 300): "File name too long",
+    ("resume", "runs/a/run", "budget.stepz=1"): "budget.stepz",
+    ("clone", "run=nobody"): "run=nobody",
+    ("clone", "run=runs/a/run", "checkpoint=120"): "checkpoint=120",
+    ("checkpoints", "nobody"): "run=nobody",
+    ("checkpoints", "runs/a/run"): "checkpoints",
+    ("compare", "nobody", "none"): "run=nobody",
+    ("lineage", "nobody"): "run=nobody",
+    ("promote", "nobody"): "run=nobody",
+    ("promote", "nobody", "--checkpoint", "../x"): "--checkpoint",
+    ("export", "run=nobody", "format=onnx"): "run=nobody",
+    ("export", "run=runs/a/run", "format=onnx"): "checkpoint",
+    ("export", "run=runs/a/run", "format=onx"): "format",
+    ("analyze", "nobody"): "nobody",
+    ("analyze", "pipe"): "pipe: is a pipe",
+    ("analyze", "log.txt", "--reward", "nothing.py"): "nothing.py",
+    ("analyze", "log.txt", "--target", "soon"): "--target soon",
+    ("analyze", "log.txt", "--out", "nowhere/page.html"): "--out nowhere",
+    ("stopping", "replay", "nobody"): "run=nobody",
+    ("tracks", "nowhere"): "nowhere",
+    ("sweep", "algorithm.lr=1e-4,1e-3", "sweep.workers=100000"): "sweep.workers=100000",
+    ("sweep", "track=../x,Oval_track"): "track=../x",
+    ("sweep", "algorithm.lr=1e-4,1e-3", "reward.file=nothing.py"): "nothing.py",
+    ("sweep", "algorithm.lr=1e-4,1e-3", "sweep.protocol=../x", "--cfg"): "sweep.protocol=../x",
+    ("sweep", "study=../x", "algorithm.lr=1e-4,1e-3", "--cfg"): "study",
+    ("sweep", "best", "nobody"): "sweeps.db",
+    ("sweep", "best", "../x"): "../x",
+    ("ui", "--port", "http"): "--port",
+    ("clean", "--runs-dir", "nowhere"): "nowhere",
+}
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory, call_at):
+    """Call all of them in one fresh process; by its words what each said, its code, and what it imported."""
+    folder = tmp_path_factory.mktemp("early")
+    os.mkfifo(folder / "pipe")
+    (folder / "log.txt").write_text("nothing\n")
+    run = folder / "runs" / "a" / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.yaml").write_text(call_at(folder, "train", "name=a", "--cfg").stdout)
+    code = f"""
+import contextlib, io, json, sys
+from deepracer_exp.cli import main
+known = set()
+for words in {list(CASES)!r}:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            main(words)
+    except SystemExit as ended:
+        heavy = {{name for name in {HEAVY!r} if name in sys.modules}}
+        print(json.dumps([words, ended.code, said.getvalue(), sorted(heavy - known)]), flush=True)
+        known |= heavy
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    return {tuple(words): (code, said, heavy) for words, code, said, heavy in lines}
+
+
+@pytest.mark.parametrize("words", CASES, ids=" ".join)
+def test_what_is_wrong_is_said_in_one_line_before_anything_heavy_is_imported(refused, words):
+    code, said, heavy = refused[words]
+    assert code == 2, said
+    assert CASES[words] in said
+    assert said.startswith("deepracer-exp: ")
+    assert said.count("\n") == 1
+    assert not heavy
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("reward=my_reward.py", "reward.file=my_reward.py"),
+        ("track=routes/my.npy", "track.file=routes/my.npy"),
+        ("action_space=model_metadata.json", "action_space.file=model_metadata.json"),
+    ],
+)
+def test_a_file_in_the_place_of_an_option_is_told_where_it_belongs(call, given, meant):
+    call("train", given).assert_bad_input(f"did you mean {meant}?")
+
+
+def test_each_option_is_listed_with_what_it_is_for(call):
+    for group in groups():
+        lines = call("train", "--options", group).stdout.splitlines()
+        assert [line.split()[0] for line in lines] == options(group)
+    assert "only the budget ends the run" in call("train", "--options", "stopping").stdout.lower()
