@@ -319,12 +319,12 @@ def _evaluate(args: argparse.Namespace) -> int:
         return 0
     config, _ = compose_evaluation(args.overrides)
     args.debug = config.debug
-    check_run(config.run, config.runs_dir, config.tracking_uri, config.checkpoint)
     if args.video is not None:
         # MuJoCo looks at this once, when it is imported.
         from deepracer_exp.evaluation.graphics import choose_graphics
 
         choose_graphics()
+    check_run(config.run, config.runs_dir, config.tracking_uri, config.checkpoint)
 
     from rich.console import Console
 

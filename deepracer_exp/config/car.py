@@ -56,7 +56,7 @@ class CarConfig:
     min_speed_mps: NonNegative
     max_speed_mps: Positive
 
-    control_hz: Positive
+    control_hz: Annotated[float, Field(ge=1, le=1000)]
     substeps: UpTo100
     integrator: Literal["euler", "implicitfast", "discrete"]
     solver: Literal["newton", "cg"]

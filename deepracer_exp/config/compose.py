@@ -389,6 +389,10 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
         siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
         return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
     value = finding.get("input")
+    if finding["type"] == "union_tag_invalid":
+        context = finding["ctx"]
+        kind = context["discriminator"].strip("'")
+        return f"{key}.{kind}={context['tag']}: no such {kind}; accepted: {context['expected_tags']}{more}"
     if finding["type"] == "value_error":
         # A dataclass whose values contradict each other names them itself.
         at = key if isinstance(value, dict) else f"{key}={_short(value)}"

@@ -7,8 +7,8 @@ from pydantic import Field
 
 from .bounds import Fraction, NonNegative, Positive, UpTo1000
 
-# 16 layers of so many fit into 4 GB with their optimizer.
-Units = Annotated[int, Field(ge=1, le=4096)]
+# Eight layers of so many take seconds to begin with; of twice as many, minutes.
+Units = Annotated[int, Field(ge=1, le=2048)]
 Steps = Annotated[int, Field(ge=1, le=10**7)]
 By = Literal["iteration", "fraction"]
 """Unit of a schedule's lengths: training iterations, or fractions of the budget (0 to 1)."""
@@ -18,7 +18,7 @@ By = Literal["iteration", "fraction"]
 class NetworkConfig:
     """A multi-layer perceptron for policy and value."""
 
-    hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=16)]
+    hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)]
     """Units of each hidden layer."""
     activation: Literal["tanh", "relu", "elu", "silu"]
     shared_trunk: bool

@@ -16,7 +16,7 @@ class CollectorConfig:
     """Cars in this process; in several, all waited for; in several, whichever is ready; as sync, on a Ray cluster."""
     processes: UpTo1000 | None
     """Worker processes; null: one per core, which `ray` does not know."""
-    cars: Annotated[int, Field(ge=1, le=100_000)]
+    cars: Annotated[int, Field(ge=1, le=10_000)]
     """Cars per process, stepped together."""
     threads: Annotated[int, Field(ge=0, le=1024)]
     """Physics threads per process (0: in_process one per core, else one)."""

@@ -261,6 +261,8 @@ class CarBatch:
         data = mujoco.MjData(self.model)
         mujoco.mj_step(self.model, data, nstep=_SETTLE_PERIODS * self.car.substeps)
         pose = data.qpos.copy()
+        if not np.isfinite(pose).all():
+            raise ValueError("its physics state is not finite at rest")
         # Height and pitch are what settling finds; the rest is zero up to rounding.
         pose[:2] = 0.0
         pose[4] = pose[6] = 0.0

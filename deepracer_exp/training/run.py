@@ -17,11 +17,12 @@ from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.errors import BadInput, RunFailed, reading
 from deepracer_exp.evaluation.checkpoint import intact_checkpoint
 from deepracer_exp.formats.checkpoint_files import kept_checkpoints
 from deepracer_exp.formats.lineage_file import LINEAGE, Lineage, read_lineage
 from deepracer_exp.formats.run_files import read_config, read_object
+from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.names import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.recorder import Tracker, open_tracker
@@ -106,6 +107,8 @@ def read_files(experiment: Experiment) -> RaceSetup:
     """
     setup = build_setup(experiment)
     RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
+    with reading(f"car {experiment.car.name}", "dimensions, masses and settings of a car that can stand"):
+        CarBatch(setup.car, 1, 1)
     check_collector(experiment.collector)
     return setup
 

@@ -19,7 +19,7 @@ from deepracer_exp.agents.schedules import Schedule
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.formats.trace import TraceWriter, to_table
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.names import END_TAG
@@ -114,9 +114,10 @@ class Training:
         # update took 25 times as long.
         torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
-        self.networks = build_actor_critic(
-            experiment.network, len(feature_names(experiment.observation)), setup.actions.n, generator
-        )
+        with reading(f"network.hidden={list(experiment.network.hidden)}", "a network that fits into memory"):
+            self.networks = build_actor_critic(
+                experiment.network, len(feature_names(experiment.observation)), setup.actions.n, generator
+            )
         self.agent = PPO(
             self.networks, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed
         )
