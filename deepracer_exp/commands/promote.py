@@ -38,7 +38,6 @@ def _promote(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import typed
     from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.evaluation import checkpoint_name
-    from deepracer_exp.env.observation import feature_names
     from deepracer_exp.errors import BadInput
     from deepracer_exp.evaluation.references import resolve
     from deepracer_exp.formats.run_files import read_config
@@ -53,6 +52,9 @@ def _promote(args: argparse.Namespace) -> int:
         raise BadInput(f"--checkpoint {args.checkpoint}: {error}") from None
     runs_dir = Path(args.runs_dir)
     run = resolve(args.run, runs_dir, args.tracking_uri)
+
+    from deepracer_exp.env.observation import feature_names
+
     observation = typed(read_config(run.path).get("observation", {}), ObservationConfig)
     registered = promote(
         run.path,
