@@ -19,7 +19,6 @@ from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed, reading
 from deepracer_exp.evaluation.checkpoint import intact_checkpoint
-from deepracer_exp.formats.checkpoint_files import kept_checkpoints
 from deepracer_exp.formats.lineage_file import LINEAGE, Lineage, read_lineage
 from deepracer_exp.formats.run_files import read_config, read_object
 from deepracer_exp.sim.batch import CarBatch
