@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from deepracer_exp import __version__
-from deepracer_exp.config.options import groups, options
+from deepracer_exp.config.options import groups
 from deepracer_exp.formats.worlds import leaders, worlds
 
 HEAVY = (

@@ -20,13 +20,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput, nearest, reading
+from deepracer_exp.formats.worlds import find_world
 
 from . import (
     custom_files,
     option_files,  # noqa: F401 - how Hydra reads them
 )
-from deepracer_exp.formats.worlds import find_world
-
 from .contradictions import check_together
 from .custom_files import Beneath, beneath, read_custom_files
 from .dimension import length
