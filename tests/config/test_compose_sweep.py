@@ -6,6 +6,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepracer_exp.addresses import with_password
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.dimension import Choices, Range, as_override, dimension, value_of
 from deepracer_exp.config.options import conf_dir, options
@@ -71,7 +72,7 @@ def test_overrides_are_of_the_sweep_of_every_trial_or_searched():
     )
     entry = request.entry
     assert (entry.study, entry.parent, entry.debug, entry.sweep.trials) == ("mine", "best:a b", True, 7)
-    assert request.base == ("collector=in_process", "track=Oval_track")
+    assert request.base == ("track=Oval_track",)
     assert request.space == {
         "algorithm.lr": "tag(log, interval(1e-5, 1e-3))",
         "network": "mlp,mlp_deep",
@@ -86,7 +87,9 @@ def test_a_study_is_named_after_the_ready_made_sweep_unless_it_has_a_name():
 
 def test_the_address_of_a_database_needs_no_quotes():
     address = "postgresql+psycopg://racer:p,w=(1)@host:5432/db?sslmode=require&x=1"
-    assert compose_sweep([f"sweep.storage={address}"]).entry.sweep.storage == address
+    stored = compose_sweep([f"sweep.storage={address}"]).entry.sweep.storage
+    assert stored == address.replace(":p,w=(1)", "")
+    assert with_password(stored) == address
 
 
 def test_the_command_line_takes_the_place_of_what_a_ready_made_sweep_searches():
@@ -109,7 +112,7 @@ def test_the_last_of_two_overrides_counts_whether_it_fixes_or_searches():
     assert compose_sweep(["algorithm.lr=0.1,0.2", "algorithm.lr=0.3"]).space == {}
     request = compose_sweep(["algorithm.lr=0.3", "+algorithm.lr=0.1,0.2"])
     assert request.space == {"algorithm.lr": "0.1,0.2"}
-    assert request.base == ("collector=in_process",)
+    assert request.base == ()
 
 
 def test_a_key_is_left_out_of_the_search_by_a_tilde():

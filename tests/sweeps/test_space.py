@@ -13,7 +13,6 @@ from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput
 from sweeps.space import SearchSpace
 
-BASE = "collector=in_process"
 GRIDS = ("action_space=discrete,grid", "action_space.speed_levels=2,3", "algorithm.lr=interval(0.001,0.01)")
 
 
@@ -70,7 +69,7 @@ def test_a_trial_trains_with_the_drawn_values_to_the_last_digit():
     overrides = searched.suggest(FixedTrial({"algorithm.lr": lr, "reward.constants.EDGE_COST": cost}))
     experiment, _ = compose_experiment(overrides)
     assert (experiment.algorithm.lr, experiment.reward.constants["EDGE_COST"]) == (lr, cost)
-    assert (experiment.seed, experiment.collector.mode) == (7, "in_process")
+    assert experiment.seed == 7
 
 
 def test_a_space_can_be_sent_to_another_process():
@@ -85,7 +84,7 @@ def test_a_key_of_a_searched_group_counts_only_with_the_options_that_have_it():
     values = {"action_space.speed_levels": 3, "algorithm.lr": 0.002}
     without = searched.suggest(FixedTrial({"action_space": "discrete", **values}))
     having = searched.suggest(FixedTrial({"action_space": "grid", **values}))
-    assert without == [BASE, "action_space=discrete", "algorithm.lr=0.002"]
+    assert without == ["action_space=discrete", "algorithm.lr=0.002"]
     assert set(having) - set(without) == {"action_space=grid", "action_space.speed_levels=3"}
 
 
@@ -170,15 +169,14 @@ def test_values_are_tried_as_the_given_check_does():
 
     def check(overrides):
         tried.append(overrides)
-        changed = with_overrides(composition.mapping, composition.choices, overrides[1:]).mapping
+        changed = with_overrides(composition.mapping, composition.choices, overrides).mapping
         if changed["network"] != composition.mapping["network"]:
             raise BadInput("network: cannot be changed in a clone")
         return changed
 
     lines = ["action_space.steering_levels=3,5", "algorithm.lr=interval(1e-5,1e-4)", "parent=x"]
     SearchSpace.from_request(compose_sweep(lines), check)
-    assert [BASE, "algorithm.lr=1e-05"] in tried
-    assert all(overrides[0] == BASE for overrides in tried)
+    assert ["algorithm.lr=1e-05"] in tried
     with pytest.raises(BadInput, match=r"\[8,8\].*cannot be changed in a clone"):
         SearchSpace.from_request(compose_sweep(["network.hidden=choice([8,8],[9,9])"]), check)
     with pytest.raises(BadInput, match="no such key"):
