@@ -109,7 +109,7 @@ def headline(view: LogView) -> str:
             laps = int(view.iterations["complete"].sum())
             best_s = view.iterations["lap_time_best_s"].min()
     else:
-        races = count(view.episodes["stream"].nunique(), "evaluation or race")
+        races = count(view.episodes["stream"].nunique(), "race")
         sentence = f"No training; {count(len(view.steps), 'control step')} in {finished} of {races}"
     if not laps:
         return f"{sentence}; no complete lap."

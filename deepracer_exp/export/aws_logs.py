@@ -209,7 +209,7 @@ class _Head:
 
 def _trainer_log(head: _Head, numbered: _Numbered, updates: pd.DataFrame) -> str:
     """Return what the trainer would have told: the end of each episode, and of each update the mean of its epochs."""
-    lines = [head.text().rstrip("\n")]
+    lines = [head.text().rstrip("\n"), _saved(0, 0)]
     driven = 0
     by_iteration = dict(iter(numbered.episodes.groupby("iteration", sort=False)))
     told = {int(row["iteration"]) - numbered.first_iteration: row for row in updates.to_dict("records")}
@@ -224,10 +224,13 @@ def _trainer_log(head: _Head, numbered: _Numbered, updates: pd.DataFrame) -> str
                 f"Policy training> Surrogate loss={row['policy_loss']}, KL divergence={row['kl']}, "
                 f"Entropy={row['entropy']}, training epoch=0, learning_rate={row['lr']}"
             )
-            lines.append(
-                f"Checkpoint> Saving in path=['./checkpoint/agent/{iteration + 1}_Step-{driven}.ckpt']"
-            )
+            lines.append(_saved(iteration + 1, driven))
     return "\n".join(lines) + "\n"
+
+
+def _saved(number: int, driven: int) -> str:
+    """Return the line of a checkpoint; the one before any driving is 0, and drives the first iteration."""
+    return f"Checkpoint> Saving in path=['./checkpoint/agent/{number}_Step-{driven}.ckpt']"
 
 
 def _episode_line(episode: Any, driven: int, reward: float) -> str:

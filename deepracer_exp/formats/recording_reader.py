@@ -178,12 +178,13 @@ class _Assembly:
         for other in self.drives:
             same = rows_also_in(mine, other)
             if same.any():
+                if left.all():  # of copies the first stays
+                    self.roots[number] = other.place.root
+                    if place.kind == TRAINING:
+                        self.jobs[job] = other.place.root
                 left &= ~same
                 other.world = log.world or other.world
                 other.names.append(place.name)
-                self.roots[number] = other.place.root
-                if place.kind == TRAINING:
-                    self.jobs[job] = other.place.root
         if left.all():
             mine.world = mine.world or self.parts.worlds.get(place.kind, "")
             self.drives.append(mine)

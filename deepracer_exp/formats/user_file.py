@@ -109,7 +109,7 @@ def read_yaml(
     with reading(f"{path}: not YAML", accepted):
         text = raw.decode("utf-8-sig")
         _check_structure(text)
-        return yaml.load(text, _LOADER) if load is None else load(text)
+        return _LOADER(text).get_single_data() if load is None else load(text)
 
 
 def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> None:

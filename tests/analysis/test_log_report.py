@@ -187,7 +187,8 @@ def test_a_log_with_little_in_it_has_a_page(drives, tmp_path):
 def test_evaluations_alone_have_a_page(tmp_path):
     recording = made_up_recording([], evaluations={"race": [Drive(speed_mps=1.5), Drive(speed_mps=1.6)]})
     text = Html(write_report(recording, tmp_path / "page.html").read_text()).text
-    assert "No training steps" in text
+    assert "No training;" in text
+    assert "2 episodes" in text
 
 
 def test_a_course_that_nobody_knows_has_a_page_without_maps(tmp_path):

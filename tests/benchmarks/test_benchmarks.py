@@ -95,6 +95,7 @@ def test_the_peer_trains_on_as_many_frames_as_the_experiment_has(experiment: Exp
     assert result["steps_per_s"] > 0
 
 
+@pytest.mark.slow
 def test_time_to_lap_writes_its_figures_for_each_seed(tmp_path: Path) -> None:
     file = tmp_path / "lap.json"
     time_to_lap.main(["--seeds", "1", "--json", str(file), *SHORTEST])

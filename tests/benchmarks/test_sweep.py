@@ -169,6 +169,7 @@ def test_a_whole_run_tells_what_the_sweep_would_report_at_each_evaluation(
     assert (found.number, found.env_steps, found.fate, found.value) == (3, 5 * 1024, "finished", 12.5)
 
 
+@pytest.mark.slow
 def test_a_trial_that_was_ended_before_its_time_uses_its_budget_up_in_a_copy(
     trained: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -104,7 +104,7 @@ def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not
         (["RUN", "--target", "nan"], ["--target nan", "accepted"]),
         (
             ["RUN", "--out", "no/such/folder/page.html"],
-            ["--out no/such/folder/page.html", "cannot be written"],
+            ["--out no/such/folder/page.html", "its folder is not there"],
         ),
         (["RUN", "--reward", "racing_lime"], ["racing_lime"]),
         (["RUN", "--reward", "missing.py"], ["missing.py"]),

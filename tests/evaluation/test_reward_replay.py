@@ -265,5 +265,5 @@ def test_an_unknown_reward_is_refused(own):
         BadInput, match=r"'progres_gain' is not in the reward zoo \(did you mean progress_gain\?\)"
     ):
         replay_reward(own, "progres_gain")
-    with pytest.raises(BadInput, match=r"'nowhere.py' cannot be read"):
+    with pytest.raises(BadInput, match=r"nowhere.py: cannot be read"):
         replay_reward(own, "nowhere.py")

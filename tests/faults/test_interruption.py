@@ -59,6 +59,7 @@ def test_an_interruption_before_the_run_has_a_folder_is_told_by_the_exit_code(st
     training.assert_nothing_left()
 
 
+@pytest.mark.slow
 def test_a_second_interruption_ends_at_once(start_training, tmp_path):
     """The iteration would go on for minutes: cars that sleep."""
     (tmp_path / "slow.py").write_text(

@@ -12,6 +12,7 @@ from mlflow import MlflowClient
 from deepracer_exp.tracking.names import metric_name
 
 
+@pytest.mark.slow
 def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
     kills = 5
     uri = f"sqlite:///{tmp_path}/mlflow.db"

@@ -181,6 +181,7 @@ def test_the_cars_of_a_killed_worker_are_gone_with_it(sweep):
     assert not left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", TIMES)
 def test_after_kill_9_of_everything_the_study_goes_on(sweep, tmp_path, seed):
     running = sweep("sweep.workers=2", at_random=random.Random(seed))
@@ -191,6 +192,7 @@ def test_after_kill_9_of_everything_the_study_goes_on(sweep, tmp_path, seed):
     assert_every_trial_is_accounted_for_once(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", TIMES)
 def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_nor_into_the_run(
     sweep, tmp_path, seed
@@ -224,6 +226,7 @@ def pid_of(slot):
     return int(slot.owner.rsplit(":", 2)[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", TIMES)
 def test_two_drivers_share_one_study(sweep, tmp_path, seed):
     both = [sweep("sweep.workers=1"), sweep("sweep.workers=1")]
@@ -232,6 +235,7 @@ def test_two_drivers_share_one_study(sweep, tmp_path, seed):
     assert_every_trial_is_accounted_for_once(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", TIMES)
 def test_while_the_database_is_away_everybody_waits_and_then_goes_on(sweep, tmp_path, postgres, seed):
     moment, url = random.Random(seed), postgres.new_database()

@@ -60,6 +60,7 @@ def recorded(tmp_path) -> int:
     return sum(file.read_bytes().count(b"\n") for file in (tmp_path / "cut").glob("tiny/*/metrics.jsonl"))
 
 
+@pytest.mark.slow
 def test_a_killed_run_that_is_resumed_is_the_run_that_was_not_killed(start, tmp_path):
     killed_after(start, (*RUN, "runs_dir=cut"), lambda: recorded(tmp_path) >= 6)
     folder = folder_of(tmp_path, "cut")

@@ -158,6 +158,7 @@ def test_a_reward_that_raises_in_a_worker_ends_the_run_with_the_workers_own_word
     training.assert_nothing_left()
 
 
+@pytest.mark.slow
 def test_a_reward_that_swallows_its_time_limit_is_ended_by_the_watchdog(start_training, tmp_path):
     path = tmp_path / "deaf.py"
     path.write_text(SWALLOWS_EVERYTHING)

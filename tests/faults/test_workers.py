@@ -29,6 +29,7 @@ def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
     assert ended.summary["iteration"] == len(ended.metrics) >= 2
 
 
+@pytest.mark.slow
 @MODES
 def test_a_worker_that_stops_is_ended_and_named(start_training, mode):
     training = start_training(f"collector={mode}", "collector.hang_timeout_s=2", "reward.time_limit_s=0.5")

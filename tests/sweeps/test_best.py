@@ -99,7 +99,8 @@ def test_best_of_a_study_leads_to_the_run_of_its_best_trial(tmp_path):
     # Something faster, trained by hand under the same name, was never compared with the trials.
     (folder / "by-hand" / "checkpoints" / "best").mkdir(parents=True)
     (folder / "by-hand" / "config.yaml").write_text("name: lr_entropy\n")
-    summary = {"best": {"metric": "x", "rank": [1, 1], "eval_completion": 100.0, "eval_lap_time_s": 1.0}}
+    best = {"iteration": 1, "metric": "x", "rank": [1, 1], "eval_completion": 100.0, "eval_lap_time_s": 1.0}
+    summary = {"best": best}
     (folder / "by-hand" / "summary.json").write_text(json.dumps(summary))
     assert resolve("best:lr_entropy", tmp_path, None).path == folder / "by-hand"
     write_best(study, tmp_path)

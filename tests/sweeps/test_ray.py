@@ -143,6 +143,7 @@ def known(cwd):
     return (cwd / "runs" / "sweeps.db").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_nodes")
 def test_cars_on_a_cluster_drive_as_those_of_processes_on_one_machine(run_at, call, tmp_path):
     folders = []

@@ -97,6 +97,7 @@ def test_a_trial_is_a_run_like_any_other(swept, call, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_made_again(swept, run_at):
     before = {path: path.stat().st_mtime_ns for path in swept.cwd.glob("runs/s/*/summary.json")}
     ended = run_at(swept.cwd, "sweep", "study=s")
@@ -144,6 +145,7 @@ def test_a_misspelt_study_is_not_begun(swept, call_at):
     assert "did you mean s?" in ended.complaint
 
 
+@pytest.mark.slow
 def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_path):
     (tmp_path / "broken.py").write_text(
         "def reward_function(params):\n    return 1 / (params['steps'] < 5)\n"

@@ -166,7 +166,7 @@ def test_a_last_line_cut_off_by_a_kill_is_left_out(make_run):
     [
         ("metrics.jsonl", '{"iteration": 1}\n{"iter\n{"iteration": 3}\n', "line 2: is not valid JSON"),
         ("metrics.jsonl", "[1]\n", "is no JSON object"),
-        ("config.yaml", "a: [", "is not valid YAML"),
+        ("config.yaml", "a: [", "not YAML"),
         ("config.yaml", "", "holds no values"),
         ("summary.json", "{", "is not valid JSON"),
     ],
