@@ -49,13 +49,11 @@ def find_checkpoint(folder: Path, name: str) -> Path:
         raise BadInput(f"checkpoint={name}: a checkpoint is best, last or the number of an iteration")
     path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
     kept = kept_checkpoints(folder)
-    if not kept:
-        raise BadInput(f"{folder}: holds no checkpoint")
-    if not (path.exists() or path.is_symlink() or name == "last"):
+    if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
         known = ", ".join(
             [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
         )
-        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known}")
+        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known or 'none'}")
     if path.exists() and path.resolve().parent != folder.resolve():
         raise BadInput(
             f"checkpoint={name}: {path} leads out of its folder to {path.resolve()}; give a number"

@@ -126,4 +126,4 @@ def test_a_picture_of_an_unknown_kind_is_refused_before_anybody_drives(call):
 
 def test_a_run_without_checkpoints_is_refused(run_dir, call):
     shutil.rmtree(run_dir / "checkpoints")
-    assert "holds no checkpoint" in call("checkpoints", run_dir.name).complaint
+    assert "checkpoints: none" in call("checkpoints", run_dir.name).complaint
