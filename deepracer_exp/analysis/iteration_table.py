@@ -24,7 +24,7 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "policy_loss": "surrogate loss",
     "value_loss": "mean squared or Huber, as the training has it",
     "lr": "learning rate",
-    "checkpoint": "the service's name of the checkpoint that drove it; empty where not told",
+    "checkpoint": "the service's name of the checkpoint that drove it; empty where the log does not name it",
     "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
 }

@@ -35,6 +35,13 @@ ALL = (
 )
 
 
+PAID = (
+    charts_of_episodes.reward_distribution,
+    charts_of_episodes.common_rewards,
+    charts_of_episodes.discount_factors,
+)
+
+
 @pytest.fixture(scope="module")
 def view() -> LogView:
     drives = [
@@ -85,10 +92,9 @@ def test_a_training_of_one_short_episode_breaks_no_figure(figure: Callable[[LogV
 @pytest.mark.parametrize("figure", ALL)
 def test_a_race_without_a_training_breaks_no_figure(figure: Callable[[LogView], Chart | None]) -> None:
     chart = figure(prepare(made_up_recording([], evaluations={"race": [Drive()]})))
-    if figure in (evaluations, lap_time_histogram):
-        assert chart is not None
-    if figure in (training_progress, learning_vs_lap_time, quarters, lap_time_percentile):
-        assert chart is None  # it is of iterations, which a race has none of
+    # The others are of iterations, which a race has none of.
+    of_drives = (evaluations, stability, lap_time_histogram, *PAID)
+    assert (chart is not None) == (figure in of_drives)
     if chart is not None:
         chart_plotly.draw(chart)
         chart_matplotlib.draw(chart)
