@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RACER := $(VENV)/.installed-racer
 STAMP := $(VENV)/.installed
+DOCS := $(VENV)/.installed-docs
 
 # uv reads no settings of pip's: where packages come from, and whose certificates are trusted.
 ifdef PIP_INDEX_URL
@@ -21,7 +22,7 @@ endif
 INSTALL = $(BIN)/uv pip install --python $(BIN)/python --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help env race test test-long test-faults check bench clean
+.PHONY: help env race test test-long test-faults check bench docs clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -64,5 +65,14 @@ bench: $(STAMP)  ## re-measure what the README claims
 	@$(BIN)/python -m benchmarks.throughput
 	@$(BIN)/python -m benchmarks.time_to_lap --seeds 3
 
+$(DOCS): $(RACER)
+	@echo "installing the generator of the documentation site"
+	@$(INSTALL) --editable '.[docs]'
+	@touch $@
+
+docs: $(DOCS)  ## build the documentation site in site/ and check its links
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "site/index.html"
+
 clean:  ## remove the environment and what was built
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist site *.egg-info

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.courses import build_courses
+from deepracer_exp.env.setup import build_courses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 

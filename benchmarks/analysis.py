@@ -13,7 +13,7 @@ and settings. deepracer-utils reads the training with the one call that its docu
 harder comparison, with its quickest way to all drives: training and evaluations from the CSVs, races from the logs.
 
 With `--long-gb` also a report of a text log of so many gigabytes, the longest log of the folder again and again:
-`long_s`, `long_peak_gb`, `long_steps` in the log. Of it the last steps are held (formats/step_tables.py).
+`long_s`, `long_peak_gb`, `long_steps` in the log. Of it the last steps are held (deepracer/sim_trace.py).
 
 Wanted: at most 20 s and 1.5 GB on two cores for the 44,247 steps of the console training, `read_ratio` at least 1.
 """
@@ -29,8 +29,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording_reader import read_recording
 
 from .command import command_line
 from .long_log import write_long_log
@@ -48,7 +48,7 @@ def report(path: Path, page: Path) -> tuple[float, float]:
     Raises:
         SystemExit: the command did not end with exit code 0.
     """
-    line = command_line("analyze", str(path), "--out", str(page))
+    line = command_line("analyze", str(path), "--output", str(page))
     began = time.perf_counter()
     child = os.posix_spawn(
         line[0], line, os.environ, file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]

@@ -1,4 +1,4 @@
-"""Write the catalogue's data file, `deepracer_exp/formats/worlds.zip`, from the service's route files.
+"""Write the catalogue's data file, `deepracer_exp/deepracer/worlds.zip`, from the service's route files.
 
     git clone https://github.com/aws-deepracer-community/deepracer-simapp
     git -C deepracer-simapp checkout 01f5f015fd85
@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from deepracer_exp.formats.routes import is_first_of_equals, read_route
-from deepracer_exp.formats.worlds import FILE, INDEX, ROUTES, UNITS_PER_M, World
+from deepracer_exp.deepracer.routes import is_first_of_equals, read_route
+from deepracer_exp.deepracer.worlds import FILE, INDEX, ROUTES, UNITS_PER_M, World
 
 SOURCE = "https://github.com/aws-deepracer-community/deepracer-simapp, bundle/routes, commit 01f5f015fd85"
 LICENCE = "Apache-2.0, Copyright Amazon.com, Inc. or its affiliates"

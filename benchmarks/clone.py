@@ -4,7 +4,7 @@
 
 For each seed `deepracer-exp train` runs the default experiment for `--steps` control steps, whatever a stopping rule
 would say, so that all parents are of the same age. Its best checkpoint is then cloned twice, each time with a fresh
-optimizer, for `--more` steps: by `deepracer-exp clone run=RUN`, which lowers the learning rate to a tenth, and with
+optimizer, for `--more` steps: by `deepracer-exp clone RUN`, which lowers the learning rate to a tenth, and with
 algorithm.lr as it was. The best checkpoint of each of the three drives 64 laps on usual and 64 on held-out conditions,
 with starts and draws that no evaluation of the training had.
 
@@ -38,7 +38,7 @@ def train_family(folder: Path, seed: int, steps: int, more: int, overrides: Sequ
     folder.mkdir()
     always = ("stopping=none", "tracking=off")
     parent = train([*overrides, *always, f"budget.env_steps={steps}", f"seed={seed}"], folder)
-    cloned = [f"run={parent}", f"budget.env_steps={more}"]
+    cloned = [str(parent), f"budget.env_steps={more}"]
     return {
         "parent": parent,
         "tenth": train(cloned, folder, "clone"),

@@ -14,8 +14,8 @@ from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.env.reward_source import load_reward_source, source_with_constants
 from deepracer_exp.env.setup import RaceSetup, build_setup
+from deepracer_exp.rewards.source import load_reward_source, source_with_constants
 
 PASS_STEPS = 150
 """Control steps of one pass: 10 s, several episodes of random driving."""

@@ -15,14 +15,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from benchmarks.calibrate import FIT_STEPS, REPORT_STEPS, car_named, held_out
+from benchmarks.replay import Windows, cut_windows, errors, replay
 from benchmarks.report import number, table, write_json
 from benchmarks.simple_cars import bicycle, fit_formula
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.formats.recording_reader import read_recording
-from deepracer_exp.sim.calibrate import FIT_STEPS, REPORT_STEPS, car_named, held_out
-from deepracer_exp.sim.recordings import Windows, cut_windows
-from deepracer_exp.sim.replay import errors, replay
 
 Floats = NDArray[np.float64]
 WANTED_M = 0.06

@@ -12,10 +12,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from benchmarks.calibrate import FIT_STEPS, REPORT_STEPS, held_out
+from benchmarks.replay import WARM_UP_STEPS, Windows, cut_windows, replay
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.sim.calibrate import FIT_STEPS, REPORT_STEPS, held_out
-from deepracer_exp.sim.recordings import WARM_UP_STEPS, Windows, cut_windows
-from deepracer_exp.sim.replay import replay
 
 Floats = NDArray[np.float64]
 RECORDED, SIMULATED, FAINT = "#d9822b", "#2f6fb5", "#7b828c"

@@ -11,7 +11,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
-from deepracer_exp.evaluation.run import read_run
+from deepracer_exp.runs.resolve import resolve
 
 TRIALS = 64
 _SEED = 20_181_128
@@ -56,7 +56,7 @@ def drive(run: Path, checkpoints: Sequence[str], trials: int = TRIALS) -> list[D
         trials: on each of usual and held-out conditions.
     """
     torch.set_num_threads(1)
-    stored = read_run(str(run), run.parent, None)
+    stored = resolve(str(run), run.parent, None)
     evaluator = Evaluator(stored.experiment, fresh_trials(trials))
     policies = [read_checkpoint(stored.experiment, stored.checkpoints, name) for name in checkpoints]
     return [driven(evaluator(policy.networks.policy)) for policy in policies]

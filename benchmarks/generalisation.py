@@ -35,10 +35,10 @@ from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import Schedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.formats.trace import PACKED, STATUS_CODE
 
 from .command import train
 from .report import number, table, write_json

@@ -1,9 +1,9 @@
-"""What a pruner of Optuna would have done with trials whose whole course is known.
+"""What one of Optuna's pruners would have done with trials that are known to their ends.
 
-A pruner sees of a trial nothing but the values it reports and when. So the values that a whole training has reported,
-told to a study in memory step by step, make it say what it would have said while that training ran; a training that it
-ends is the beginning of the whole one. What two workers do at the same time decides which values are there to compare
-with: each of them is modelled by how long its trials take, at the pace that was measured.
+A pruner sees nothing of a trial but the values it reports and their steps. So the values of a complete training,
+reported to a study in memory step by step, give the decisions that the pruner would have made during that training; a
+pruned training is the beginning of the complete one. Which values there are to compare with depends on what the other
+workers do at the same time: each worker is modelled by how long its trials take, at the measured pace.
 """
 
 import heapq
@@ -18,17 +18,17 @@ from optuna.trial import Trial, TrialState
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """A trial that nobody prunes."""
+    """A trial without pruning."""
 
     number: int
     points: tuple[tuple[int, float], ...]
-    """(env steps, value) of each evaluation on its way."""
+    """(env steps, value) of each evaluation before its end."""
     env_steps: int
     """At its end."""
-    fate: str
+    outcome: str
     """How it ends by itself."""
     value: float | None
-    """What it is worth then; None: nothing that could win."""
+    """Its value then; None: it failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,15 +38,15 @@ class Pace:
     step_s: float
     """A control step of one worker, learning included."""
     trial_s: float
-    """What a trial takes besides."""
+    """The rest of a trial, seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ended:
-    """A trial as it came to its end."""
+    """A trial that has ended."""
 
     number: int
-    fate: str
+    outcome: str
     env_steps: int
     value: float | None
     """None: it was pruned, or failed."""
@@ -58,27 +58,27 @@ class Ended:
 def replay(
     courses: Sequence[Course],
     pruner: BasePruner,
-    fate: str,
+    outcome: str,
     *,
     pace: Pace,
     workers: int,
     direction: StudyDirection = StudyDirection.MINIMIZE,
     study_name: str = "replay",
 ) -> list[Ended]:
-    """Make the trials once more, a pruner looking on; return them in their order.
+    """Replay trials with a pruner; return them in their order.
 
     Args:
         courses: in the order in which they begin.
-        pruner: is asked after each evaluation.
-        fate: of the trials that it ends.
+        pruner: asked after each evaluation.
+        outcome: of the trials that it prunes.
         pace: of all workers.
-        workers: how many trials run at once; whichever is free first takes the next one.
+        workers: how many trials run at once; the first free one takes the next trial.
         direction: of the values.
         study_name: chooses Hyperband's brackets, with the trial's number.
     """
     study = optuna.create_study(study_name=study_name, pruner=pruner, direction=direction)
     waiting, ended = iter(courses), list[Ended]()
-    lines = [_worker(study, waiting, fate, pace, ended) for _ in range(workers)]
+    lines = [_worker(study, waiting, outcome, pace, ended) for _ in range(workers)]
     moments = [(0.0, place) for place in range(workers)]
     while moments:
         _, place = heapq.heappop(moments)
@@ -89,36 +89,36 @@ def replay(
 
 
 def _worker(
-    study: optuna.Study, waiting: Iterator[Course], fate: str, pace: Pace, ended: list[Ended]
+    study: optuna.Study, waiting: Iterator[Course], outcome: str, pace: Pace, ended: list[Ended]
 ) -> Iterator[float]:
-    """Make trial after trial; yield the moment of whatever comes next, and do it when called again."""
+    """Make trial after trial; yield the time of the next event, which happens at the next call."""
     now_s = 0.0
     for course in waiting:
-        trial, began_s, beaten_at = study.ask(), now_s, None
+        trial, began_s, pruned_at = study.ask(), now_s, None
         for step, (env_steps, value) in enumerate(course.points, 1):
             yield began_s + env_steps * pace.step_s
             trial.report(value, step)
             if trial.should_prune():
-                beaten_at = env_steps
+                pruned_at = env_steps
                 break
-        env_steps = course.env_steps if beaten_at is None else beaten_at
+        env_steps = course.env_steps if pruned_at is None else pruned_at
         now_s = began_s + env_steps * pace.step_s + pace.trial_s
         yield now_s
-        _tell(study, trial, course, beaten_at is not None)
+        _report(study, trial, course, pruned_at is not None)
         ended.append(
             Ended(
                 number=course.number,
-                fate=course.fate if beaten_at is None else fate,
+                outcome=course.outcome if pruned_at is None else outcome,
                 env_steps=env_steps,
-                value=course.value if beaten_at is None else None,
+                value=course.value if pruned_at is None else None,
                 began_s=began_s,
                 ended_s=now_s,
             )
         )
 
 
-def _tell(study: optuna.Study, trial: Trial, course: Course, beaten: bool) -> None:
-    if beaten:
+def _report(study: optuna.Study, trial: Trial, course: Course, pruned: bool) -> None:
+    if pruned:
         study.tell(trial, state=TrialState.PRUNED)
     elif course.value is None:
         study.tell(trial, state=TrialState.FAIL)
@@ -137,7 +137,7 @@ def steps_until(ended: Sequence[Ended], moment_s: float, pace: Pace) -> int:
 
 
 def found_within(ended: Sequence[Ended], env_steps: int, pace: Pace) -> list[Ended]:
-    """Return the trials that could win and had ended before all together had driven more steps than that."""
+    """Return the trials with a value that had ended before all together had driven more steps than that."""
     return [
         one for one in ended if one.value is not None and steps_until(ended, one.ended_s, pace) <= env_steps
     ]

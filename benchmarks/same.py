@@ -11,9 +11,9 @@ from typing import Any
 import pandas as pd
 from torchrl.checkpoint import Checkpoint
 
-from deepracer_exp.formats.trace import read_trace
-from deepracer_exp.tracking.names import BEST, metric_name
-from deepracer_exp.training.run import TIMES
+from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.tracking.metrics import BEST, metric_name
+from deepracer_exp.training.metrics import TIMES
 
 Row = Mapping[str, Any]
 History = Mapping[str, Sequence[tuple[int, float]]]

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
+from deepracer_exp.collectors.base import worker_count
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.gym_env import DeepRacerVectorEnv
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.training.collection import worker_count
 
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
 

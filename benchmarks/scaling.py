@@ -25,7 +25,7 @@ import sqlalchemy as sa
 from mlflow import MlflowClient
 from mlflow.entities import Metric
 
-from sweeps.ledger import Ledger
+from sweeps.claims import TrialClaims
 from sweeps.storage import Storage, open_storage
 
 from .command import command_line
@@ -38,7 +38,7 @@ _SWEEP = (
     "algorithm.lr=tag(log,interval(1e-4,1e-3))",
     "sweep.pruners=[]",
 )
-_SLOTS = (10, 100, 1000)
+_TRIALS = (10, 100, 1000)
 _CLIENTS = (1, 8, 32)
 
 
@@ -124,8 +124,8 @@ def real_sweep(args: argparse.Namespace, folder: Path, iterations: int) -> dict[
     if done.returncode:
         raise SystemExit(done.stderr)
     runs = [path.parent for path in folder.glob(f"runs/{name}/*/summary.json")]
-    slots = Ledger(storage.engine, name).slots()
-    held_s = sum(run["took_s"] for slot in slots for run in slot.runs)
+    claims = TrialClaims(storage.engine, name).all()
+    held_s = sum(run["took_s"] for claim in claims for run in claim.runs)
     return {
         "iterations": iterations,
         "seconds": took_s,
@@ -153,16 +153,16 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     relay, found = Relay(*host_and_port(args.storage, 5432)), {}
     direct = open_storage(args.storage, folder)
     storage = open_storage(through(relay, args.storage), folder)
-    for slots in _SLOTS:
+    for trials in _TRIALS:
         study = f"calls-{uuid.uuid4().hex[:8]}"
-        fill(direct, study, slots)
-        claim = Ledger(direct.engine, study).claim("bench:1:a", slots + 1, 3600)
+        fill(direct, study, trials)
+        claim = TrialClaims(direct.engine, study).claim("bench:1:a", trials + 1, 3600)
         assert claim is not None
-        far = Ledger(storage.engine, claim.study)
+        far = TrialClaims(storage.engine, study)
         calls: dict[str, Callable[[], object]] = {
             "renewal of a lease": lambda far=far, claim=claim: far.renew(claim, 3600.0, {"iteration": 1}),  # type: ignore[misc]
-            "look of the live table": lambda far=far: far.slots(),  # type: ignore[misc]
-            "claim when nothing is free": partial(far.claim, "bench:2:b", slots + 1, 3600),
+            "look of the live view": lambda far=far: far.all(),  # type: ignore[misc]
+            "claim when nothing is free": partial(far.claim, "bench:2:b", trials + 1, 3600),
         }
         for name, call in calls.items():
             relay.taken()
@@ -171,7 +171,7 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 call()
             took_s = (time.monotonic() - began) / 20
             counts = relay.taken()
-            found[f"{name}, {slots} trials"] = {
+            found[f"{name}, {trials} trials"] = {
                 "transactions": (commits(direct) - before - 1) / 20,
                 "bytes": (counts["bytes_up"] + counts["bytes_down"]) / 20,
                 "ms": 1000 * took_s,
@@ -179,7 +179,7 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     return found
 
 
-def fill(storage: Storage, study: str, slots: int) -> None:
+def fill(storage: Storage, study: str, trials: int) -> None:
     """Give a study so many trials that have ended, of the size that those of the default experiment have."""
     run = {
         "run_dir": "x" * 120,
@@ -190,18 +190,18 @@ def fill(storage: Storage, study: str, slots: int) -> None:
     }
     told = json.dumps({"overrides": ["x" * 40] * 8, "runs": [run], "env_steps": 10**6, "reason": "x" * 60})
     row = {"attempt": 1, "owner": "bench:1:a", "state": "told", "expires_s": 0.0, "outcome": "COMPLETE"}
-    Ledger(storage.engine, study)
+    TrialClaims(storage.engine, study)
     there = sa.Table("deepracer_slots", sa.MetaData(), autoload_with=storage.engine)
     rows = [
         {
             **row,
             "study": study,
-            "slot": slot,
+            "slot": index,
             "runs": json.dumps([run]),
             "objective_values": "[10.0]",
             "attrs": told,
         }
-        for slot in range(slots)
+        for index in range(trials)
     ]
     with storage.engine.begin() as connection:
         connection.execute(sa.insert(there), rows)
@@ -210,9 +210,9 @@ def fill(storage: Storage, study: str, slots: int) -> None:
 def renewals_a_second(args: argparse.Namespace, folder: Path, clients: int, seconds: float = 8.0) -> float:
     """Return how many leases the database renews, asked by so many clients, each connection for one transaction."""
     storage, study = open_storage(args.storage, folder), f"rate-{uuid.uuid4().hex[:8]}"
-    claims = [Ledger(storage.engine, study).claim(f"bench:{n}:a", clients, 3600) for n in range(clients)]
+    claims = [TrialClaims(storage.engine, study).claim(f"bench:{n}:a", clients, 3600) for n in range(clients)]
     return rate(
-        [lambda claim=claim: Ledger(storage.engine, study).renew(claim, 3600.0) for claim in claims],  # type: ignore[misc]
+        [lambda claim=claim: TrialClaims(storage.engine, study).renew(claim, 3600.0) for claim in claims],  # type: ignore[misc]
         seconds,
     )
 

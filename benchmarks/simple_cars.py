@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from benchmarks.replay import WARM_UP_STEPS, Windows, errors
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.sim.recordings import WARM_UP_STEPS, Windows
-from deepracer_exp.sim.replay import errors
 
 Floats = NDArray[np.float64]
 
@@ -45,7 +44,7 @@ class Formula(NamedTuple):
     """How much of the share is lost with the square of the speed, s2/m2."""
     rate_lag_s: float = 0.5
     speed_correction: float = 0.3
-    """Share of the warm-up's errors by which speed and yaw rate are corrected, as `sim.replay.Observer`."""
+    """Share of the warm-up's errors by which speed and yaw rate are corrected, as `benchmarks.replay.Observer`."""
     rate_correction: float = 0.5
 
     def predict(self, car: CarConfig, windows: Windows) -> Floats:

@@ -1,36 +1,36 @@
-"""What pruning by entropy saves a sweep, and what it costs, beside Optuna's pruners.
+"""What pruning by entropy saves a sweep, and what it costs, compared with Optuna's pruners.
 
     python -m benchmarks.sweep [--trials 60] [--workers 2] [--reuse DIR] [--json FILE] [OVERRIDE...]
 
 1. `deepracer-exp sweep sweep=lr_entropy track=reinvent_base` really runs, with its defaults (MLflow included).
-2. Those of its trials that were ended before their time go on, without stopping rule and pruner, until they have used
-   their budget, in copies of their runs: the same trials without pruning, in the same order.
-3. Median and Hyperband, as `sweep.pruners=[median]` and `[hyperband]` set them up, are replayed on these whole runs.
-4. The winner of each drives fresh laps that have chosen nobody (`benchmarks.fresh`): of these are all lap times told.
+2. Its trials that were ended early are resumed, without stopping rule and pruner, until they have used their budget, in
+   copies of their runs: the same trials without pruning, in the same order.
+3. Median and Hyperband, as `sweep.pruners=[median]` and `[hyperband]` set them up, are replayed on these complete runs.
+4. The winner of each drives fresh laps that chose no winner (`benchmarks.fresh`); all lap times shown are of these.
 
-Why replaying is exact. Collection in the trial's own process is deterministic, and a run that goes on is the run that
-was never interrupted, bit for bit (`benchmarks.resume` kills runs to show it), so that a pruned training is the
-beginning of the whole one. What each trial told Optuna must be what its whole run tells, and one that is whole
-already must be worth the same again; else the benchmark fails. A pruner knows nothing of a trial but the values that
-it reports (`sweeps.score`) and their steps; they are read from the rows of the whole run and told to a fresh study in
-memory, one by one, and where the pruner says so the trial ends. Which values are there to compare with depends on who
-is how far: workers are modelled as equally fast, a step and a trial taking as long as they took in the sweep on
-average. Two things are not replayed: what the sampler would have drawn after another pruner's verdicts (all get the
-same trials), and time: rivals' `minutes` follow from the model, only the sweep's own are measured.
+Why replaying is exact. Collection in the trial's own process is deterministic, and a resumed run equals an
+uninterrupted one bit for bit (`benchmarks.resume` kills runs to show it), so that a pruned training is the beginning of
+the complete one. What each trial reported to Optuna must equal what its complete run reports, and a trial that used its
+budget must have the same value again; otherwise the benchmark fails. A pruner knows nothing of a trial but the values
+that it reports (`sweeps.objectives`) and their steps; they are read from the rows of the complete run and reported to a
+new study in memory, one by one, and the trial ends where the pruner says so. Which values there are to compare with
+depends on how far the other trials are: workers are modelled as equally fast, a step and a trial taking as long as in
+the sweep on average. Two things are not replayed: what the sampler would have drawn after another pruner's decisions
+(all get the same trials), and time: the `minutes` of the others follow from the model, only the sweep's are measured.
 
-Winners are chosen as the sweep does it: of the `sweep.rerank` complete trials with the best values the one that does
-best on `sweep.rerank_laps` more laps. For the sweep itself this must come to the winner that it has told.
+Winners are chosen as the sweep does it: of the `sweep.rerank` complete trials with the best values the one that is best
+on `sweep.rerank_laps` more laps. For the sweep itself this must be the winner that it has reported.
 
-- `minutes`, `trials_per_hour`, `env_steps`, `steps_by_fate`, `trials_by_fate`;
-- `steps_saved`: share of the control steps without pruning that need not have been driven;
+- `minutes`, `trials_per_hour`, `env_steps`, `steps_by_fate`, `trials_by_fate`: the last two by outcome;
+- `steps_saved`: share of the control steps without pruning that were not needed;
 - `lap_time_loss`: how much slower the winner's mean lap is than that of the winner without pruning, as a share;
 - `best`: its trial, its value (the race score in seconds) in the sweep and on the re-ranking's laps, and its laps;
 - `rivals`: the same of `no_pruning`, `median` and `hyperband`; each with `at_equal_steps`, the winners of both among
   what was found when as many steps were driven as the more frugal one needed for all trials, and how much slower
   the sweep's winner is then (`lap_time_loss`, below zero: faster).
 
-`--reuse DIR` leaves everything in DIR (35 MB a trial, mostly traces), goes on with a sweep that was interrupted and
-takes the runs that it finds finished. `minutes` is the time of all starts of the sweep then; `starts` counts them.
+`--reuse DIR` leaves everything in DIR (35 MB a trial, mostly traces), resumes a sweep that was interrupted and reuses
+the finished runs in it. `minutes` is then the time of all starts of the sweep; `starts` counts them.
 """
 
 import argparse
@@ -52,7 +52,8 @@ from optuna.trial import FrozenTrial, TrialState
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import Pruner, SweepConfig, compose_sweep
-from sweeps.best import best_trial, cost
+from sweeps.best import best_trial
+from sweeps.objectives import cost
 from sweeps.pruners import build_pruner
 from sweeps.rerank import fresh
 from sweeps.storage import open_storage
@@ -99,10 +100,10 @@ def winner_of(found: Sequence[Ended], objective: str, rerank: int, again: Callab
     """Return the winner as a sweep chooses it.
 
     Args:
-        found: trials that are worth something.
+        found: trials with a value.
         objective: of their values.
-        rerank: how many of the best are put to another test.
-        again: that test.
+        rerank: how many of the best race again.
+        again: returns the value of that race.
 
     Raises:
         SystemExit: there is none.
@@ -113,11 +114,11 @@ def winner_of(found: Sequence[Ended], objective: str, rerank: int, again: Callab
     return min(first[:rerank], key=lambda one: cost([objective], [again(one)])) if rerank else first[0]
 
 
-def steps_by_fate(ended: Sequence[Ended]) -> dict[str, int]:
+def steps_by_outcome(ended: Sequence[Ended]) -> dict[str, int]:
     """Return the control steps of the trials by how they ended."""
     steps: dict[str, int] = collections.defaultdict(int)
     for one in ended:
-        steps[one.fate] += one.env_steps
+        steps[one.outcome] += one.env_steps
     return dict(sorted(steps.items()))
 
 
@@ -127,15 +128,15 @@ def figures(ended: Sequence[Ended], minutes: float, unpruned: Sequence[Ended]) -
     Args:
         ended: its trials.
         minutes: that it took.
-        unpruned: the same trials, nobody pruning.
+        unpruned: the same trials without pruning.
     """
     steps, every = (sum(one.env_steps for one in each) for each in (ended, unpruned))
     return {
         "minutes": round(minutes, 2),
         "trials_per_hour": round(60 * len(ended) / minutes, 1),
         "env_steps": steps,
-        "steps_by_fate": steps_by_fate(ended),
-        "trials_by_fate": dict(sorted(collections.Counter(one.fate for one in ended).items())),
+        "steps_by_fate": steps_by_outcome(ended),
+        "trials_by_fate": dict(sorted(collections.Counter(one.outcome for one in ended).items())),
         "steps_saved": round(1 - steps / every, 4),
     }
 
@@ -158,7 +159,7 @@ def held(result: dict[str, Any]) -> dict[str, bool]:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """Return the table of the sweep and its rivals, and that of the steps by fate."""
+    """Return the table of the sweep and its rivals, and that of the steps by outcome."""
     ways = {OWN: result, **result["rivals"]}
     head = (
         "pruning",
@@ -192,19 +193,19 @@ def markdown(result: dict[str, Any]) -> str:
                 "-" if equal is None else number(equal["sweep_lap_time_s"], 2),
             )
         )
-    fates = sorted({fate for one in ways.values() for fate in one["steps_by_fate"]})
+    outcomes = sorted({outcome for one in ways.values() for outcome in one["steps_by_fate"]})
     spent = [
         (
             name.replace("_", " "),
             *(
                 f"{one['trials_by_fate'].get(f, 0)}: {one['steps_by_fate'].get(f, 0) / 1e6:.2f} M"
-                for f in fates
+                for f in outcomes
             ),
         )
         for name, one in ways.items()
     ]
     at_equal = ("at steps (M)", "its lap (s)", "the sweep's (s)")
-    return f"{table((*head, *at_equal), rows)}\n\n{table(('trials: steps', *fates), spent)}"
+    return f"{table((*head, *at_equal), rows)}\n\n{table(('trials: steps', *outcomes), spent)}"
 
 
 def contenders(
@@ -234,7 +235,7 @@ def contenders(
             number=trial.number,
             points=(),
             env_steps=trial.user_attrs["env_steps"],
-            fate=trial.user_attrs["fate"],
+            outcome=trial.user_attrs["fate"],
             value=trial.values[0] if trial.state == TrialState.COMPLETE else None,
         )
         for trial in trials
@@ -244,7 +245,7 @@ def contenders(
     for name in RIVALS:
         pruner = build_pruner(replace(config, pruners=(name,)), evaluations)
         ended[name] = again(courses, pruner, name)
-    # Start, re-ranking and page, and what the model of the workers does not tell.
+    # Start, re-ranking and page, and what the model of the workers leaves out.
     besides_s = max(measured_s - makespan_s(ended[OWN]), 0.0)
     return {
         name: Contender(
@@ -269,7 +270,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
     noted = started(overrides, folder)
     study = load_study(request.study, open_storage(config.storage, folder / "runs"))
-    # Without those whose worker was killed before they were anybody's.
+    # Without those whose worker was killed while it created them.
     trials = [trial for trial in study.get_trials(deepcopy=False) if "runs" in trial.user_attrs]
     places = {
         trial.number: folder / "runs" / request.study / Path(trial.user_attrs["run_dir"] or "").name
@@ -289,10 +290,10 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         trials, courses, config, noted["seconds"], (places, fulls), study.direction, request.study
     )
     result = compared(ways, pace, config, protocol, options.laps)
-    told = best_trial(study).number
-    if result["best"]["trial"] != told:
+    winner = best_trial(study).number
+    if result["best"]["trial"] != winner:
         raise SystemExit(
-            f"the sweep says that trial {told} has won, this benchmark {result['best']['trial']}"
+            f"the sweep says that trial {winner} has won, this benchmark {result['best']['trial']}"
         )
     return {
         **result,
@@ -330,10 +331,10 @@ def compared(
     every = {
         name: best(way, [one for one in way.ended if one.value is not None]) for name, way in ways.items()
     }
-    told: dict[str, dict[str, Any]] = {}
+    found_by_way: dict[str, dict[str, Any]] = {}
     for name, way in ways.items():
         won, laps_of = every[name]
-        told[name] = {
+        found_by_way[name] = {
             **figures(way.ended, way.minutes, unpruned.ended),
             "lap_time_loss": lap_time_loss(laps_of, every[NO_PRUNING][1]),
             "best": {
@@ -345,14 +346,18 @@ def compared(
         }
         if name == OWN:
             continue
-        steps = min(told[OWN]["env_steps"], told[name]["env_steps"])
+        steps = min(found_by_way[OWN]["env_steps"], found_by_way[name]["env_steps"])
         pairs = [found_within(each.ended, steps, pace) for each in (way, ways[OWN])]
         if not all(pairs):
-            told[name]["at_equal_steps"] = {"env_steps": steps, "lap_time_s": None, "sweep_lap_time_s": None}
-            told[name]["at_equal_steps"]["lap_time_loss"] = None
+            found_by_way[name]["at_equal_steps"] = {
+                "env_steps": steps,
+                "lap_time_s": None,
+                "sweep_lap_time_s": None,
+            }
+            found_by_way[name]["at_equal_steps"]["lap_time_loss"] = None
             continue
         (rival, rivals), (mine, own) = best(way, pairs[0]), best(ways[OWN], pairs[1])
-        told[name]["at_equal_steps"] = {
+        found_by_way[name]["at_equal_steps"] = {
             "env_steps": steps,
             "trial": rival.number,
             "lap_time_s": rivals.lap_time_s,
@@ -360,7 +365,7 @@ def compared(
             "sweep_lap_time_s": own.lap_time_s,
             "lap_time_loss": lap_time_loss(own, rivals),
         }
-    return {**told.pop(OWN), "rivals": told}
+    return {**found_by_way.pop(OWN), "rivals": found_by_way}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -369,12 +374,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sweep"
     )
     parser.add_argument("--trials", type=int, default=60, help="of the sweep")
+    parser.add_argument("--workers", type=int, default=2, help="of the sweep, and trainings that run at once")
+    parser.add_argument("--laps", type=int, default=TRIALS, help="fresh laps that each winner drives")
     parser.add_argument(
-        "--workers", type=int, default=2, help="of the sweep, and trainings that go on at once"
-    )
-    parser.add_argument("--laps", type=int, default=TRIALS, help="that each winner drives anew")
-    parser.add_argument(
-        "--reuse", type=Path, metavar="DIR", help="keep everything here, and go on with what is there"
+        "--reuse", type=Path, metavar="DIR", help="keep everything here, and resume what is there"
     )
     parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
     parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp sweep")

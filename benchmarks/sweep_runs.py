@@ -16,11 +16,11 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.run import read_run
-from deepracer_exp.formats.run_files import read_config, read_object
+from deepracer_exp.runs.files import read_config, read_object
+from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking import tracking_file
-from deepracer_exp.training.training import SPENT
-from sweeps.score import value_on_the_way, values_of
+from deepracer_exp.training.callbacks import BUDGET_REACHED
+from sweeps.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary
 from .pruning_replay import Course, Pace
@@ -32,7 +32,7 @@ _NOTE_S = 5.0
 
 
 def started(overrides: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Run the sweep in `folder`, or go on with it; return the `seconds` of all its `starts`.
+    """Run or resume the sweep in `folder`; return the `seconds` of all its `starts`.
 
     Raises:
         SystemExit: it did not end well, or another sweep has been begun in the folder.
@@ -52,7 +52,7 @@ def started(overrides: Sequence[str], folder: Path) -> dict[str, Any]:
         while code is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 code = process.wait(_NOTE_S)
-            # On the way, too: what was killed shall not forget its time.
+            # While it runs, too, so that the time of a killed start counts.
             noted |= {"seconds": before_s + time.monotonic() - began, "done": code == 0}
             file.write_text(json.dumps(noted), encoding="utf-8")
     if code:
@@ -80,7 +80,7 @@ def refuse_others(request: SweepRequest) -> None:
 
 
 def whole_run(run: Path, folder: Path) -> Path:
-    """Return a copy of a trial's run that has used its budget up; it goes on with whatever of it is in `folder`.
+    """Return a copy of a trial's run that has used its budget; a copy that is in `folder` already is resumed.
 
     It may have failed on the way: trials do.
 
@@ -89,7 +89,7 @@ def whole_run(run: Path, folder: Path) -> Path:
         folder: for the copy.
 
     Raises:
-        SystemExit: it cannot go on.
+        SystemExit: it cannot be resumed.
     """
     copy = folder / "runs" / "whole" / run.name
     if not copy.exists():
@@ -114,27 +114,27 @@ def whole_run(run: Path, folder: Path) -> Path:
 
 def _is_whole(run: Path) -> bool:
     summary = read_object(run / "summary.json")
-    return summary.get("status") == "failed" or str(summary.get("reason")).startswith(SPENT)
+    return summary.get("status") == "failed" or str(summary.get("reason")).startswith(BUDGET_REACHED)
 
 
 def hold_against(trial: FrozenTrial, course: Course) -> None:
-    """Refuse a trial whose whole run tells something else than the trial has told Optuna.
+    """Refuse a trial whose complete run reports something else than the trial has reported to Optuna.
 
     Raises:
         SystemExit: naming the trial and the difference.
     """
-    fate = trial.user_attrs["fate"]
-    if fate == "failed":
+    outcome = trial.user_attrs["fate"]
+    if outcome == "failed":
         return
     refuse_other_reports(trial, course)
-    if fate == "finished" and trial.values[0] != course.value:
+    if outcome == "finished" and trial.values[0] != course.value:
         raise SystemExit(
-            f"trial {trial.number}: was worth {trial.values[0]} and is worth {course.value} again"
+            f"trial {trial.number}: had the value {trial.values[0]} and has {course.value} again"
         )
 
 
 def refuse_other_reports(trial: FrozenTrial, course: Course) -> None:
-    """Hold what a trial told Optuna on its way against what its whole run tells.
+    """Compare what a trial reported to Optuna with what its complete run reports.
 
     Raises:
         SystemExit: they differ.
@@ -143,34 +143,36 @@ def refuse_other_reports(trial: FrozenTrial, course: Course) -> None:
     reports = {step: value for step, (at, value) in enumerate(course.points, 1) if at <= until}
     if trial.intermediate_values != reports:
         raise SystemExit(
-            f"trial {trial.number}: told Optuna {trial.intermediate_values}, its whole run tells {reports}"
+            f"trial {trial.number}: reported {trial.intermediate_values} to Optuna, its complete run reports {reports}"
         )
 
 
 def course_of(trial: int, run: Path, objective: str, protocol: EvaluationConfig) -> Course:
-    """Return what a whole run tells a sweep, on its way and at its end."""
+    """Return what a complete run reports to a sweep, before and at its end."""
     rows, summary = read_metrics(run), read_summary(run)
     every = read_config(run)["checkpoints"]["every"]
-    # A run that ends before its first evaluation is evaluated then, which nobody tells the pruners.
+    # A run that ends before its first evaluation is evaluated then, which is not reported to the pruners.
     due = [row for row in rows if every is not None and row["iteration"] % every == 0]
-    values = [(row["env_steps"], value_on_the_way(row, objective, protocol.time_s)) for row in due]
+    values = [(row["env_steps"], intermediate_value(row, objective, protocol.time_s)) for row in due]
     failed = summary["status"] == "failed"
     return Course(
         number=trial,
         points=tuple((env_steps, value) for env_steps, value in values if value is not None),
         env_steps=summary["env_steps"],
-        fate="failed" if failed else "finished",
+        outcome="failed" if failed else "finished",
         value=None if failed else score(run, objective, protocol),
     )
 
 
 def score(run: Path, objective: str, protocol: EvaluationConfig) -> float:
-    """Return what a run's best policy is worth by a protocol; it is driven once, and noted in the run's folder."""
+    """Return the value of a run's best policy by a protocol; it races once, and the run's folder keeps the value."""
     file, key = run / _SCORES, f"{objective}: {protocol}"
     known = read_object(file)
     if key not in known:
-        stored = read_run(str(run), run.parent, None)
-        policy = read_checkpoint(stored.experiment, stored.checkpoints, stored.meant(None)).networks.policy
+        stored = resolve(str(run), run.parent, None)
+        policy = read_checkpoint(
+            stored.experiment, stored.checkpoints, stored.choose_checkpoint(None)
+        ).networks.policy
         evaluation = Evaluator(stored.experiment, protocol)(policy)
         known[key] = values_of(evaluation, [objective], protocol.time_s)[0]
         file.write_text(json.dumps(known), encoding="utf-8")

@@ -10,7 +10,7 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
   experiment's without its `reward_batch`), episodes begun anew as they end.
 - `all_tracks_over_one_env` (a ratio): the same on eighteen tracks at once, over the figure on one track.
-- `collect_steps_per_s`: batches of an iteration's frames through `Collection` in sync mode with 1 and 2 worker
+- `collect_steps_per_s`: batches of an iteration's frames through `LocalCollector` in sync mode with 1 and 2 worker
   processes, the experiment's cars per process, its network sampling actions with its first weights.
 - `train_steps_per_s`: `deepracer-exp train` as a process of its own without MLflow: collection, update, trace, metrics,
   checkpoints. Start-up and the first iteration are left out: env_steps over wall_clock_s between the first and the
@@ -40,12 +40,13 @@ from typing import Any
 import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.commands.starting import start_workers_early
+from deepracer_exp.collectors.base import cores
+from deepracer_exp.collectors.collector import LocalCollector
+from deepracer_exp.commands.startup import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.training.collection import Collection, cores
 
 from .all_tracks import TRACKS
 from .command import read_metrics, train
@@ -109,11 +110,11 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
     features = len(feature_names(experiment.observation))
     policy = build_actor_critic(experiment.network, features, setup.actions.n, generator).policy
 
-    def start(processes: int) -> Collection:
+    def start(processes: int) -> LocalCollector:
         config = dataclasses.replace(experiment.collector, mode="sync", processes=processes)
         run_dir = folder / f"collect_{processes}"
         run_dir.mkdir()
-        return Collection(config, setup, policy, frames, run_dir)
+        return LocalCollector(config, setup, policy, frames, run_dir)
 
     with start(1) as one, start(2) as two:
         passes: dict[str, Callable[[], tuple[float, float]]] = {}

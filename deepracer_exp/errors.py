@@ -18,7 +18,7 @@ class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise sit
 
 
 class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise site
-    """A run that had begun cannot go on: reward error, non-finite value, lost worker, full disk."""
+    """A run that had started cannot continue: reward error, non-finite value, lost worker, full disk."""
 
     exit_code = 3
 

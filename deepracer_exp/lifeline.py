@@ -23,7 +23,7 @@ _IS_LINUX = sys.platform == "linux"
 
 
 def kill_when_closed(pipe: int, target: int) -> None:
-    """Have a process killed once nobody holds the writing end of a pipe.
+    """Have a process killed once the writing end of a pipe is closed.
 
     Args:
         pipe: reading end, which has been read to the end; the target must keep it open.
@@ -46,7 +46,8 @@ def die_with_parent() -> None:
 def end_with_owner() -> None:
     """End this process, which `multiprocessing` started, with the one that started it.
 
-    One that was forked from a fork server ends with that server, too: only the server could tell the owner of its end.
+    One that was forked from a fork server ends with that server, too: only the server could report its end to the
+    owner.
     """
     owner = multiprocessing.parent_process()
     assert owner is not None

@@ -1,7 +1,7 @@
-"""The best trial of a study: its values, its line to paste, its run."""
+"""The best trial of a study: its values, the command that trains it, its run."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,32 +9,16 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.best_of_sweep import BestOfSweep, write_best_of_sweep
+from deepracer_exp.runs.files import is_run
+from deepracer_exp.runs.resolve import BestOfSweep, write_best_of_sweep
 
-from .labels import MEASURES, objectives_of, shown_values
-
-_LEAST_SHARE = 0.01  # of the lap; a trial that never moved must not divide by zero
-
-
-def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
-    """Return what trials are put in order by, lower is better.
-
-    One objective is its value. Of several the race score decides if it is one of them; else lap time over the share of
-    the lap driven, which comes near to seconds per complete lap: a fast car that seldom arrives is not the best.
-    """
-    by_name = dict(zip(objectives, values, strict=True))
-    if len(objectives) == 1:
-        (name,) = objectives
-        return by_name[name] if MEASURES[name].minimize else -by_name[name]
-    if "race_score" in by_name:
-        return by_name["race_score"]
-    return by_name["lap_time"] / max(by_name["completion"] / 100, _LEAST_SHARE)
+from .objectives import cost, objectives_of, shown_values
 
 
 def reranked(study: optuna.Study) -> list[Mapping[str, Any]]:
-    """Return what the best trials came to on fresh laps, the best first; empty before that.
+    """Return the results of the best trials on fresh laps, the best first; empty before that.
 
-    They are not the best any more once trials have been made since.
+    Empty again once more trials are complete: those on fresh laps may not be the best any more.
     """
     objectives, count = objectives_of(study), len(complete_trials(study))
     found = study.user_attrs.get("reranked") if study.user_attrs.get("reranked_of", count) == count else None
@@ -49,7 +33,7 @@ def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def best_trial(study: optuna.Study) -> FrozenTrial:
-    """Return the winner: the first of those re-ranked, or else the best complete trial.
+    """Return the winner: the best on fresh laps, or else the best complete trial.
 
     Raises:
         BadInput: no trial is complete.
@@ -57,12 +41,12 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
     complete = complete_trials(study)
     if not complete:
         raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
-    told = next(iter(reranked(study)), {})
-    return next((trial for trial in complete if trial.number == told.get("trial")), complete[0])
+    first = next(iter(reranked(study)), {})
+    return next((trial for trial in complete if trial.number == first.get("trial")), complete[0])
 
 
 def best_values(study: optuna.Study) -> list[float]:
-    """Return the values of the best trial, those on fresh laps if it was re-ranked.
+    """Return the values of the best trial, on fresh laps if it drove some.
 
     Raises:
         BadInput: no trial is complete.
@@ -73,7 +57,7 @@ def best_values(study: optuna.Study) -> list[float]:
 
 
 def best_shown(study: optuna.Study) -> str:
-    """Return the values of the best trial in words, and whether fresh laps gave them.
+    """Return the values of the best trial as text, with "on fresh laps" if they are from there.
 
     Raises:
         BadInput: no trial is complete.
@@ -90,12 +74,13 @@ def best_line(study: optuna.Study) -> str:
     """
     overrides = [str(override) for override in best_trial(study).user_attrs.get("overrides", ())]
     if parent := study.user_attrs.get("parent_run"):
-        return shlex.join(["deepracer-exp", "clone", *parent, *overrides])
+        run, *checkpoint = parent
+        return shlex.join(["deepracer-exp", "clone", run.removeprefix("run="), *checkpoint, *overrides])
     return shlex.join(["deepracer-exp", "train", *overrides])
 
 
 def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
-    """Return the folder of the best run of the best trial, of all its seeds.
+    """Return the folder of the best run, over all seeds, of the best trial.
 
     Args:
         study: with the runs of its trials.
@@ -107,19 +92,20 @@ def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
     trial, objectives = best_trial(study), objectives_of(study)
     runs = [run for run in trial.user_attrs.get("runs", ()) if run.get("value") is not None]
     best = min(runs, key=lambda run: cost(objectives, run["value"]), default=trial.user_attrs)
-    told = Path(best.get("run_dir") or "")
+    stored = Path(best.get("run_dir") or "")
     base = runs_dir or Path(study.user_attrs.get("runs_dir", "runs"))
-    places = [base / study.study_name / told.name, told]
-    found = next((place for place in places if (place / "config.yaml").is_file()), None)
-    if not told.name or found is None:
+    candidates = [base / study.study_name / stored.name, stored]
+    found = next((folder for folder in candidates if is_run(folder)), None)
+    if not stored.name or found is None:
         raise BadInput(
-            f"study {study.study_name}: {told} of trial {trial.number} is gone; give runs_dir= if the runs have moved"
+            f"study {study.study_name}: {stored} of trial {trial.number} is gone; "
+            "give runs_dir= if the runs have moved"
         )
     return found
 
 
 def write_best(study: optuna.Study, runs_dir: Path) -> Path:
-    """Write best_of_sweep.json beside the study's runs, which `best:STUDY` finds its run by.
+    """Write best_of_sweep.json beside the study's runs, where `best:STUDY` looks its run up.
 
     Raises:
         BadInput: there is no best run, or it does not lie in the folder of the study's runs.

@@ -1,4 +1,4 @@
-"""The database that a study is kept in: its URL checked, and how one connects to it."""
+"""The database of a study: its URL checked, connection options, and a lock for creating things."""
 
 import fcntl
 import os
@@ -19,11 +19,11 @@ _ACCEPTED = (
     "accepted: sqlite:////path/sweeps.db, postgresql+psycopg://user@host/name, mysql+pymysql://user@host/name"
 )
 _DRIVERS = {"psycopg": "psycopg[binary]", "pymysql": "pymysql", "mysqldb": "mysqlclient"}
-"""What installs a driver."""
+"""Package of each driver."""
 
 _CONNECT_S = 10
 _STUCK_S = 60
-"""How long a process may leave a transaction open, or wait for one; a stopped machine holds up no other for longer."""
+"""How long a process may leave a transaction open, or wait for one: a suspended machine blocks others no longer."""
 _LOCK = "deepracer_exp sweeps"
 _LOCK_NUMBER = 0x64726578
 
@@ -35,7 +35,7 @@ class Database:
     url: sa.URL = field(repr=False)
     """With its password, if it has one."""
     shown: str
-    """The setting it came from, as a message may show it: without password."""
+    """The setting it came from, for messages, without password."""
 
     @property
     def kind(self) -> str:
@@ -48,11 +48,10 @@ class Database:
         return Path(str(self.url.database)) if self.kind == "sqlite" else None
 
     def engine_options(self) -> dict[str, Any]:
-        """Return what SQLAlchemy's `create_engine` needs besides the URL.
+        """Return arguments of SQLAlchemy's `create_engine` besides the URL.
 
-        A server is connected to for each transaction. A pool would keep one or two connections for each worker
-        open for hours, of which PostgreSQL allows 100 unless told otherwise, and they would all be broken after
-        the server was started anew.
+        Each transaction on a server has its own connection. A pool would keep one or two connections per worker open
+        for hours, of which PostgreSQL allows 100 by default, and all of them would break when the server restarts.
         """
         if self.kind == "sqlite":
             return {"connect_args": {"timeout": _STUCK_S}}
@@ -74,15 +73,15 @@ class Database:
                 "write_timeout": 2 * _STUCK_S,
                 "init_command": f"SET SESSION wait_timeout={_STUCK_S}, innodb_lock_wait_timeout={_STUCK_S}",
             }
-        told = {key: value for key, value in arguments.items() if key not in self.url.query}
-        return {"poolclass": sa.NullPool, "connect_args": told}
+        given = {key: value for key, value in arguments.items() if key not in self.url.query}
+        return {"poolclass": sa.NullPool, "connect_args": given}
 
     @contextmanager
     def creation_lock(self, engine: sa.Engine | None) -> Iterator[None]:
-        """Let one process at a time make what there shall be one of: the tables, the study's run in MLflow.
+        """Let one process at a time create what must exist once: the tables, the study's run in MLflow.
 
-        Optuna has no lock of its own here: of processes that begin together all but one fail, with "table already
-        exists" or with a version that stands there twice. The lock goes with the process that holds it.
+        Optuna has no lock of its own here: of processes that start together all but one fail, with "table already
+        exists" or with a version stored twice. The lock ends with the process that holds it.
 
         Args:
             engine: of a server; a file needs none.
@@ -102,22 +101,24 @@ class Database:
 
 
 def resolve_database(url: str | None, runs_dir: Path) -> Database:
-    """Return the database named by `sweep.storage`, or the file `sweeps.db` in `runs_dir`; nothing is connected to.
+    """Return the database named by `sweep.storage`, or the file `sweeps.db` in `runs_dir`, without connecting.
 
     Raises:
-        BadInput: it can never work: not a URL, an unknown kind, a missing driver, a file that cannot be written.
+        BadInput: not a URL, an unknown kind, a missing driver, a file that cannot be written.
     """
     if url is None:
         return _of_file(runs_dir / "sweeps.db", f"runs_dir={runs_dir}")
     try:
         parsed = sa.make_url(with_password(url))
     except (ArgumentError, ValueError):
-        # Where it has no form, nobody knows which part of it is the password.
+        # Without a form it is unknown which part of it is the password.
         raise BadInput(f"sweep.storage: not the URL of a database; {_ACCEPTED}") from None
     shown = f"sweep.storage={without_passwords(url)}"
     kind = parsed.get_backend_name()
     if kind not in _KINDS:
-        raise BadInput(f"{shown}: no database for sweeps{nearest(kind, _KINDS)}; {_ACCEPTED}")
+        raise BadInput(
+            f"{shown}: not a kind of database that holds sweeps{nearest(kind, _KINDS)}; {_ACCEPTED}"
+        )
     if kind == "sqlite":
         name = parsed.database
         if not name or name.startswith((":", "file:")) or parsed.host or parsed.query:
@@ -149,10 +150,10 @@ def _of_file(file: Path, shown: str) -> Database:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BadInput(f"{shown}: folder {file.parent} cannot be made: {error.strerror}") from None
+        raise BadInput(f"{shown}: folder {file.parent} cannot be created: {error.strerror}") from None
     if file.is_dir():
         raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
-    # SQLite keeps two files beside it, so that the folder counts, too.
+    # SQLite keeps two files beside it, so the folder must be writable, too.
     if not all(os.access(path, os.W_OK) for path in (file, file.parent) if path.exists()):
         raise BadInput(f"{shown}: {file} cannot be written; choose a writable place")
     return Database(sa.URL.create("sqlite", database=str(file)), shown)

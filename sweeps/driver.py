@@ -1,4 +1,4 @@
-"""The process that a sweep is begun by: starts workers, looks after them, shows what they do."""
+"""The driver of a sweep: starts workers, replaces those that die, and shows their progress."""
 
 import collections
 import contextlib
@@ -10,18 +10,17 @@ from collections.abc import Callable, Sequence
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.training.signals import Interruption
 
-from . import process
-from .launch import Launched, Launcher
-from .ledger import Ledger, Slot
-from .plan import Plan
+from .claims import Claim, TrialClaims
+from .launcher import Launcher, WorkerProcess
 from .storage import Storage, patiently
-from .table import SweepView
+from .view import SweepView
+from .worker_config import WorkerConfig, is_gone
 
-OnEnded = Callable[[Sequence[Slot]], None]
+OnEnded = Callable[[Sequence[Claim]], None]
 _LOOK_S = 0.5
 _LEAVE_S = 6.0
-"""For a worker that was told to end: it writes a checkpoint and tells MLflow. What it has not done by then is done when
-its trial resumes; with what comes after, the whole sweep is gone within ten seconds."""
+"""For a worker that was asked to end, to write a checkpoint and to log to MLflow. What it has not done by then is done
+when its trial resumes; together with what follows, the whole sweep is gone within ten seconds."""
 _FEW = 3
 """Trials all of which must have failed before a sweep is given up."""
 
@@ -31,7 +30,7 @@ class Driver:
 
     def __init__(
         self,
-        plan: Plan,
+        config: WorkerConfig,
         storage: Storage,
         launcher: Launcher,
         view: SweepView,
@@ -40,19 +39,19 @@ class Driver:
         """Start nothing yet.
 
         Args:
-            plan: of the sweep.
-            storage: of the study, which is there.
+            config: of the workers.
+            storage: of the study, which exists.
             launcher: starts them.
             view: has been entered.
-            on_ended: called whenever trials have ended.
+            on_ended: called with all claims whenever trials have ended.
         """
-        self._plan, self._launcher, self._view, self._on_ended = plan, launcher, view, on_ended
-        self._ledger = Ledger(storage.engine, plan.study)
-        self._running: list[Launched] = []
+        self._config, self._launcher, self._view, self._on_ended = config, launcher, view, on_ended
+        self._claims = TrialClaims(storage.engine, config.study)
+        self._running: list[WorkerProcess] = []
         self._all_made = False
         """A worker has found nothing left to do."""
         self._losses = 0
-        """Workers that died since a trial was last ended."""
+        """Workers that died since a trial last ended."""
         self._ended = -1
 
     def run(self, interruption: Interruption) -> int | None:
@@ -61,26 +60,24 @@ class Driver:
         Raises:
             RunFailed: all trials fail, workers die again and again, or the database stays away.
         """
-        self._plan.folder.mkdir(parents=True, exist_ok=True)
-        # What was killed here, mostly with its driver, need not wait for the end of its lease.
-        for owner in {
-            slot.owner for slot in self._slots() if slot.outcome is None and process.is_gone(slot.owner)
-        }:
+        self._config.folder.mkdir(parents=True, exist_ok=True)
+        # Workers killed on this machine, mostly with their driver: their trials need not wait for the end of a lease.
+        for owner in {one.owner for one in self._look() if one.result is None and is_gone(one.owner)}:
             self._release(owner)
         try:
             for _ in range(self._launcher.workers):
                 self._start()
             while True:
-                slots = self._slots()
-                self._view.show(slots)
+                claims = self._look()
+                self._view.show(claims)
                 if interruption.signum is not None:
-                    self._view.stage = "ends: running trials write their checkpoints"
-                    self._view.show(slots)
+                    self._view.stage = "ending: running trials write their checkpoints"
+                    self._view.show(claims)
                     self._end()
-                    self._view.show(self._slots())
+                    self._view.show(self._look())
                     return interruption.exit_code
-                self._give_up_if_hopeless(slots)
-                self._reap()
+                self._give_up_if_all_fail(claims)
+                self._replace_lost_workers()
                 if not self._running:
                     return None
                 time.sleep(_LOOK_S)
@@ -89,59 +86,67 @@ class Driver:
             raise
 
     def _start(self) -> None:
-        self._running.append(self._launcher.start(self._plan, uuid.uuid4().hex[:8]))
+        self._running.append(self._launcher.start(self._config, uuid.uuid4().hex[:8]))
 
-    def _reap(self) -> None:
-        """Look after workers that are gone: their trials are free, and others take their place."""
+    def _replace_lost_workers(self) -> None:
+        """Release the trials of workers that are gone, and start others instead."""
         for one in [one for one in self._running if one.exitcode is not None]:
             self._running.remove(one)
-            if one.exitcode == 0:
+            # A reward function can end its process with 0, too.
+            if one.exitcode == 0 and patiently(self._is_done, self._config.config.patience_s):
                 self._all_made = True
                 continue
             if one.owner is not None and one.is_seen:
                 self._release(one.owner, is_lost=True)
             if one.exitcode == RunFailed.exit_code:
-                raise RunFailed(f"the study's database does not answer; {self._goes_on()}")
+                raise RunFailed(f"the study's database does not answer; {self._how_to_resume()}")
             if self._all_made:
                 continue
             self._losses += 1
             if self._losses > 2 * self._launcher.workers + _FEW:
                 raise RunFailed(
-                    f"workers die again and again; {self._plan.folder}/workers*.log tell why; {self._goes_on()}"
+                    f"workers die again and again; see {self._config.folder}/workers*.log for the reason; "
+                    f"{self._how_to_resume()}"
                 )
             self._start()
         if self._all_made:
-            # Whoever still waits for its place on a cluster is not needed.
+            # Workers that still wait for room on a cluster are not needed.
             for one in [one for one in self._running if one.owner is None]:
                 self._running.remove(one)
                 one.kill()
 
     def _release(self, owner: str, *, is_lost: bool = False, patience_s: float | None = None) -> None:
         patiently(
-            lambda: self._ledger.release(owner, is_lost=is_lost), patience_s or self._plan.config.patience_s
+            lambda: self._claims.release(owner, is_lost=is_lost),
+            patience_s or self._config.config.patience_s,
         )
 
-    def _slots(self) -> list[Slot]:
-        slots = patiently(self._ledger.slots, self._plan.config.patience_s)
-        ended = sum(slot.outcome is not None for slot in slots)
+    def _is_done(self) -> bool:
+        return self._claims.is_done(self._config.config.trials)
+
+    def _look(self) -> list[Claim]:
+        claims = patiently(self._claims.all, self._config.config.patience_s)
+        ended = sum(one.result is not None for one in claims)
         if ended != self._ended:
             self._ended, self._losses = ended, 0
-            self._on_ended(slots)
-        return slots
+            self._on_ended(claims)
+        return claims
 
-    def _give_up_if_hopeless(self, slots: Sequence[Slot]) -> None:
-        ended = [slot for slot in slots if slot.outcome is not None]
-        if len(ended) < min(_FEW, self._plan.config.trials) or any(slot.outcome != "FAIL" for slot in ended):
+    def _give_up_if_all_fail(self, claims: Sequence[Claim]) -> None:
+        results = [one.result for one in claims if one.result is not None]
+        if len(results) < min(_FEW, self._config.config.trials) or any(
+            one.state != "FAIL" for one in results
+        ):
             return
         # The same error names the file of another run in each.
-        folder = re.escape(str(self._plan.folder.resolve())) + r"/[^/\s:]+"
-        why = collections.Counter(re.sub(folder, "RUN", str(slot.attrs.get("reason"))) for slot in ended)
-        ((reason, count),) = why.most_common(1)
+        folder = re.escape(str(self._config.folder.resolve())) + r"/[^/\s:]+"
+        reasons = collections.Counter(re.sub(folder, "RUN", str(one.attrs.get("reason"))) for one in results)
+        ((reason, count),) = reasons.most_common(1)
         self._end()
-        raise RunFailed(f"all {len(ended)} trials so far failed, {count} of them with: {reason}")
+        raise RunFailed(f"all {len(results)} trials so far failed, {count} of them with: {reason}")
 
     def _end(self) -> None:
-        """Tell the workers to end, and wait for them."""
+        """Ask the workers to end, and wait for them."""
         for one in self._running:
             one.terminate()
         until = time.monotonic() + _LEAVE_S
@@ -154,10 +159,10 @@ class Driver:
             one.kill()
             if one.owner is None or not one.is_seen:
                 continue
-            # A database that is away frees the trial by itself, once its lease is over.
+            # If the database is away, the trial is free once its lease has run out.
             with contextlib.suppress(RunFailed):
                 self._release(one.owner, patience_s=1.0)
         self._running.clear()
 
-    def _goes_on(self) -> str:
-        return f"`deepracer-exp sweep study={self._plan.study}` resumes it"
+    def _how_to_resume(self) -> str:
+        return f"resume with `deepracer-exp sweep study={self._config.study}`"

@@ -1,89 +1,415 @@
-"""The pictures of a study: how its search went, what mattered, and how the trials' entropy did."""
+"""Figures of a study: Optuna's own plots in the style of the analysis pages, and two that Optuna does not draw.
+
+Ours are the entropy of all trials by outcome, and parallel coordinates: Optuna draws those without axes to drag along
+and with one trace per trial, which is slow for hundreds.
+"""
 
 import html
 import math
 import random
-from collections.abc import Callable, Sequence
-from itertools import accumulate, combinations
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import optuna
 import plotly.graph_objects as go
-from optuna.distributions import BaseDistribution, CategoricalDistribution
+from optuna.distributions import CategoricalDistribution
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
-from plotly.subplots import make_subplots
+from optuna.visualization import (
+    plot_optimization_history,
+    plot_param_importances,
+    plot_pareto_front,
+    plot_slice,
+)
 
-from deepracer_exp.analysis.chart import FAINT, INK
-from deepracer_exp.analysis.chart_layout import GRID, SPINE
-from deepracer_exp.analysis.chart_plotly import base_layout
-from deepracer_exp.analysis.chart_plotly_panel import NARROW_WIDTH
+from deepracer_exp.analysis.charts.style import CATEGORIES, GRID, INK, NARROW_WIDTH, SPINE, base_layout
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.files import METRICS, read_metrics
 
-from .fates import FATES, fate_of, words
-from .labels import MEASURES, number, objectives_of, short_keys, shown
+from .best import best_trial
+from .labels import OUTCOMES, outcome_of, outcome_words, parameter, short_keys
+from .objectives import MEASURES, NONE, objectives_of
 
 FEWEST_COMPLETE = 20
-"""Complete trials below which a parameter's importance is chance: the best quarter would be less than five trials."""
+"""Complete trials below which importance is chance: the best quarter would be fewer than five trials."""
+_EVALUATOR = PedAnovaImportanceEvaluator(target_quantile=0.25)
 _RESAMPLES = 40
-_FAR = 5.0
-"""Times the distance from the best to the median, from which on worse trials stand at the edge of an axis."""
-_NEAR = 0.25
-"""Share of the best value that a trial may be worse by without standing at the edge."""
 _MOST_PARAMETERS = 12
+_COLUMNS = 4
 _PANEL, _GAP = 210.0, 62.0
-"""Height of a panel on a narrow screen and the room between two of them, pixels."""
-_STEPS = tuple(step * 10.0**decade for decade in range(-3, 6) for step in (1, 2, 5))
+"""Height of a panel and the distance between two of them, pixels."""
+_FAR, _NEAR = 5.0, 0.25
+"""A trial is off the axis if it is farther from the best than this many times the median is, and worse than the best
+by more than this share of it."""
+_MOST_POINTS = 15_000  # of all entropy curves together: 0.3 MB of the page
+_FEWEST_POINTS = 12  # of a curve
+
+Target = Callable[[FrozenTrial], float]
 
 
 def figures(study: optuna.Study) -> dict[str, go.Figure]:
-    """Draw a study's pictures, each of them only if there is enough to show.
+    """Draw a study's figures, each only if there is enough to show.
 
     Returns:
-        By name: `history`, `pareto` (several objectives), `importance`, `slice`, `parallel`, `entropy`.
+        By name: `history`, `pareto` (several objectives), `importance`, `slice`, `parallel`, `entropy`. With several
+        objectives `history`, `importance` and `slice` are one each, such as `slice-lap_time`, and `pareto` one per
+        pair.
 
     Raises:
         BadInput: the study was not made by a sweep.
     """
-    # They draw with what is defined here.
-    from .entropy_figure import entropy_curves
-    from .parameter_figures import parallel, slices
-
     objectives = objectives_of(study)
     trials = study.get_trials(deepcopy=False)
-    drawn: dict[str, go.Figure | None] = {
-        "history": history(objectives, trials),
-        "pareto": pareto(study, objectives, trials) if len(objectives) > 1 else None,
-        "importance": None,
-        "slice": None,
-        "parallel": None,
-        "entropy": entropy_curves(study, trials),
-    }
-    if parameters := Parameters(study, trials):
-        drawn["importance"] = importance_bars(parameters)
-        drawn["slice"] = slices(objectives, trials, parameters)
-        drawn["parallel"] = parallel(objectives, trials, parameters)
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    drawn: dict[str, go.Figure | None] = {}
+    if complete:
+        keys = short_keys(sorted({key for trial in complete for key in trial.params}))
+        several = len(objectives) > 1
+        shares: dict[str, float] = {}
+        for at, objective in enumerate(objectives):
+            target = _target(at) if several else None
+            name = f"-{objective}" if several else ""
+            title = f": {MEASURES[objective].words}" if several else ""
+            drawn[f"history{name}"] = _history(study, complete, objective, at, target, title)
+            if len(complete) >= FEWEST_COMPLETE and len(keys) > 1:
+                # PED-ANOVA takes low values for good.
+                low_is_good = _target(at, 1.0 if MEASURES[objective].minimize else -1.0) if several else None
+                own = _importances(study, low_is_good)
+                drawn[f"importance{name}"] = _importance_bars(study, complete, own, keys, low_is_good, title)
+                shares = {key: max(share, shares.get(key, 0.0)) for key, share in own.items()}
+        shown = sorted(keys, key=lambda key: (-shares.get(key, 0.0), key))[:_MOST_PARAMETERS]
+        for at, objective in enumerate(objectives) if shown else ():
+            name, title = (f"-{objective}", f": {MEASURES[objective].words}") if several else ("", "")
+            drawn[f"slice{name}"] = _slices(study, complete, shown, keys, objective, at, title)
+        for pair in combinations(range(len(objectives)), 2):
+            name = "-".join(
+                ["pareto", *(objectives[at] for at in pair)] if len(objectives) > 2 else ["pareto"]
+            )
+            drawn[name] = _pareto(study, complete, objectives, pair)
+        if shown and len(complete) > 1:
+            drawn["parallel"] = _parallel(complete, shown, keys, objectives)
+    drawn["entropy"] = _entropy_curves(study, trials)
     return {name: figure for name, figure in drawn.items() if figure is not None}
 
 
-def value_of(trial: FrozenTrial, objectives: Sequence[str], at: int) -> float | None:
-    """Return a trial's value of one objective: of a pruned one the last it had, None if it has none."""
-    value: float | None = None
-    if trial.state == TrialState.COMPLETE:
-        value = trial.values[at]
-    elif trial.state == TrialState.PRUNED and len(objectives) == 1 and trial.intermediate_values:
-        value = trial.intermediate_values[max(trial.intermediate_values)]
-    return value if value is not None and math.isfinite(value) else None
+def narrowed(figure: go.Figure) -> go.Figure:
+    """Return a figure with a layout for a narrow screen: its panels below each other, the legend below them."""
+    layout, narrow = figure.layout, go.Figure(layout=figure.layout)
+    narrow.update_layout(base_layout(layout.meta["title"], NARROW_WIDTH))
+    head = layout.margin.t + 20.0 * narrow.layout.title.text.count("<br>")
+    names = {trace.name for trace in figure.data if trace.name} if layout.showlegend else ()
+    foot = layout.margin.b + 22.0 * len(names)
+    body = layout.height - layout.margin.t - layout.margin.b
+    if len(_panels(figure)) > 1:
+        body = _arrange(narrow, _panels(figure), 1)
+    narrow.update_layout(
+        height=round(head + body + foot),
+        margin={"l": 62, "r": 12, "t": head, "b": foot},
+        legend={"orientation": "h", "x": 0, "y": -layout.margin.b / body, "yanchor": "top"},
+    )
+    return narrow
 
 
-def plain(text: object, longest: int = 90) -> str:
-    """Return a text for Plotly, which takes tags and entities for what they are in HTML."""
-    cut = str(text) if len(str(text)) <= longest else f"{str(text)[: longest - 1]}…"
-    return html.escape(cut, quote=False)
+def least_width(figure: go.Figure) -> int:
+    """Return the pixels below which a figure cannot be read: each parallel axis needs room for its values."""
+    return max((95 * len(trace.dimensions) for trace in figure.data if trace.type == "parcoords"), default=0)
 
 
-def short(value: float) -> float:
-    """Return a value with as many digits as anybody can see: a page has tens of thousands of them."""
-    return float(f"{value:.5g}")
+def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
+    """Return the ends of an axis that shows the better trials well; far worse ones lie off it.
+
+    A trial without a lap has ten times the seconds of one with laps, beside which all laps would look the same.
+
+    Args:
+        values: of the complete trials, one at least.
+        minimize: whether less is better.
+    """
+    sign = 1.0 if minimize else -1.0
+    costs = sorted(sign * value for value in values)
+    best, median = costs[0], costs[max((len(costs) - 1) // 2, min(1, len(costs) - 1))]
+    edge = max(median + _FAR * (median - best), best + _NEAR * abs(best))
+    worst = max(cost for cost in costs if cost <= edge)
+    margin = 0.06 * (worst - best) or 0.5
+    low, high = sorted((sign * (best - margin), sign * (worst + margin)))
+    return low, high
+
+
+def _target(at: int, sign: float = 1.0) -> Target:
+    return lambda trial: sign * trial.values[at]
+
+
+def _styled(figure: go.Figure, title: str, height: float, *, legend: bool = True) -> go.Figure:
+    """Apply the style that all figures share."""
+    figure.update_layout(
+        base_layout(title),
+        meta={"title": title},
+        height=round(height),
+        width=None,
+        margin={"l": 70, "r": 20, "t": 60, "b": 60},
+        showlegend=legend,
+        legend={"itemsizing": "constant", "font": {"size": 13}},
+        colorway=CATEGORIES,
+    )
+    axes = {"gridcolor": GRID, "zeroline": False, "linecolor": SPINE, "title": {"font": {"size": 13}}}
+    figure.update_xaxes(**axes)
+    figure.update_yaxes(**axes)
+    return figure
+
+
+def _value_axis(complete: Sequence[FrozenTrial], objective: str, at: int) -> dict[str, Any]:
+    measure = MEASURES[objective]
+    values = [trial.values[at] for trial in complete]
+    return {"title_text": measure.label, "range": usual_range(values, measure.minimize)}
+
+
+def _panels(figure: go.Figure) -> list[str]:
+    """Return the numbers of a figure's pairs of axes, as Plotly names them: "", "2", "3", ..."""
+    used = {(trace.yaxis or "y")[1:] for trace in figure.data if "yaxis" in trace}
+    return sorted(used, key=lambda number: int(number or 1))
+
+
+def _arrange(figure: go.Figure, panels: Sequence[str], columns: int) -> float:
+    """Arrange panels in a grid; return its height, pixels."""
+    rows = math.ceil(len(panels) / columns)
+    body = rows * (_PANEL + _GAP) - _GAP
+    for at, number in enumerate(panels):
+        row, column = divmod(at, columns)
+        top = 1 - row * (_PANEL + _GAP) / body
+        domain = column / columns + 0.03 * (column > 0), (column + 1) / columns - 0.01 * (columns > 1)
+        figure.layout[f"yaxis{number}"].update(domain=(max(0.0, top - _PANEL / body), top))
+        figure.layout[f"yaxis{number}"].update(showticklabels=column == 0)
+        figure.layout[f"xaxis{number}"].update(domain=domain)
+    return body
+
+
+def _history(
+    study: optuna.Study,
+    complete: Sequence[FrozenTrial],
+    objective: str,
+    at: int,
+    target: Target | None,
+    title: str,
+) -> go.Figure:
+    figure = plot_optimization_history(study, target=target, target_name=MEASURES[objective].title)
+    _styled(figure, f"Values of the complete trials{title}", 440)
+    figure.update_xaxes(title_text="trial", tickformat="d")
+    return figure.update_yaxes(**_value_axis(complete, objective, at))
+
+
+def _pareto(
+    study: optuna.Study, complete: Sequence[FrozenTrial], objectives: Sequence[str], pair: tuple[int, int]
+) -> go.Figure:
+    names = [objectives[at] for at in pair]
+    figure = plot_pareto_front(
+        study,
+        targets=lambda trial: [trial.values[at] for at in pair],
+        target_names=[MEASURES[name].label for name in names],
+    )
+    _styled(figure, "Pareto front: no other trial is better in every objective", 480)
+    figure.update_xaxes(**_value_axis(complete, names[0], pair[0]))
+    return figure.update_yaxes(**_value_axis(complete, names[1], pair[1]))
+
+
+def _importances(study: optuna.Study, target: Target | None) -> dict[str, float]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of any target: that low values are taken for good
+        return get_param_importances(study, evaluator=_EVALUATOR, target=target)
+
+
+def _importance_bars(
+    study: optuna.Study,
+    complete: Sequence[FrozenTrial],
+    shares: Mapping[str, float],
+    keys: Mapping[str, str],
+    target: Target | None,
+    title: str,
+) -> go.Figure | None:
+    """Draw importances with 90 per cent intervals from as many trials drawn from these, with replacement."""
+    if not any(shares.values()):  # all trials have the same values
+        return None
+    draws = []
+    for seed in range(_RESAMPLES):
+        again = optuna.create_study(directions=study.directions)
+        again.add_trials(random.Random(seed).choices(complete, k=len(complete)))
+        draws.append(_importances(again, target))
+    shown = list(shares)[:_MOST_PARAMETERS]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # as in `_importances`
+        figure = plot_param_importances(study, evaluator=_EVALUATOR, target=target)
+    _styled(figure, f"Which parameters mattered most{title}", 150 + 34 * len(shown), legend=False)
+    (bars,) = figure.data
+    kept = [at for at, key in enumerate(bars.y) if key in shown]
+    names = [bars.y[at] for at in kept]
+    ends = {key: sorted(draw.get(key, 0.0) for draw in draws) for key in names}
+    low = {key: ends[key][_RESAMPLES // 20] for key in names}
+    high = {key: ends[key][-1 - _RESAMPLES // 20] for key in names}
+    bars.update(
+        x=[shares[key] for key in names],
+        y=[_plain(keys[key], 40) for key in names],
+        text=[f" {shares[key]:.0%} ({low[key]:.0%} to {high[key]:.0%})" for key in names],
+        textposition="none",
+        hovertemplate=[f"{_plain(key)}: %{{text}}<extra></extra>" for key in names],
+        error_x={
+            "type": "data", "symmetric": False, "color": INK, "thickness": 1.2, "width": 4,
+            "array": [max(high[key] - shares[key], 0.0) for key in names],
+            "arrayminus": [max(shares[key] - low[key], 0.0) for key in names],
+        },
+    )  # fmt: skip
+    for label, text in zip(bars.y, bars.text, strict=True):
+        figure.add_annotation(x=1, xref="x domain", xanchor="right", y=label, text=text, showarrow=False)
+    ticks = [at / 5 for at in range(6)]
+    figure.update_xaxes(
+        title_text="importance for being in the best quarter",
+        range=[0, 1.28],
+        tickvals=ticks,
+        tickformat=".0%",
+    )
+    return figure.update_yaxes(title_text="", automargin=True, ticksuffix="  ")
+
+
+def _slices(
+    study: optuna.Study,
+    complete: Sequence[FrozenTrial],
+    shown: Sequence[str],
+    keys: Mapping[str, str],
+    objective: str,
+    at: int,
+    title: str,
+) -> go.Figure:
+    figure = plot_slice(study, list(shown), target=_target(at), target_name=MEASURES[objective].title)
+    panels = _panels(figure)
+    _styled(figure, f"Each parameter against the value{title}", _PANEL, legend=False)
+    figure.update_traces(marker={"size": 7, "colorscale": "Viridis", "line": {"width": 0}})
+    body = _arrange(figure, panels, min(_COLUMNS, len(panels)))
+    figure.update_layout(height=round(body + 120), margin={"r": 90})
+    figure.update_xaxes(tickangle=0, nticks=4, exponentformat="power")
+    figure.for_each_xaxis(
+        lambda axis: axis.update(range=[-0.5, len(axis.categoryarray) - 0.5]), {"type": "category"}
+    )
+    figure.for_each_xaxis(lambda axis: axis.title.update(text=_plain(keys[axis.title.text], 40)))
+    figure.update_yaxes(**_value_axis(complete, objective, at) | {"title_text": ""})
+    for number in panels[::_COLUMNS]:
+        figure.layout[f"yaxis{number}"].title.text = MEASURES[objective].label
+    return figure
+
+
+def _parallel(
+    complete: Sequence[FrozenTrial], shown: Sequence[str], keys: Mapping[str, str], objectives: Sequence[str]
+) -> go.Figure:
+    """Draw every complete trial as a line through its parameters, coloured by its first objective."""
+    axes = []
+    for at, objective in enumerate(objectives):
+        measure = MEASURES[objective]
+        low, high = usual_range([trial.values[at] for trial in complete], measure.minimize)
+        values = [_short(min(max(trial.values[at], low), high)) for trial in complete]
+        axes.append({"label": measure.label, "values": values, "range": (low, high)})
+    axes += [_parameter_axis(key, keys[key], complete) for key in shown]
+    lines = go.Parcoords(
+        dimensions=axes,
+        line={
+            "color": axes[0]["values"],
+            "colorscale": "Viridis",
+            "reversescale": not MEASURES[objectives[0]].minimize,
+            "showscale": True,
+            "colorbar": {"title": {"text": axes[0]["label"], "side": "right"}, "thickness": 14},
+        },
+        labelangle=-12 if len(axes) > 7 else 0,
+        unselected={"line": {"opacity": 0.06}},
+    )
+    figure = _styled(go.Figure(lines), "Every complete trial a line: drag along an axis to choose", 480)
+    return figure.update_layout(margin={"l": 90, "r": 40, "t": 130 if len(axes) > 7 else 110, "b": 30})
+
+
+def _parameter_axis(key: str, label: str, trials: Sequence[FrozenTrial]) -> dict[str, Any]:
+    """Return an axis of parallel coordinates; a trial without the parameter crosses it at a dash."""
+    distribution: Any = next(trial.distributions[key] for trial in trials if key in trial.params)
+    params = [trial.params.get(key) for trial in trials]
+    axis: dict[str, Any] = {"label": _plain(label, 40)}
+    if isinstance(distribution, CategoricalDistribution):
+        choices = [one for one in distribution.choices if one in params]
+        ticks = [NONE] * (None in params) + [_plain(one, 24) for one in choices]
+        first = len(ticks) - len(choices)
+        places = [0 if one is None else first + choices.index(one) for one in params]
+        return axis | {"values": places, "tickvals": list(range(len(ticks))), "ticktext": ticks}
+    scale: Callable[[float], float] = math.log10 if distribution.log else float
+    low, high = scale(distribution.low), scale(distribution.high)
+    ends = [low + part * (high - low) / 4 for part in range(5)]
+    texts = [parameter(10**end if distribution.log else end) for end in ends]
+    below = low - 0.12 * (high - low or 1.0)
+    axis["values"] = [below if one is None else _short(scale(one)) for one in params]
+    if None in params:
+        return axis | {"range": (below, high), "tickvals": [below, *ends], "ticktext": [NONE, *texts]}
+    return axis | {"range": (low, high if high > low else low + 1.0), "tickvals": ends, "ticktext": texts}
+
+
+def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Figure | None:
+    """Draw the entropy of every trial's policy during training, coloured by the trial's outcome."""
+    rows = {trial.number: runs for trial in trials if (runs := _rows(study, trial))}
+    if not rows:
+        return None
+    every = [row for runs in rows.values() for run in runs for row in run]
+    column = "entropy_share" if any(row.get("entropy_share") is not None for row in every) else "entropy"
+    most = max(_FEWEST_POINTS, _MOST_POINTS // sum(map(len, rows.values())))
+    known = [trial for trial in trials if trial.number in rows]
+    figure = go.Figure()
+    for outcome, style in OUTCOMES.items():
+        if some := [trial for trial in known if outcome_of(trial) == outcome]:
+            line = {"color": style.color, "dash": style.dash, "width": 1.3}
+            look = {"name": outcome_words(outcome), "line": line, "opacity": 0.75}
+            figure.add_trace(_curves(some, rows, column, most, look))
+    if any(trial.state == TrialState.COMPLETE for trial in trials):
+        best = best_trial(study)
+        if best.number in rows:
+            look = {"name": f"best: trial {best.number}"}
+            look |= {"line": {"color": OUTCOMES[outcome_of(best)].color, "width": 4.5}}
+            figure.add_trace(_curves([best], rows, column, most, look))
+    _styled(figure, "Entropy of the policies, by outcome of their trials", 460)
+    figure.update_xaxes(title_text="control steps", rangemode="tozero")
+    if column == "entropy_share":
+        return figure.update_yaxes(title_text="entropy, share of a random policy's", tickformat=".0%")
+    return figure.update_yaxes(title_text="entropy, nats")
+
+
+def _curves(
+    trials: Sequence[FrozenTrial],
+    rows: Mapping[int, list[list[dict[str, Any]]]],
+    column: str,
+    most: int,
+    look: Mapping[str, Any],
+) -> go.Scatter:
+    """Return the curves of trials as one trace with gaps between them, since hundreds of traces would be slow."""
+    x: list[int | None] = []
+    y: list[float | None] = []
+    numbers: list[int] = []
+    for trial in trials:
+        for run in rows[trial.number]:
+            known = [row for row in run if row.get(column) is not None and math.isfinite(row[column])]
+            some = thinned(known, most)
+            x += [*(int(row["env_steps"]) for row in some), None]
+            y += [*(round(row[column], 4) for row in some), None]
+            numbers += [trial.number] * (len(some) + 1)
+    hover = "<b>Trial %{customdata}</b><br>%{x:.3s} steps: %{y:.3f}<extra></extra>"
+    return go.Scatter(x=x, y=y, mode="lines", customdata=numbers, hovertemplate=hover, **look)
+
+
+def _rows(study: optuna.Study, trial: FrozenTrial) -> list[list[dict[str, Any]]]:
+    """Return the rows of a trial's runs, without runs whose files are gone or incomplete."""
+    stored = [run.get("run_dir") for run in trial.user_attrs.get("runs") or ()]
+    base = Path(study.user_attrs.get("runs_dir", "runs")) / study.study_name
+    found = []
+    for folder in dict.fromkeys(Path(name) for name in stored or [trial.user_attrs.get("run_dir")] if name):
+        candidates = (base / folder.name / METRICS, folder / METRICS)
+        file = next((one for one in candidates if one.is_file()), None)
+        try:
+            rows = [] if file is None else read_metrics(file)
+        except BadInput:
+            continue
+        if rows := [row for row in rows if isinstance(row.get("env_steps"), int)]:
+            found.append(rows)
+    return found
 
 
 def thinned(rows: Sequence[Any], most: int) -> list[Any]:
@@ -93,327 +419,12 @@ def thinned(rows: Sequence[Any], most: int) -> list[Any]:
     return [rows[round(at * (len(rows) - 1) / (most - 1))] for at in range(most)]
 
 
-def styled(figure: go.Figure, title: str, height: int, *, legend: bool = True) -> go.Figure:
-    """Give a figure the look that all share."""
-    figure.update_layout(
-        base_layout(title),
-        meta={"title": title},
-        height=height,
-        margin={"l": 70, "r": 20, "t": 60, "b": 60},
-        showlegend=legend,
-        legend={"itemsizing": "constant", "font": {"size": 13}},
-    )
-    axes = {"gridcolor": GRID, "zeroline": False, "linecolor": SPINE, "title": {"font": {"size": 13}}}
-    figure.update_xaxes(**axes)
-    figure.update_yaxes(**axes)
-    return figure
+def _plain(text: object, longest: int = 90) -> str:
+    """Return a text escaped for Plotly, which reads tags and entities as HTML."""
+    cut = str(text) if len(str(text)) <= longest else f"{str(text)[: longest - 1]}…"
+    return html.escape(cut, quote=False)
 
 
-def narrowed(figure: go.Figure) -> go.Figure:
-    """Return a figure with a layout for a narrow screen: its panels below each other, the legend below them."""
-    used = {trace.yaxis or "y" for trace in figure.data if "yaxis" in trace}
-    panels = sorted((axis for axis in used), key=lambda axis: int(axis[1:] or 1))
-    layout, narrow = figure.layout, go.Figure(layout=figure.layout)
-    narrow.update_layout(base_layout(layout.meta["title"], NARROW_WIDTH))
-    head = layout.margin.t + 20.0 * narrow.layout.title.text.count("<br>")
-    names = {trace.name for trace in figure.data if trace.name} if layout.showlegend else ()
-    foot = layout.margin.b + 22.0 * len(names)
-    bodies = (
-        len(panels) * (_PANEL + _GAP) - _GAP if panels else layout.height - layout.margin.t - layout.margin.b
-    )
-    if len(panels) > 1:
-        for at, axis in enumerate(panels):
-            top = 1 - at * (_PANEL + _GAP) / bodies
-            narrow.layout[f"yaxis{axis[1:]}"].domain = (max(0.0, top - _PANEL / bodies), top)
-            narrow.layout[f"xaxis{axis[1:]}"].domain = (0.0, 1.0)
-    narrow.update_layout(
-        height=round(head + bodies + foot),
-        margin={"l": 62, "r": 12, "t": head, "b": foot},
-        legend={"orientation": "h", "x": 0, "y": -layout.margin.b / bodies, "yanchor": "top"},
-    )
-    return narrow
-
-
-def least_width(figure: go.Figure) -> int:
-    """Return the pixels below which a figure cannot be read: each of many parallel axes needs room for its values."""
-    return max((95 * len(trace.dimensions) for trace in figure.data if trace.type == "parcoords"), default=0)
-
-
-def usual_range(complete: Sequence[float], values: Sequence[float], minimize: bool) -> tuple[float, float]:
-    """Return the ends of an axis that trials far worse than the better half do not squeeze: these stand at its edge.
-
-    A trial without a lap comes to ten times the seconds of one with laps, beside which all laps look the same.
-
-    Args:
-        complete: what the complete trials came to, whose better half says what is usual.
-        values: what all trials came to, one at least.
-        minimize: whether less is better.
-    """
-    sign = 1.0 if minimize else -1.0
-    costs = sorted(sign * value for value in values)
-    judged = sorted(sign * value for value in complete) or costs
-    best, median = judged[0], judged[max((len(judged) - 1) // 2, min(1, len(judged) - 1))]
-    edge = max(median + _FAR * (median - best), best + _NEAR * abs(best))
-    inside = [cost for cost in costs if cost <= edge]
-    # A tenth more than the usual ones, so that the edge is not where the worst of them is.
-    worst = inside[-1] if len(inside) == len(costs) else inside[-1] + 0.1 * (inside[-1] - costs[0])
-    ends = sorted((sign * costs[0], sign * worst))
-    return ends[0], ends[1]
-
-
-class ValueAxis:
-    """An axis of an objective; what lies beyond its end is drawn at its edge."""
-
-    def __init__(self, objective: str, trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> None:
-        """Look at the values of all trials."""
-        at = objectives.index(objective)
-        self.name, self.measure = objective, MEASURES[objective]
-        found = {trial.number: value_of(trial, objectives, at) for trial in trials}
-        self.values = {trial: value for trial, value in found.items() if value is not None}
-        """By the number of the trial, those that have one."""
-        complete = [trial.values[at] for trial in trials if trial.state == TrialState.COMPLETE]
-        minimize = self.measure.minimize
-        low, high = usual_range(complete, list(self.values.values()), minimize) if self.values else (0.0, 0.0)
-        self.ends = (low, high) if high > low else (low - 0.5, high + 0.5)
-        """The lowest and highest place."""
-        self.beyond = [value for value in self.values.values() if not self.ends[0] <= value <= self.ends[1]]
-        """Values that stand at its edge."""
-
-    def place(self, trial: FrozenTrial) -> float:
-        """Return where a trial is drawn."""
-        low, high = self.ends
-        return short(min(max(self.values[trial.number], low), high))
-
-    def ticks(self) -> dict[str, Any]:
-        """Return values and texts of ticks; where trials stand at its edge the tick there says so."""
-        low, high = self.ends
-        step = next(s for s in _STEPS if (high - low) / s <= 6)
-        numbers = [step * at for at in range(math.ceil(low / step), math.floor(high / step) + 1)]
-        texts = [f"{one:.10g}" for one in numbers]
-        if self.beyond:
-            edge, sign = (high, "≥") if self.measure.minimize else (low, "≤")
-            kept = [at for at, one in enumerate(numbers) if abs(edge - one) > 0.5 * step]
-            numbers, texts = [numbers[at] for at in kept], [texts[at] for at in kept]
-            numbers.append(edge)
-            texts.append(f"{sign} {edge:.4g}")
-        return {"tickvals": numbers, "ticktext": texts}
-
-    def beyond_words(self) -> str:
-        """Return what stands at the edge: ``2 trials at the edge lie beyond it: 226.00 s to 230.00 s``."""
-        ends = dict.fromkeys(shown(self.name, one) for one in (min(self.beyond), max(self.beyond)))
-        plural = "s" * (len(self.beyond) > 1)
-        return f"{len(self.beyond)} trial{plural} at the edge lie{'' if plural else 's'} beyond it: {' to '.join(ends)}"
-
-    def layout(self) -> dict[str, Any]:
-        """Return the settings of the axis."""
-        low, high = self.ends
-        margin = 0.06 * (high - low)
-        return {"title": {"text": self.measure.label}, "range": [low - margin, high + margin], **self.ticks()}
-
-
-def log_axis(low: float, high: float) -> dict[str, Any]:
-    """Return the settings of a logarithmic axis with whole numbers at its ticks."""
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    steps = (1, 2, 5) if high / low < 50 else (1,)
-    ticks = [step * 10.0**decade for decade in decades for step in steps]
-    if sum(low <= tick <= high for tick in ticks) < 2:
-        ticks = [low, high]
-    margin = 0.04 * math.log10(high / low)
-    return {
-        "type": "log",
-        "tickvals": ticks,
-        "ticktext": [number(tick) for tick in ticks],
-        "range": [math.log10(low) - margin, math.log10(high) + margin],
-    }
-
-
-def by_fate(trials: Sequence[FrozenTrial]) -> dict[str, list[FrozenTrial]]:
-    """Return trials by their fate, in the order of FATES."""
-    groups = {fate: [trial for trial in trials if fate_of(trial) == fate] for fate in FATES}
-    return {fate: found for fate, found in groups.items() if found}
-
-
-_MOST_REASONS = 300  # that a pointing reader is told; the table has them
-HOVER = "<b>Trial %{customdata[0]}</b><br>%{customdata[1]}<br>%{customdata[2]}<extra></extra>"
-
-
-def told(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> list[list[Any]]:
-    """Return what a reader who points at a trial is told: its number, its values, why it ended."""
-    lines = []
-    for trial in trials:
-        values = [value_of(trial, objectives, at) for at in range(len(objectives))]
-        pairs = zip(objectives, values, strict=True)
-        known = [f"{MEASURES[name].words} {shown(name, value)}" for name, value in pairs if value is not None]
-        if trial.user_attrs.get("lap_time_s") is None:
-            known.append("no complete lap")
-        reason = trial.user_attrs.get("reason") if len(trials) <= _MOST_REASONS else None
-        lines.append([trial.number, ", ".join(known), plain(reason or words(fate_of(trial)))])
-    return lines
-
-
-def marks(trials: Sequence[FrozenTrial], fate: str, x: Sequence[Any], y: Sequence[Any]) -> go.Scatter:
-    """Return points of trials of one fate."""
-    look = FATES[fate]
-    marker = {"color": look.color, "symbol": look.symbol, "size": 9, "opacity": 0.85}
-    return go.Scatter(x=x, y=y, mode="markers", name=words(fate), legendgroup=fate, marker=marker)
-
-
-def history(objectives: Sequence[str], trials: Sequence[FrozenTrial]) -> go.Figure | None:
-    """Draw what each trial came to, and the best until then."""
-    figure = make_subplots(rows=len(objectives), shared_xaxes=True, vertical_spacing=0.07)
-    seen: set[str] = set()
-    for row, objective in enumerate(objectives, 1):
-        axis = ValueAxis(objective, trials, objectives)
-        known = [trial for trial in trials if trial.number in axis.values]
-        if not known:
-            return None
-        for fate, some in by_fate(known).items():
-            points = marks(some, fate, [trial.number for trial in some], list(map(axis.place, some)))
-            points.update(hovertemplate=HOVER, customdata=told(some, objectives), showlegend=fate not in seen)
-            seen.add(fate)
-            figure.add_trace(points, row=row, col=1)
-        complete = [trial for trial in known if trial.state == TrialState.COMPLETE]
-        better: Callable[[float, float], float] = min if axis.measure.minimize else max
-        line = go.Scatter(
-            x=[trial.number for trial in complete], y=list(accumulate(map(axis.place, complete), better)),
-            mode="lines", name="best so far", legendgroup="best", hoverinfo="skip", showlegend=row == 1,
-            line={"color": INK, "width": 1.6, "shape": "hv"},
-        )  # fmt: skip
-        figure.add_trace(line, row=row, col=1)
-        figure.update_yaxes(axis.layout(), row=row, col=1)
-        if axis.beyond:
-            figure.add_annotation(
-                text=axis.beyond_words(), x=1, xref="x domain", xanchor="right", y=1 if axis.measure.minimize else 0,
-                yref="y domain", yanchor="bottom" if axis.measure.minimize else "top", showarrow=False,
-                font={"size": 12, "color": FAINT}, row=row, col=1,
-            )  # fmt: skip
-    figure.update_xaxes(tickformat="d", nticks=min(12, len(trials) + 1))
-    figure.update_xaxes(title_text="trial", row=len(objectives), col=1)
-    title = "What the trials came to" + " (pruned ones: what they had by then)" * (len(objectives) == 1)
-    return styled(figure, title, 160 + 280 * len(objectives))
-
-
-def pareto(study: optuna.Study, objectives: Sequence[str], trials: Sequence[FrozenTrial]) -> go.Figure | None:
-    """Draw the complete trials by each two objectives, with those that no other beats in both in a ring."""
-    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    if not complete:
-        return None
-    front = {trial.number for trial in study.best_trials}
-    pairs = list(combinations(objectives, 2))
-    figure = make_subplots(cols=len(pairs), horizontal_spacing=0.08)
-    for column, names in enumerate(pairs, 1):
-        first, second = (ValueAxis(name, complete, objectives) for name in names)
-        for fate, some in by_fate(complete).items():
-            points = marks(some, fate, list(map(first.place, some)), list(map(second.place, some)))
-            points.update(hovertemplate=HOVER, customdata=told(some, objectives), showlegend=column == 1)
-            figure.add_trace(points, row=1, col=column)
-        ring = sorted((first.place(one), second.place(one)) for one in complete if one.number in front)
-        figure.add_trace(
-            go.Scatter(
-                x=[x for x, _ in ring], y=[y for _, y in ring], name="Pareto front", legendgroup="front",
-                mode="lines+markers" if len(objectives) == 2 else "markers", hoverinfo="skip",
-                line={"color": INK, "width": 1.2, "dash": "dot"}, showlegend=column == 1,
-                marker={"size": 16, "color": INK, "symbol": "circle-open", "line": {"width": 1.8}},
-            ),
-            row=1, col=column,
-        )  # fmt: skip
-        figure.update_xaxes(first.layout(), row=1, col=column)
-        figure.update_yaxes(second.layout(), row=1, col=column)
-    return styled(figure, "Pareto front: no trial is better in everything than those in a ring", 480)
-
-
-class Parameters:
-    """What a study searched: its parameters, the most important first."""
-
-    def __init__(self, study: optuna.Study, trials: Sequence[FrozenTrial]) -> None:
-        """Look at all trials; a parameter may be of some of them only."""
-        self.distributions: dict[str, BaseDistribution] = {}
-        for trial in trials:
-            self.distributions |= trial.distributions
-        complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-        self.importance: dict[str, float] = {}
-        self.interval: dict[str, tuple[float, float]] = {}
-        """90 per cent of the importances that come out of as many trials drawn from these, with replacement."""
-        self.complete = len(complete)
-        differ = len({tuple(trial.values) for trial in complete}) > 1
-        if len(self.distributions) > 1 and differ and len(complete) >= FEWEST_COMPLETE:
-            evaluator = PedAnovaImportanceEvaluator(target_quantile=0.25)
-            self.importance = get_param_importances(study, evaluator=evaluator)
-            draws = [_importance_again(study, complete, evaluator, seed) for seed in range(_RESAMPLES)]
-            for key in self.importance:
-                shares = sorted(draw.get(key, 0.0) for draw in draws)
-                self.interval[key] = shares[_RESAMPLES // 20], shares[-1 - _RESAMPLES // 20]
-        order = sorted(self.distributions, key=lambda key: (-self.importance.get(key, 0.0), key))
-        self.shown = order[:_MOST_PARAMETERS]
-        """Those that there is room for."""
-        self.labels = {key: plain(label, 40) for key, label in short_keys(order).items()}
-
-    def __bool__(self) -> bool:
-        """Return whether anything was searched."""
-        return bool(self.distributions)
-
-    def is_log(self, key: str) -> bool:
-        """Return whether a parameter was searched on a logarithmic scale."""
-        return bool(getattr(self.distributions[key], "log", False))
-
-    def choices(self, key: str) -> list[str] | None:
-        """Return what a parameter was chosen from, None for a number."""
-        distribution = self.distributions[key]
-        if not isinstance(distribution, CategoricalDistribution):
-            return None
-        cut = [plain(choice, 24) for choice in distribution.choices]
-        return cut if len({*cut}) == len(cut) else [f"{at}: {one}" for at, one in enumerate(cut)]
-
-    def shown_value(self, key: str, value: Any) -> Any:
-        """Return what stands for a value on an axis: its choice's text, or the number itself."""
-        choices, distribution = self.choices(key), self.distributions[key]
-        if choices is None or not isinstance(distribution, CategoricalDistribution):
-            return short(value)
-        return choices[int(distribution.to_internal_repr(value))]
-
-    def room(self, key: str) -> tuple[float, float]:
-        """Return the ends of a number's range, which are never the same."""
-        distribution: Any = self.distributions[key]
-        low, high = float(distribution.low), float(distribution.high)
-        return low, high if high > low else low + max(abs(low), 1e-9)
-
-
-def _importance_again(
-    study: optuna.Study, complete: Sequence[FrozenTrial], evaluator: PedAnovaImportanceEvaluator, seed: int
-) -> dict[str, float]:
-    """Return the importances in a bootstrap sample of a study's complete trials."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)  # it says of each study that it is made
-    again = optuna.create_study(directions=study.directions)
-    again.add_trials(random.Random(seed).choices(complete, k=len(complete)))
-    return get_param_importances(again, evaluator=evaluator)
-
-
-def importance_bars(parameters: Parameters) -> go.Figure | None:
-    """Draw how much each parameter mattered for a trial to be among the best quarter (PED-ANOVA)."""
-    if not parameters.importance:
-        return None
-    keys = [key for key in parameters.shown if key in parameters.importance][::-1]
-    shares = [100 * parameters.importance[key] for key in keys]
-    ends = [tuple(100 * end for end in parameters.interval[key]) for key in keys]
-    bars = go.Bar(
-        x=shares, y=[parameters.labels[key] for key in keys], orientation="h", marker_color="#0072B2",
-        hovertext=[plain(key) for key in keys], hoverinfo="text",
-        error_x={
-            "type": "data", "symmetric": False, "color": INK, "thickness": 1.2, "width": 4,
-            "array": [max(high - share, 0.0) for share, (_, high) in zip(shares, ends, strict=True)],
-            "arrayminus": [max(share - low, 0.0) for share, (low, _) in zip(shares, ends, strict=True)],
-        },
-    )  # fmt: skip
-    figure = styled(go.Figure(bars), "What mattered most", 150 + 34 * len(keys), legend=False)
-    figure.update_xaxes(
-        title_text="importance for being in the best quarter, %",
-        range=[0, 128],
-        tickvals=list(range(0, 101, 20)),
-    )
-    for key, share, (low, high) in zip(keys, shares, ends, strict=True):
-        figure.add_annotation(
-            text=f"{share:.0f} % ({low:.0f} to {high:.0f})", x=1, xref="x domain", xanchor="right",
-            y=parameters.labels[key], showarrow=False, font={"size": 12, "color": INK},
-        )  # fmt: skip
-    figure.update_yaxes(automargin=True, ticksuffix="  ")
-    return figure
+def _short(value: float) -> float:
+    """Return a value with the digits that are visible, because a page has tens of thousands of values."""
+    return float(f"{value:.5g}")

@@ -1,82 +1,61 @@
-"""What keys and values of a study are called where somebody reads them."""
+"""Labels for people: how trials ended, with colours; short names of keys; numbers, steps and durations."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import optuna
-
-from deepracer_exp.errors import BadInput
-
-NONE = "\N{EN DASH}"
-"""Stands where there is no value."""
+from optuna.trial import FrozenTrial, TrialState
 
 
 @dataclass(frozen=True)
-class Measure:
-    """What an objective is measured in."""
+class OutcomeStyle:
+    """How trials with one outcome are drawn."""
 
-    title: str
-    unit: str
-    minimize: bool
-
-    @property
-    def label(self) -> str:
-        """Title and unit, for an axis."""
-        return f"{self.title}, {self.unit}"
-
-    @property
-    def words(self) -> str:
-        """The title within a sentence."""
-        return self.title[0].lower() + self.title[1:]
+    color: str
+    dash: str
+    """Of Plotly."""
+    meaning: str
 
 
-MEASURES: Mapping[str, Measure] = {
-    "race_score": Measure("Race score", "s", minimize=True),
-    "lap_time": Measure("Lap time", "s", minimize=True),
-    "completion": Measure("Completion", "%", minimize=False),
+OUTCOMES: Mapping[str, OutcomeStyle] = {
+    "finished": OutcomeStyle("#0072B2", "longdash", "used its whole budget"),
+    "converged": OutcomeStyle("#009E73", "solid", "learned to drive and stopped improving"),
+    "reliable": OutcomeStyle("#56B4E9", "dashdot", "completed enough laps"),
+    "plateau": OutcomeStyle("#A0C0E0", "dot", "stopped improving"),
+    "overfitting": OutcomeStyle("#E0C0A0", "dash", "lost held-out conditions while its return held"),
+    "collapsed": OutcomeStyle("#D55E00", "dash", "entropy fell before it could drive"),
+    "not_learning": OutcomeStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
+    "median": OutcomeStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
+    "percentile": OutcomeStyle(
+        "#882255", "dot", "worse than the given share of the others at the same point"
+    ),
+    "hyperband": OutcomeStyle("#A060E0", "dashdot", "lost its bracket"),
+    "wilcoxon": OutcomeStyle("#332288", "longdash", "lost to the best trial, seed by seed"),
+    "pruned": OutcomeStyle("#A04080", "solid", "worse than the others"),
+    "failed": OutcomeStyle("#000000", "longdashdot", "ended by an error"),
+    "running": OutcomeStyle("#9A9A9A", "dot", "still running"),
 }
-"""By the name of the objective. Race score: seconds per complete lap, failed laps included."""
+"""By the trial's attribute `fate`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from them
+for colour-blind readers, too, or are drawn with another dash."""
+
+_BY_STATE = {TrialState.COMPLETE: "finished", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
-def objectives_of(study: optuna.Study) -> tuple[str, ...]:
-    """Return the names of a study's objectives.
-
-    Raises:
-        BadInput: it was not made by a sweep.
-    """
-    told = study.user_attrs.get("objectives")
-    if (
-        not isinstance(told, list | tuple)
-        or len(told) != len(study.directions)
-        or not set(told) <= set(MEASURES)
-    ):
-        raise BadInput(
-            f"study {study.study_name}: has no objectives that a sweep writes ({', '.join(MEASURES)}); "
-            "it was not made by `deepracer-exp sweep`"
-        )
-    return tuple(told)
+def outcome_of(trial: FrozenTrial) -> str:
+    """Return how a trial ended, a key of OUTCOMES."""
+    if not trial.state.is_finished():
+        return "running"
+    stored = str(trial.user_attrs.get("fate"))
+    return stored if stored in OUTCOMES else _BY_STATE[trial.state]
 
 
-def shown(objective: str, value: float) -> str:
-    """Return a value with its unit: ``9.84 s``, ``97.3 %``."""
-    digits = 2 if MEASURES[objective].minimize else 1
-    return f"{value:.{digits}f} {MEASURES[objective].unit}"
-
-
-def described(objective: str, value: float | None) -> str:
-    """Return a value for a table: with its unit, or a dash."""
-    return NONE if value is None else shown(objective, value)
-
-
-def shown_values(objectives: Sequence[str], values: Sequence[float]) -> str:
-    """Return all values of a trial in words: ``lap time 9.84 s, completion 97.3 %``."""
-    pairs = zip(objectives, values, strict=True)
-    return ", ".join(f"{MEASURES[name].words} {shown(name, value)}" for name, value in pairs)
+def outcome_words(outcome: str) -> str:
+    """Return an outcome as people write it: ``not learning``."""
+    return outcome.replace("_", " ")
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
-    """Return for each dotted key its last part, or as many of its last parts as tell it from the others."""
+    """Return for each dotted key its last part, or as many last parts as distinguish it from the other keys."""
     parts = {key: key.split(".") for key in keys}
     found: dict[str, str] = {}
     for key, own in parts.items():
@@ -86,19 +65,16 @@ def short_keys(keys: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def number(value: float) -> str:
-    """Return a number short enough for a table or a tick: ``0.00031``, ``3.1e-5``, ``1200``."""
+def parameter(value: Any) -> str:
+    """Return a parameter's value for a table, short: ``0.00031``, ``3.1e-5``, ``1200``, ``mlp``."""
+    if not isinstance(value, float):
+        return str(value)
     text = f"{value:.3g}" if abs(value) < 1000 else f"{value:.4g}"
     return text.replace("e-0", "e-")
 
 
-def parameter(value: Any) -> str:
-    """Return a parameter's value for a table."""
-    return number(value) if isinstance(value, float) else str(value)
-
-
 def steps(count: float) -> str:
-    """Return a number of control steps in words: ``950``, ``81.9 k``, ``12.3 M``."""
+    """Return a number of control steps: ``950``, ``81.9 k``, ``12.3 M``."""
     for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if count >= size:
             return f"{count / size:.1f}{letter}"
@@ -106,7 +82,7 @@ def steps(count: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time in words: ``45 s``, ``12 min``, ``3.4 h``."""
+    """Return a time: ``45 s``, ``12 min``, ``3.4 h``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,8 +1,12 @@
-"""What gives up a trial before its end, by name."""
+"""Pruners by name: what ends a trial early, and says why."""
 
 import functools
 import warnings
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from optuna.exceptions import ExperimentalWarning
@@ -16,66 +20,90 @@ from optuna.pruners import (
 )
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState, create_trial
+from pydantic import TypeAdapter
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.stopping import EntropyStopping
+from deepracer_exp.config.stopping import EntropyStopping, StoppingConfig
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-
-from .entropy_pruner import EntropyPruner
-from .verdict import ExplainedPruner, Verdict
+from deepracer_exp.runs.convergence import Decision, Row, Stopping
+from deepracer_exp.runs.files import METRICS, RunRecord, read_config, read_metrics
+from deepracer_exp.training.stopping_replay import action_count
 
 _MEDIAN = 50.0
 _LEVEL = 0.1
-"""Of Wilcoxon's test at a look: how often a trial as good as the best one may be given up."""
+"""Significance level of Wilcoxon's test: how often a trial as good as the best one may be pruned."""
+_STOPPING: TypeAdapter[StoppingConfig] = TypeAdapter(StoppingConfig)
+_FOLLOWED = 32  # runs at a time; one that was forgotten is read from its first row again
 
 
-class AnyPruner(ExplainedPruner):
-    """Several pruners of one study: the first that gives a trial up has said so for good."""
+class PruneDecision(NamedTuple):
+    """Why a trial is pruned."""
 
-    def __init__(self, pruners: Sequence[ExplainedPruner]):
-        """Set it up; without a pruner no trial is given up."""
+    name: str
+    """`collapsed`, `not_learning`, `median`, `percentile`, `hyperband` or `wilcoxon`; the trial's outcome."""
+    reason: str
+    """One line."""
+
+
+class ExplainingPruner(BasePruner):
+    """A pruner that says why."""
+
+    @abstractmethod
+    def decide(self, study: Study, trial: FrozenTrial) -> PruneDecision | None:
+        """Return why the trial is pruned, None to continue."""
+
+    def prune(self, study: Study, trial: FrozenTrial) -> bool:
+        """Return whether the trial is pruned."""
+        return self.decide(study, trial) is not None
+
+
+class AnyPruner(ExplainingPruner):
+    """Several pruners of one study: the first that prunes a trial decides."""
+
+    def __init__(self, pruners: Sequence[ExplainingPruner]):
+        """Combine pruners; without any, no trial is pruned."""
         self._pruners = tuple(pruners)
-        self._given: dict[int, Verdict] = {}
+        self._decided: dict[int, PruneDecision] = {}
 
-    def verdict(self, study: Study, trial: FrozenTrial) -> Verdict | None:
-        """Return the first verdict, None to go on.
+    def decide(self, study: Study, trial: FrozenTrial) -> PruneDecision | None:
+        """Return the first decision, None to continue.
 
         Raises:
-            BadInput: as for `EntropyPruner.verdict`.
+            BadInput: as for `EntropyPruner.decide`.
         """
-        # Hyperband notes in the study that it was asked; a second time it would let the trial pass.
-        if trial.number not in self._given:
-            verdicts = (pruner.verdict(study, trial) for pruner in self._pruners)
-            found = next((verdict for verdict in verdicts if verdict is not None), None)
+        # Hyperband records in the study that it was asked; a second time it would let the trial pass.
+        if trial.number not in self._decided:
+            decisions = (pruner.decide(study, trial) for pruner in self._pruners)
+            found = next((decision for decision in decisions if decision is not None), None)
             if found is None:
                 return None
-            self._given[trial.number] = found
-        return self._given[trial.number]
+            self._decided[trial.number] = found
+        return self._decided[trial.number]
 
 
-class ComparingPruner(ExplainedPruner):
-    """One of Optuna's pruners that compare the scores of trials, with words for its verdict."""
+class ComparingPruner(ExplainingPruner):
+    """One of Optuna's pruners that compare the scores of trials, with a reason."""
 
     def __init__(self, name: str, pruner: BasePruner, percentile: float | None):
-        """Set it up.
+        """Wrap a pruner.
 
         Args:
-            name: for the verdict.
+            name: of the decision.
             pruner: of Optuna.
             percentile: per cent of the trials that are kept at each evaluation; None for hyperband.
         """
         self._name, self._pruner, self._percentile = name, pruner, percentile
 
-    def verdict(self, study: Study, trial: FrozenTrial) -> Verdict | None:
-        """Return why the trial is beaten, None to go on."""
+    def decide(self, study: Study, trial: FrozenTrial) -> PruneDecision | None:
+        """Return why the trial is pruned, None to continue."""
         step = trial.last_step
         if step is None or not self._pruner.prune(study, trial):
             return None
         if self._percentile is None:
             score = trial.intermediate_values[step]
-            return Verdict(self._name, f"{score:.4g} at evaluation {step} is not in the best third")
-        return Verdict(self._name, self._bound(study, trial, step, self._percentile))
+            return PruneDecision(self._name, f"{score:.4g} at evaluation {step} is not in the best third")
+        return PruneDecision(self._name, self._bound(study, trial, step, self._percentile))
 
     def _bound(self, study: Study, trial: FrozenTrial, step: int, percentile: float) -> str:
         upwards = study.direction == StudyDirection.MAXIMIZE
@@ -87,35 +115,130 @@ class ComparingPruner(ExplainedPruner):
         return f"{best:.4g} is the best up to evaluation {step}, {bound:.4g} the {what} there, trials: {len(there)}"
 
 
+class EntropyPruner(ExplainingPruner):
+    """The stopping rule `entropy`, applied to the files of a trial's run, where it stops a run early.
+
+    A run with a rule `entropy` of its own is judged by its own thresholds. The first decision on a run is final: a run
+    that has converged is never pruned, whatever follows.
+    """
+
+    def __init__(self, rules: EntropyStopping):
+        """Start without any run.
+
+        Args:
+            rules: for runs with another stopping rule.
+        """
+        self._rules = rules
+        self._followed: dict[str, _Followed] = {}
+
+    def decide(self, study: Study, trial: FrozenTrial) -> PruneDecision | None:
+        """Return `collapsed` or `not_learning` and the reason, None to continue.
+
+        A trial without a run, and a run without an iteration, continue.
+
+        Raises:
+            BadInput: the run's files are not what a training writes.
+        """
+        run_dir = trial.user_attrs.get("run_dir")
+        decision = None if run_dir is None else self._decision(run_dir)
+        if decision is None or not decision.hopeless:
+            return None
+        return PruneDecision(decision.rule, decision.why)
+
+    def _decision(self, run_dir: str) -> Decision | None:
+        path = Path(run_dir)
+        metrics = path / METRICS
+        if not metrics.exists():
+            return None
+        rows = read_metrics(metrics)
+        followed = self._followed.pop(run_dir, None)
+        if followed is None or not followed.continues_in(rows):
+            followed = _Followed(self._stopping(path))
+        followed.observe(rows)
+        self._followed[run_dir] = followed
+        if len(self._followed) > _FOLLOWED:
+            del self._followed[next(iter(self._followed))]
+        return followed.decision
+
+    def _stopping(self, path: Path) -> Stopping:
+        config = read_config(path)
+        own: Any = _STOPPING.validate_python(config["stopping"])
+        rules = own if isinstance(own, EntropyStopping) else self._rules
+        return Stopping(rules, action_count(RunRecord(path, config, [], {}, {})))
+
+
+@dataclass
+class _Followed:
+    """The part of a run seen so far."""
+
+    stopping: Stopping
+    rows: int = 0
+    last: Row | None = None
+    decision: Decision | None = None
+
+    def continues_in(self, rows: list[dict[str, Any]]) -> bool:
+        """Return whether these rows begin with those seen; a resumed run goes back to its checkpoint first."""
+        return self.rows == 0 or (len(rows) >= self.rows and rows[self.rows - 1] == self.last)
+
+    def observe(self, rows: list[dict[str, Any]]) -> None:
+        for row in rows[self.rows :]:
+            self.rows, self.last = self.rows + 1, row
+            if self.decision is None:
+                self.decision = self.stopping.observe(row)
+
+
+def _hyperband(config: SweepConfig, first: int, evaluations: int | None) -> BasePruner:
+    longest = "auto" if evaluations is None else max(evaluations, first)
+    return HyperbandPruner(min_resource=first, max_resource=longest, reduction_factor=3)
+
+
+_COMPARING: dict[str, Callable[[SweepConfig, int, int | None], BasePruner]] = {
+    "median": lambda config, first, _: MedianPruner(config.startup_trials, n_warmup_steps=first),
+    "percentile": lambda config, first, _: PercentilePruner(
+        config.percentile, config.startup_trials, n_warmup_steps=first
+    ),
+    "hyperband": _hyperband,
+}
+"""Pruners that compare trials by their first objective, from (sweep, first evaluation that counts, evaluations)."""
+
+
 def build_pruner(config: SweepConfig, evaluations: int | None = None) -> AnyPruner:
-    """Build the pruners that look at a running trial; wilcoxon looks at its seeds, see `is_beaten_across_seeds`.
+    """Build the pruners for running trials; wilcoxon compares seeds, see `is_worse_across_seeds`.
 
     Args:
         config: of the sweep.
-        evaluations: that a trial has at most on its way, for hyperband's brackets. None: as many as the first complete
-            trial had; each worker finds that out by itself, and not all of them find the same.
+        evaluations: the most that a trial has before its end, for hyperband's brackets. None: as many as the first
+            complete trial had; each worker finds that out by itself, and they may differ.
 
     Raises:
-        BadInput: pruners compare trials that have several objectives.
+        BadInput: a pruner compares trials, and they have several objectives.
     """
-    comparing = [name for name in config.pruners if name not in ("entropy", "wilcoxon")]
+    comparing = [name for name in config.pruners if name in _COMPARING]
     if comparing and len(config.objectives) > 1:
         raise BadInput(
             f"sweep.pruners={_list(config.pruners)}: {', '.join(comparing)} compare one score, and "
             f"sweep.objectives={_list(config.objectives)}; accepted with several: [entropy] or []"
         )
-    pruners: list[ExplainedPruner] = []
+    pruners: list[ExplainingPruner] = []
     if "entropy" in config.pruners:
         pruners.append(EntropyPruner(_standard_rules()))
-    pruners += [_comparing(name, config, evaluations) for name in comparing]
+    for name in comparing:
+        pruner = _COMPARING[name](config, config.warmup_evaluations + 1, evaluations)
+        if config.patience is not None:
+            with warnings.catch_warnings():
+                # Experimental in Optuna, whose version is pinned.
+                warnings.simplefilter("ignore", ExperimentalWarning)
+                pruner = PatientPruner(pruner, config.patience)
+        percentile = {"median": _MEDIAN, "percentile": config.percentile}.get(name)
+        pruners.append(ComparingPruner(name, pruner, percentile))
     return AnyPruner(pruners)
 
 
-def is_beaten_across_seeds(study: Study, values: Sequence[float]) -> bool:
-    """Return whether the best trial has beaten these values seed by seed, by Wilcoxon's signed-rank test.
+def is_worse_across_seeds(study: Study, values: Sequence[float]) -> bool:
+    """Return whether these values are worse than the best trial's, seed by seed, by Wilcoxon's signed-rank test.
 
-    The level is 0.1; with fewer than five seeds it is what the test can reach before the last seed, 2^-(seeds - 1),
-    and after one seed no test can say anything. With several objectives no trial is the best, and none is beaten.
+    The significance level is 0.1; with fewer than five seeds it is the least the test can reach before the last seed,
+    2^-(seeds - 1); after one seed no test can decide. With several objectives there is no best trial: False.
 
     Args:
         study: its complete trials have `runs` in their user attributes.
@@ -124,19 +247,18 @@ def is_beaten_across_seeds(study: Study, values: Sequence[float]) -> bool:
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if not complete or len(study.directions) > 1:
         return False
-    best = study.best_trial
-    rival = [run["value"][0] for run in best.user_attrs["runs"]]
+    rival = [run["value"][0] for run in study.best_trial.user_attrs["runs"]]
     level = max(_LEVEL, 1.01 * 0.5 ** (len(rival) - 1))
     with warnings.catch_warnings():
-        # Optuna may change WilcoxonPruner in a later version; its version is pinned.
+        # Experimental in Optuna, whose version is pinned.
         warnings.simplefilter("ignore", ExperimentalWarning)
         pruner = WilcoxonPruner(p_threshold=level)
-    # Of the best one the same seeds: its mean over more of them would say nothing about these.
+    # The best trial's same seeds only: its mean over more of them would say nothing about these.
     return pruner.prune(_BySeed(study.direction, _by_seed(rival[: len(values)])), _by_seed(values))
 
 
 class _BySeed(Study):
-    """A study whose best trial has a value at each seed instead of each evaluation; no more is asked of it."""
+    """A study whose best trial has a value per seed instead of per evaluation; the pruner asks for nothing else."""
 
     def __init__(self, direction: StudyDirection, best: FrozenTrial):
         self._direction, self._best = direction, best
@@ -154,32 +276,10 @@ def _by_seed(values: Sequence[float]) -> FrozenTrial:
     return create_trial(value=sum(values) / len(values), intermediate_values=dict(enumerate(values)))
 
 
-def _comparing(name: str, config: SweepConfig, evaluations: int | None) -> ComparingPruner:
-    first = config.warmup_evaluations + 1
-    percentile = {"median": _MEDIAN, "percentile": config.percentile}.get(name)
-    pruner: BasePruner
-    if name == "median":
-        pruner = MedianPruner(n_startup_trials=config.startup_trials, n_warmup_steps=first)
-    elif name == "percentile":
-        pruner = PercentilePruner(
-            config.percentile, n_startup_trials=config.startup_trials, n_warmup_steps=first
-        )
-    else:
-        longest = "auto" if evaluations is None else max(evaluations, first)
-        pruner = HyperbandPruner(min_resource=first, max_resource=longest, reduction_factor=3)
-    if config.patience is not None:
-        with warnings.catch_warnings():
-            # Optuna may change PatientPruner in a later version; its version is pinned.
-            warnings.simplefilter("ignore", ExperimentalWarning)
-            pruner = PatientPruner(pruner, config.patience)
-    return ComparingPruner(name, pruner, percentile)
-
-
 @functools.cache
 def _standard_rules() -> EntropyStopping:
     rules = compose_experiment(["stopping=entropy"])[0].stopping
-    if not isinstance(rules, EntropyStopping):
-        raise TypeError(f"stopping=entropy is a {type(rules).__name__}")
+    assert isinstance(rules, EntropyStopping)
     return rules
 
 

@@ -1,6 +1,7 @@
-"""One HTML page that tells all of a study, and needs nothing beside it."""
+"""The HTML page of a study, which needs nothing beside it."""
 
 import base64
+import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,28 +10,17 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.next_steps import COMMAND, outcome
+from deepracer_exp.analysis.next_steps import COMMAND
+from deepracer_exp.analysis.next_steps import outcome as outcome_of_run
 from deepracer_exp.analysis.page import plot, render
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.run_files import read_head
-from deepracer_exp.formats.user_file import read_bytes
-from deepracer_exp.formats.whole_file import write_whole
+from deepracer_exp.files import atomic_write, read_bytes
+from deepracer_exp.runs.files import BEST_LAP, read_head
 
 from .best import best_line, best_run, best_trial, best_values, complete_trials, reranked
-from .fates import FATES, fate_of, words
-from .figures import FEWEST_COMPLETE, figures, least_width, narrowed, value_of
-from .labels import (
-    MEASURES,
-    NONE,
-    described,
-    duration,
-    objectives_of,
-    parameter,
-    short_keys,
-    shown,
-    shown_values,
-    steps,
-)
+from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
+from .labels import OUTCOMES, duration, outcome_of, outcome_words, parameter, short_keys, steps
+from .objectives import MEASURES, NONE, objectives_of, shown, shown_or_dash, shown_values
 
 _MOST_ROWS = 300
 _MOST_FAILURES = 20
@@ -39,32 +29,31 @@ _LONGEST_REASON = 140
 _LONGEST_TRACEBACK = 4000
 _ORDER = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED, TrialState.FAIL, TrialState.WAITING)
 _NOTES = {
-    "history": "Complete trials are filled shapes, pruned ones crosses at what they had when they were pruned. "
-    "The line is the best complete trial until then. What is far worse than the better half, as a trial without "
-    "a complete lap, stands at the edge, and a line says how far it is beyond.",
-    "pareto": "Complete trials only.",
+    "history": "Complete trials only. Trials far worse than the better half, such as those without a complete lap, lie "
+    "outside the axis: double-click to see them all.",
+    "pareto": "Complete trials only. Trials far worse than the better half lie outside the axes: double-click to see "
+    "them all.",
     "importance": "PED-ANOVA over the complete trials: how much the values of the best quarter differ from those of "
-    "all. The lines and the numbers in brackets hold 90 % of what comes out when the trials are drawn again from these "
-    "(bootstrap): where two of them overlap, it is not known which mattered more. A parameter of some trials only is "
-    "measured among those.",
-    "slice": "A slope or a cloud at one end says where to search next.",
+    "all. The lines and the numbers in brackets are 90 % bootstrap intervals: where two of them overlap, it is not "
+    "known which parameter mattered more. A parameter that only some trials have is measured among those.",
+    "slice": "Complete trials, coloured by their number. A slope or a cloud at one end shows where to search next.",
     "parallel": "Drag along an axis to see only the trials in that part, drag a name to move its axis. A dash is a "
-    "trial without this parameter.",
+    "trial without this parameter. Trials far worse than the better half are at the end of the objective's axis.",
     "entropy": "Policies begin near the top (all actions alike) and come down as they settle. Click a word of the "
     "legend to hide its trials, twice to see them alone.",
 }
 
 
-def write_report(study: optuna.Study, path: Path) -> Path:
-    """Write a study's page, whole or not at all.
+def write_study_page(study: optuna.Study, path: Path) -> Path:
+    """Write a study's page atomically.
 
     Raises:
         BadInput: the study was not made by a sweep.
     """
-    return write_whole(path, report(study))
+    return atomic_write(path, study_page(study))
 
 
-def report(study: optuna.Study) -> str:
+def study_page(study: optuna.Study) -> str:
     """Return a study's page: HTML that loads nothing.
 
     Raises:
@@ -83,14 +72,14 @@ def report(study: optuna.Study) -> str:
         "report.html.j2",
         plots,
         study=study.study_name,
-        headline=headline(study),
-        fates=fates(trials),
-        outcome=_outcome(study, objectives, keys) if won else [],
-        steps=_next_steps(study) if won else [(_resume(study), "search on")],
+        headline=study_summary(study),
+        outcomes=outcomes(trials),
+        winner=_winner(study, keys) if won else [],
+        steps=_next_steps(study) if won else [(_resume(study), "continue the search")],
         picture=_picture(study) if won else None,
         best=best_trial(study).number if won else None,
         winners=_winners(study, objectives, keys),
-        notes=_NOTES,
+        notes={one.name: _NOTES[one.name.partition("-")[0]] for one in plots},
         too_few=None
         if sum(t.state == TrialState.COMPLETE for t in trials) >= FEWEST_COMPLETE
         else FEWEST_COMPLETE,
@@ -102,8 +91,8 @@ def report(study: optuna.Study) -> str:
     )
 
 
-def headline(study: optuna.Study) -> list[str]:
-    """Return what came of a study in a few sentences, the most important first."""
+def study_summary(study: optuna.Study) -> list[str]:
+    """Return the results of a study in a few sentences, the most important first."""
     objectives, trials = objectives_of(study), study.get_trials(deepcopy=False)
     ended = [trial for trial in trials if trial.state.is_finished()]
     complete = [trial for trial in ended if trial.state == TrialState.COMPLETE]
@@ -122,7 +111,7 @@ def headline(study: optuna.Study) -> list[str]:
             sentences.append(f"{len(study.best_trials)} trials are on the Pareto front.")
     else:
         sentences.append("No trial is complete, so there is no best one.")
-    spent, wasted = (_spent(some) for some in (ended, [t for t in ended if t.state != TrialState.COMPLETE]))
+    spent, wasted = _spent(ended), _spent([t for t in ended if t.state != TrialState.COMPLETE])
     share = f", {100 * wasted / spent:.0f} % of them in trials that were pruned or failed" if spent else ""
     sentences.append(
         f"{len(ended)} of {total} trials ended, {len(complete)} of them complete; they drove {steps(spent)} control "
@@ -131,29 +120,31 @@ def headline(study: optuna.Study) -> list[str]:
     return sentences
 
 
-def _outcome(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[tuple[str, str]]:
-    """Return what the winner is and what came of it, in names and values."""
+def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
+    """Return the winner's parameters and results, as names and values."""
     best = best_trial(study)
     found = [(f"{keys[key]}", parameter(value)) for key, value in best.params.items()]
-    found.append(("Lap time in evaluation", described("lap_time", best.user_attrs.get("lap_time_s"))))
-    found.append(("Completion in evaluation", described("completion", best.user_attrs.get("completion"))))
-    found.append(("How its training ended", str(best.user_attrs.get("reason") or words(fate_of(best)))))
+    found.append(("Lap time in evaluation", shown_or_dash("lap_time", best.user_attrs.get("lap_time_s"))))
+    found.append(("Completion in evaluation", shown_or_dash("completion", best.user_attrs.get("completion"))))
+    found.append(
+        ("How its training ended", str(best.user_attrs.get("reason") or outcome_words(outcome_of(best))))
+    )
     try:
         run = read_head(best_run(study))
     except BadInput:  # moved or removed since
         return found
-    return [pair for pair in outcome(run) if pair[0] in ("Track", "Reward")] + found
+    return [pair for pair in outcome_of_run(run) if pair[0] in ("Track", "Reward")] + found
 
 
 def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
-    """Return what to do with the winner: commands, each with what it does."""
-    winner = shlex.quote(f"run=best:{study.study_name}")
+    """Return commands for the winner, each with what it does."""
+    winner = shlex.quote(f"best:{study.study_name}")
     more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
     return [
         (best_line(study), "train the winner again"),
         (f"{COMMAND} evaluate {winner} --video lap.mp4", "race it, and film its fastest lap"),
-        (f"{COMMAND} clone {winner}", "train on from it, at a tenth of the learning rate"),
-        (f"{_resume(study)} sweep.trials={more}", "search on, with twice the trials"),
+        (f"{COMMAND} clone {winner}", "train it further, at a tenth of the learning rate"),
+        (f"{_resume(study)} sweep.trials={more}", "continue the search, with twice the trials"),
     ]
 
 
@@ -164,22 +155,26 @@ def _resume(study: optuna.Study) -> str:
 def _picture(study: optuna.Study) -> str | None:
     """Return the picture of the winner's fastest lap in base64, None where there is none."""
     try:
-        picture = read_bytes(best_run(study) / "best_lap.png", "the picture that a training draws")
+        picture = read_bytes(best_run(study) / BEST_LAP, "the picture that a training draws")
     except BadInput:
         return None
     return base64.b64encode(picture).decode("ascii")
 
 
-def fates(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
-    """Return how many trials ended in which way, and the control steps they drove."""
-    total, spent = len(trials), _spent(trials)
-    found = []
-    for fate, look in FATES.items():
-        some = [trial for trial in trials if fate_of(trial) == fate]
+def outcomes(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
+    """Return for each outcome its trials and control steps, with their shares in per cent."""
+    total, spent, found = len(trials), _spent(trials), []
+    for outcome, style in OUTCOMES.items():
+        some = [trial for trial in trials if outcome_of(trial) == outcome]
         if some:
-            told = {"fate": words(fate), "color": look.color, "meaning": look.meaning, "count": len(some)}
-            told |= {"trials_share": 100 * len(some) / total, "steps": steps(_spent(some))}
-            found.append(told | {"steps_share": 100 * _spent(some) / spent if spent else 0.0})
+            row = {
+                "outcome": outcome_words(outcome),
+                "color": style.color,
+                "meaning": style.meaning,
+                "count": len(some),
+            }
+            row |= {"trials_share": 100 * len(some) / total, "steps": steps(_spent(some))}
+            found.append(row | {"steps_share": 100 * _spent(some) / spent if spent else 0.0})
     return found
 
 
@@ -188,29 +183,29 @@ def _spent(trials: Sequence[FrozenTrial]) -> int:
 
 
 def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[dict[str, Any]]:
-    """Return the trials that drove again on fresh laps, the best first."""
+    """Return the re-ranked trials, the best on fresh laps first."""
     by_number = {trial.number: trial for trial in complete_trials(study)}
     found = []
     for one in reranked(study):
         trial = by_number.get(one["trial"])
         interval = one.get("interval")
-        told: dict[str, Any] = {"trial": one["trial"], "now": shown_values(objectives, one["values"])}
-        told["before"] = shown_values(objectives, trial.values) if trial else NONE
-        told["interval"] = " to ".join(shown(objectives[0], end) for end in interval) if interval else NONE
-        told["lap_time"] = described("lap_time", one.get("lap_time_s"))
-        told["completion"] = described("completion", one.get("completion"))
-        told["held_out"] = described("completion", one.get("held_out_completion"))
+        row: dict[str, Any] = {"trial": one["trial"], "now": shown_values(objectives, one["values"])}
+        row["before"] = shown_values(objectives, trial.values) if trial else NONE
+        row["interval"] = " to ".join(shown(objectives[0], end) for end in interval) if interval else NONE
+        row["lap_time"] = shown_or_dash("lap_time", one.get("lap_time_s"))
+        row["completion"] = shown_or_dash("completion", one.get("completion"))
+        row["held_out"] = shown_or_dash("completion", one.get("held_out_completion"))
         parameters = trial.params.items() if trial else ()
-        told["parameters"] = ", ".join(f"{keys[key]} {parameter(value)}" for key, value in parameters)
-        found.append(told)
+        row["parameters"] = ", ".join(f"{keys[key]} {parameter(value)}" for key, value in parameters)
+        found.append(row)
     return found
 
 
 def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> dict[str, Any]:
-    """Return the table of trials: the complete ones from the best on, then those that go on, were pruned, failed."""
+    """Return the table of trials: complete ones, the best first, then running, pruned and failed ones."""
     trials = study.get_trials(deepcopy=False)
-    place = {trial.number: number for number, trial in enumerate(complete_trials(study))}
-    order = sorted(trials, key=lambda t: (_ORDER.index(t.state), place.get(t.number, t.number)))
+    rank = {trial.number: at for at, trial in enumerate(complete_trials(study))}
+    order = sorted(trials, key=lambda t: (_ORDER.index(t.state), rank.get(t.number, t.number)))
     columns = [key for key in keys if any(key in trial.params for trial in trials)][:_MOST_PARAMETERS]
     extra = [
         (attr, objective)
@@ -220,17 +215,17 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     rows = []
     for trial in order[:_MOST_ROWS]:
         attrs = trial.user_attrs
-        values = [described(name, value_of(trial, objectives, at)) for at, name in enumerate(objectives)]
-        values += [described(objective, attrs.get(attr)) for attr, objective in extra]
-        values.append(described("completion", attrs.get("held_out_completion")))
-        fate = fate_of(trial)
+        values = [shown_or_dash(name, _value(trial, objectives, at)) for at, name in enumerate(objectives)]
+        values += [shown_or_dash(objective, attrs.get(attr)) for attr, objective in extra]
+        values.append(shown_or_dash("completion", attrs.get("held_out_completion")))
+        outcome = outcome_of(trial)
         reason = str(attrs.get("reason") or "")
         clock_s = attrs.get("wall_clock_s")
         rows.append(
             {
                 "number": trial.number,
-                "fate": words(fate),
-                "color": FATES[fate].color,
+                "outcome": outcome_words(outcome),
+                "color": OUTCOMES[outcome].color,
                 "complete": trial.state == TrialState.COMPLETE,
                 "values": values,
                 "steps": steps(attrs["env_steps"]) if attrs.get("env_steps") else NONE,
@@ -249,12 +244,22 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     }
 
 
+def _value(trial: FrozenTrial, objectives: Sequence[str], at: int) -> float | None:
+    """Return a trial's value of one objective, of a pruned one the last it had; None if it has none."""
+    value: float | None = None
+    if trial.state == TrialState.COMPLETE:
+        value = trial.values[at]
+    elif trial.state == TrialState.PRUNED and len(objectives) == 1 and trial.intermediate_values:
+        value = trial.intermediate_values[max(trial.intermediate_values)]
+    return value if value is not None and math.isfinite(value) else None
+
+
 def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     """Return failed trials by their reason, with the traceback of the first of each, the most frequent first."""
     groups: dict[str, list[FrozenTrial]] = {}
     for trial in trials:
         if trial.state == TrialState.FAIL:
-            groups.setdefault(str(trial.user_attrs.get("reason") or "no reason told"), []).append(trial)
+            groups.setdefault(str(trial.user_attrs.get("reason") or "no reason stored"), []).append(trial)
     found: list[dict[str, Any]] = [
         {
             "reason": reason,

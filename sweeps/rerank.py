@@ -1,4 +1,4 @@
-"""The best trials of a sweep put to a test that did not choose them."""
+"""Re-ranking: the best trials of a sweep raced again, on laps that did not choose them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,57 +13,57 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import USUAL, Evaluation, Group
-from deepracer_exp.evaluation.run import read_run
+from deepracer_exp.runs.resolve import resolve
 
-from .best import complete_trials, cost
-from .plan import Plan
-from .score import values_of, without_lap
+from .best import complete_trials
+from .objectives import cost, values_of, without_lap
+from .worker_config import WorkerConfig
 
 _SEED = 30_011
-"""Of what conditions draw: no protocol of the project has it."""
+"""Seed of the conditions; no protocol of the project has it."""
 _SHIFT = 0.25
-"""Of the places where laps begin, as a share of their distance."""
+"""Shift of the starting positions, as a share of their distance."""
 _RESAMPLES = 2000
 _CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reranked:
-    """A trial driven anew."""
+    """A trial's result on fresh laps."""
 
     trial: int
     """Its number in the study."""
     values: list[float]
     """Of the objectives, means over the trial's runs."""
     interval: tuple[float, float]
-    """95 per cent interval of the first value, by bootstrap over laps; of one policy, not over training anew."""
+    """95 per cent interval of the first value, by bootstrap over laps: of these policies, not of further trainings."""
     lap_time_s: float | None
     completion: float
     held_out_completion: float | None
 
 
 def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
-    """Return a protocol's trials with starts and draws that no evaluation of the sweep had."""
+    """Return a protocol with starting positions and random draws that no evaluation of the sweep had."""
     starts = tuple((place + _SHIFT) / trials for place in range(trials))
     return replace(protocol, trials=trials, seed=_SEED, starts=starts)
 
 
 def rerank(
-    plan: Plan, study: optuna.Study, on_next: Callable[[FrozenTrial], None], on_step: OnStep
+    worker_config: WorkerConfig, study: optuna.Study, on_next: Callable[[FrozenTrial], None], on_step: OnStep
 ) -> list[Reranked]:
-    """Let the best trials' best checkpoints drive fresh laps; return them in the order that comes out.
+    """Race the best checkpoints of the best trials on fresh laps; return the trials in the new order.
 
     Args:
-        plan: of the sweep.
-        study: has its trials.
-        on_next: called with each trial before it drives.
-        on_step: called after each control step; what it raises ends everything.
+        worker_config: of the sweep.
+        study: of the sweep.
+        on_next: called with each trial before its laps.
+        on_step: called after each control step; an exception it raises ends the re-ranking.
 
     Raises:
         RunFailed: a car's state became NaN.
     """
-    config = plan.config
-    protocol = fresh(plan.protocol, config.rerank_laps)
+    config = worker_config.config
+    protocol = fresh(worker_config.protocol, config.rerank_laps)
     found = []
     for trial in complete_trials(study)[: config.rerank]:
         on_next(trial)
@@ -75,12 +75,12 @@ def rerank(
 def interval_of(
     evaluations: Sequence[Evaluation], objective: str, trial_time_s: float
 ) -> tuple[float, float]:
-    """Return the bootstrap interval of an objective, trials drawn anew within each track and each evaluation.
+    """Return the bootstrap interval of an objective; trials are resampled within each track and each evaluation.
 
     Args:
-        evaluations: of the policies whose mean is meant.
+        evaluations: of the policies that the value is the mean of.
         objective: its name.
-        trial_time_s: the longest that a trial may take.
+        trial_time_s: the longest that a trial of the evaluation may take.
     """
     groups = [group for one in evaluations for group in one.groups if group.condition == USUAL]
     rng = np.random.default_rng(0)
@@ -93,24 +93,24 @@ def interval_of(
 def _draws(
     group: Group, objective: str, trial_time_s: float, rng: np.random.Generator
 ) -> "np.ndarray[Any, np.dtype[np.float64]]":
-    """Return the objective's value in each of the resamples, (n,)."""
-    place = {trial: at for at, trial in enumerate(group.trials)}
-    sums = np.zeros((4, len(place)))  # laps tried, complete ones, what counts of their time, progress
+    """Return the objective's value in each resample, (n,)."""
+    column = {trial: at for at, trial in enumerate(group.trials)}
+    sums = np.zeros((4, len(column)))  # laps tried, complete laps, counted time, progress
     for attempt in group.decided:
         time_s = attempt.time_s if objective == "race_score" or attempt.complete else 0.0
-        sums[:, place[attempt.trial]] += (1, attempt.complete, time_s, attempt.progress)
-    drawn = sums[:, rng.integers(len(place), size=(_RESAMPLES, len(place)))].sum(axis=2)
+        sums[:, column[attempt.trial]] += (1, attempt.complete, time_s, attempt.progress)
+    drawn = sums[:, rng.integers(len(column), size=(_RESAMPLES, len(column)))].sum(axis=2)
     tried, laps, time_s, progress = drawn
     completion = progress / tried
     if objective == "completion":
         return completion
-    nothing = np.array([without_lap(one, trial_time_s) for one in completion])
-    return np.where(laps > 0, time_s / np.maximum(laps, 1), nothing)
+    fallback = np.array([without_lap(one, trial_time_s) for one in completion])
+    return np.where(laps > 0, time_s / np.maximum(laps, 1), fallback)
 
 
 def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evaluation:
-    run = read_run(str(run_dir), run_dir.parent, None)
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.meant(None))
+    run = resolve(str(run_dir), run_dir.parent, None)
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(None))
     return Evaluator(run.experiment, protocol)(stored.networks.policy, on_step)
 
 

@@ -1,4 +1,4 @@
-"""What chooses the values of the next trial, by name."""
+"""Samplers by name: what chooses the parameters of the next trial."""
 
 import copy
 import math
@@ -28,9 +28,6 @@ from deepracer_exp.errors import BadInput
 
 from .space import SearchSpace
 
-Values = dict[str, list[Any]]
-"""What a grid is made of: the values of each key."""
-
 
 def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
     """Build the sampler of a study; every worker builds its own.
@@ -38,36 +35,34 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
     Raises:
         BadInput: the sampler cannot search this space, or not for these objectives.
     """
-    grid: Values = {}
     if config.sampler == "cmaes":
         _check_cmaes(config, space)
     if config.sampler == "grid":
-        grid = space.grid()
-        _check_grid(config, grid)
+        _check_grid(config, space)
 
-    def make(slot: int) -> BaseSampler:
+    def make(index: int) -> BaseSampler:
+        seed = int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0])
         with warnings.catch_warnings():
-            # Optuna calls group, with_margin, QMCSampler and BLXAlphaCrossover experimental: they may change in a
-            # later version. Its version is pinned, and the racer can do nothing about it.
+            # Experimental in Optuna, whose version is pinned: group, with_margin, QMCSampler, BLXAlphaCrossover.
             warnings.simplefilter("ignore", ExperimentalWarning)
-            return _make(config, space, grid, slot)
+            return _SAMPLERS[config.sampler](config, space, index, seed)
 
-    return NumberedSampler(make)
+    return PerTrialSampler(make)
 
 
-class NumberedSampler(BaseSampler):
-    """A sampler that begins anew with each trial, seeded by the trial's slot.
+class PerTrialSampler(BaseSampler):
+    """A fresh sampler for each trial, seeded by the trial's index.
 
-    A sampler draws from its seed on. Workers share the study's seed, so that each of them, and each start of a
-    study, would try the same first points once more. Here the draws of a trial depend on its slot, not on who makes
-    it or when; what was learned from earlier trials is in the study.
+    A sampler draws from its seed on. Workers share the study's seed, so each of them, and each start of a study, would
+    try the same first points again. Here the draws of a trial depend on its index and not on the worker or the moment;
+    what was learned from earlier trials is in the study.
     """
 
     def __init__(self, make: Callable[[int], BaseSampler]):
-        """Set it up.
+        """Start without any sampler.
 
         Args:
-            make: returns the sampler of a slot's trial.
+            make: returns the sampler of the trial with an index.
         """
         self._make = make
         self._open: dict[int, BaseSampler] = {}
@@ -106,21 +101,21 @@ class NumberedSampler(BaseSampler):
 
 
 class _WholeSpaceQMC(QMCSampler):
-    """Point n of one sequence over the whole space for slot n, whichever worker asks.
+    """Point n of one sequence over the whole space for the trial with index n, whichever worker asks.
 
-    Optuna's own counts the points in the study, where two workers may read the same count, and knows the space only
-    from the first trial: keys of other options would be left to chance.
+    Optuna's own counts the points in the study, where two workers may read the same count, and takes the space from
+    the first trial, so that keys of other options would be drawn at random.
     """
 
-    def __init__(self, space: dict[str, BaseDistribution], slot: int, seed: int):
+    def __init__(self, space: dict[str, BaseDistribution], index: int, seed: int):
         super().__init__(scramble=True, seed=seed)
-        self._space, self._slot = space, slot
+        self._space, self._index = space, index
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         return self._space
 
     def _find_sample_id(self, study: Study, search_space: dict[str, BaseDistribution]) -> int:
-        return self._slot
+        return self._index
 
 
 class _EndlessGrid(GridSampler):
@@ -132,8 +127,8 @@ class _EndlessGrid(GridSampler):
         pass
 
 
-class _PrunedToo(GPSampler):
-    """Learns from pruned trials what they were worth at their end.
+class _LearnsFromPruned(GPSampler):
+    """Learns from the last values of pruned trials, too.
 
     Optuna's own knows complete and running trials only: where the best guess is pruned it guesses the same again.
     """
@@ -156,9 +151,8 @@ class _WithPruned(Study):
     def _get_trials(
         self, deepcopy: bool = True, states: Container[TrialState] | None = None, use_cache: bool = False
     ) -> list[FrozenTrial]:
-        found = super()._get_trials(deepcopy, None, use_cache)
-        seen = [_as_complete(trial) for trial in found]
-        return [trial for trial in seen if states is None or trial.state in states]
+        found = [_as_complete(trial) for trial in super()._get_trials(deepcopy, None, use_cache)]
+        return [trial for trial in found if states is None or trial.state in states]
 
 
 def _as_complete(trial: FrozenTrial) -> FrozenTrial:
@@ -169,35 +163,32 @@ def _as_complete(trial: FrozenTrial) -> FrozenTrial:
     return seen
 
 
-def _make(config: SweepConfig, space: SearchSpace, grid: Values, slot: int) -> BaseSampler:
-    seed = int(np.random.SeedSequence([config.seed, slot]).generate_state(1)[0])
-    startup = config.startup_trials
-    match config.sampler:
-        case "tpe":
-            # group: keys that only some trials have get a model of their own.
-            return TPESampler(
-                n_startup_trials=startup, seed=seed, multivariate=True, group=True, constant_liar=True
-            )
-        case "gp":
-            # It would warn at each trial that keys which only some trials have are left to chance.
-            return _PrunedToo(n_startup_trials=startup, seed=seed, warn_independent_sampling=False)
-        case "cmaes":
-            # As for gp, and the same of choices.
-            return CmaEsSampler(
-                n_startup_trials=startup, seed=seed, with_margin=True, warn_independent_sampling=False
-            )
-        case "qmc":
-            return _WholeSpaceQMC(_distributions(space), slot, config.seed)
-        case "nsga2":
-            # The first generation is what others call the start: drawn by chance. Children are blends of both parents:
-            # a copy of one would be the same training once more.
-            return NSGAIISampler(
-                population_size=max(startup, 2), seed=seed, crossover=BLXAlphaCrossover(), crossover_prob=1.0
-            )
-        case "grid":
-            return _EndlessGrid(grid, seed=config.seed)  # the order of all points
-        case _:
-            return RandomSampler(seed=seed)
+_SAMPLERS: dict[str, Callable[[SweepConfig, SearchSpace, int, int], BaseSampler]] = {
+    # group: keys that only some trials have get a model of their own.
+    "tpe": lambda config, space, index, seed: TPESampler(
+        n_startup_trials=config.startup_trials, seed=seed, multivariate=True, group=True, constant_liar=True
+    ),
+    # No warning at each trial that keys which only some trials have are drawn at random.
+    "gp": lambda config, space, index, seed: _LearnsFromPruned(
+        n_startup_trials=config.startup_trials, seed=seed, warn_independent_sampling=False
+    ),
+    "cmaes": lambda config, space, index, seed: CmaEsSampler(
+        n_startup_trials=config.startup_trials, seed=seed, with_margin=True, warn_independent_sampling=False
+    ),
+    "qmc": lambda config, space, index, seed: _WholeSpaceQMC(_distributions(space), index, config.seed),
+    # The first generation, drawn at random, is the startup of the others. Children are blends of both parents: a copy
+    # of one would be the same training again.
+    "nsga2": lambda config, space, index, seed: NSGAIISampler(
+        population_size=max(config.startup_trials, 2),
+        seed=seed,
+        crossover=BLXAlphaCrossover(),
+        crossover_prob=1.0,
+    ),
+    # The sweep's seed gives the order of all points.
+    "grid": lambda config, space, index, seed: _EndlessGrid(dict(space.grid()), seed=config.seed),
+    "random": lambda config, space, index, seed: RandomSampler(seed=seed),
+}
+"""By name, from (sweep, space, index of the trial, seed of the trial)."""
 
 
 def _distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
@@ -205,20 +196,21 @@ def _distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
 
 
 def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
+    others = ", ".join(name for name in _SAMPLERS if name != "cmaes")
     if len(config.objectives) > 1:
         raise BadInput(
             f"sweep.sampler=cmaes: follows one objective, and sweep.objectives has {len(config.objectives)}; "
-            "accepted with several: tpe, gp, nsga2, qmc, random, grid"
+            f"accepted with several: {others}"
         )
     if all(isinstance(found, CategoricalDistribution) for found in _distributions(space).values()):
         raise BadInput(
             "sweep.sampler=cmaes: searches ranges, and the space has choices only; "
-            "accepted for them: tpe, gp, nsga2, qmc, random, grid"
+            f"accepted for them: {others}"
         )
 
 
-def _check_grid(config: SweepConfig, grid: Values) -> None:
-    points = math.prod(map(len, grid.values()))
+def _check_grid(config: SweepConfig, space: SearchSpace) -> None:
+    points = math.prod(map(len, space.grid().values()))
     if config.trials > points:
         raise BadInput(
             f"sweep.trials={config.trials}: the grid has {points} points, and the others would be trained twice; "

@@ -1,4 +1,4 @@
-"""What a sweep searches: keys, their values, and with which options of a group a key counts."""
+"""The search space of a sweep: keys, their values, and the options of a group for which a key counts."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -13,51 +13,52 @@ from optuna.distributions import (
 )
 from optuna.trial import BaseTrial, FixedTrial
 
-from deepracer_exp.config.compose import compose_experiment, validate
-from deepracer_exp.config.dimension import Choice, Choices, Range, as_override, dimension, value_of
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.dimension import Choice, Choices, Range, as_override, dimension, override_value
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.overrides import OPEN_MAPPINGS
+from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.reward_source import load_reward_source
 from deepracer_exp.errors import BadInput
+from deepracer_exp.rewards.source import load_reward_source
 
 Check = Callable[[list[str]], Mapping[str, Any]]
-"""Refuses overrides that no run accepts (BadInput) and returns all values of the run they make."""
+"""Raises BadInput for overrides that no run accepts, and returns all values of the run they make."""
 
 _CONSTANTS = "reward.constants"
 
 
 @dataclass(frozen=True)
 class Dimension:
-    """One key that is searched."""
+    """One searched key."""
 
     key: str
     expression: str
     distribution: BaseDistribution
     group: str | None
-    """The group that the key is of, if that is searched, too."""
+    """The key's group, if that is searched, too."""
     options: tuple[Choice, ...] | None
-    """Options of that group with which the key counts; None: always."""
+    """Options of that group for which the key counts; None: all."""
 
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """All that is searched, and what all trials have in common."""
+    """All searched keys, and the overrides that all trials share."""
 
     base: tuple[str, ...]
     """Overrides of every trial."""
     dimensions: tuple[Dimension, ...]
-    """Groups first, as other keys may depend on them."""
+    """Groups first, because other keys may depend on them."""
 
     @classmethod
     def from_request(cls, request: SweepRequest, check: Check | None = None) -> "SearchSpace":
-        """Find out what can be searched; every choice and both ends of every range are tried, each alone.
+        """Build the space of a request; every choice and both ends of every range are checked, each alone.
 
         Args:
-            request: a sweep as it was asked for.
-            check: how overrides are tried; None: as a training from scratch does.
+            request: of the sweep.
+            check: how overrides are checked; None: as by a training from scratch.
 
         Raises:
             BadInput: there is nothing to search, a key does not exist, or no run accepts one of its values.
@@ -79,7 +80,7 @@ class SearchSpace:
         return cls(request.base, tuple(dimensions))
 
     def suggest(self, trial: BaseTrial) -> list[str]:
-        """Return the overrides of a trial; the same values give the same overrides, to the last digit."""
+        """Return the overrides of a trial; equal values give equal overrides, to the last digit."""
         chosen: dict[str, Choice] = {}
         for one in self.dimensions:
             if one.options is None or (one.group and chosen[one.group] in one.options):
@@ -96,10 +97,10 @@ class SearchSpace:
         return {one.key: one.expression for one in self.dimensions}
 
     def difference(self, other: Mapping[str, str]) -> list[str]:
-        """Return a line for each key that another space searches otherwise.
+        """Return a line for each key that another space searches differently.
 
         Args:
-            other: its expressions by key, as of `as_text`.
+            other: expressions by key, from its `as_text`.
         """
         own, lines = self.as_text(), []
         for key in dict.fromkeys([*other, *own]):
@@ -114,20 +115,20 @@ class SearchSpace:
         """Return all values by key.
 
         Raises:
-            BadInput: there is no end of the values of a key, or a key counts with some options only.
+            BadInput: a key has infinitely many values, or counts for some options only.
         """
         grid: dict[str, list[Choice]] = {}
         for one in self.dimensions:
             if one.options is not None:
                 raise BadInput(
-                    f"sweep.sampler=grid: {one.key} counts only with {one.group}={','.join(map(str, one.options))}, "
+                    f"sweep.sampler=grid: {one.key} counts only for {one.group}={','.join(map(str, one.options))}, "
                     "and a grid knows no conditions; accepted: another sampler, or one option"
                 )
             what = dimension(one.key, one.expression)
             values = list(what.values) if isinstance(what, Choices) else what.values()
             if values is None:
                 raise BadInput(
-                    f"sweep.sampler=grid: {one.key}={one.expression} has values without end; accepted: A,B, "
+                    f"sweep.sampler=grid: {one.key}={one.expression} has infinitely many values; accepted: A,B, "
                     "range(FROM,BELOW,STEP), int(interval(LOW,HIGH)), or another sampler"
                 )
             grid[one.key] = list(values)
@@ -135,18 +136,18 @@ class SearchSpace:
 
 
 class _Trials:
-    """Experiments composed for trying values."""
+    """Composed experiments, to check values with."""
 
     def __init__(self, base: Sequence[str], check: Check | None, found: Mapping[str, Choices | Range]):
         self._base, self._found = list(base), found
-        self._is_composed = check is None
+        self._from_scratch = check is None
         self._check = check or _compose
-        self._made: dict[tuple[str, ...], Mapping[str, Any]] = {}
+        self._composed: dict[tuple[str, ...], Mapping[str, Any]] = {}
         self._context: dict[str, str] = {}
         try:
             self._values({})
         except BadInput as error:
-            # Perhaps only with what is searched the base is complete, as with one of two keys set to null.
+            # The base may be complete only with the searched keys, such as where one of two keys is null.
             self._context = {key: _lines(key, what)[0] for key, what in found.items() if not self._group(key)}
             try:
                 self._values({})
@@ -155,7 +156,7 @@ class _Trials:
                 raise error if of_base else with_context from None
 
     def condition(self, key: str) -> tuple[str | None, tuple[Choice, ...] | None]:
-        """Return the searched group that the key is of, and those of its options that have the key; None: all."""
+        """Return the key's group if that is searched, and the options of it that have the key; None: all."""
         group = self._group(key)
         if group is None:
             return None, None
@@ -164,7 +165,7 @@ class _Trials:
         return group, having if having and len(having) < len(every) else None
 
     def is_known(self, key: str) -> bool:
-        """Return whether any of the options that are searched or chosen has the key."""
+        """Return whether any searched or chosen option has the key."""
         group = self._group(key)
         if group is None:
             return self._has(self._values({}), key)
@@ -179,16 +180,16 @@ class _Trials:
         for option in options:
             context = {} if one.group is None else {one.group: as_override(one.group, option)}
             for line in _lines(one.key, what):
-                self._try(context, one, line)
+                self._check_line(context, one, line)
 
-    def _try(self, context: Mapping[str, str], one: Dimension, line: str) -> None:
+    def _check_line(self, context: Mapping[str, str], one: Dimension, line: str) -> None:
         try:
             values = self._values(context)
-            if self._is_composed and one.key not in groups() and _place(values, one.key) is not None:
+            if self._from_scratch and one.key not in groups() and _holder(values, one.key) is not None:
                 # Composing takes a hundred times as long as setting a value.
                 changed = copy.deepcopy(dict(values))
-                _set(changed, one.key, value_of(line))
-                _read(validate(changed))
+                _set(changed, one.key, override_value(line))
+                _read(parse_experiment(changed))
             else:
                 self._values({**context, one.key: line})
         except BadInput as error:
@@ -206,9 +207,9 @@ class _Trials:
             BadInput: no run accepts them.
         """
         overrides = (*self._base, *{**self._context, **lines}.values())
-        if overrides not in self._made:
-            self._made[overrides] = self._check(list(overrides))
-        return self._made[overrides]
+        if overrides not in self._composed:
+            self._composed[overrides] = self._check(list(overrides))
+        return self._composed[overrides]
 
     def _with(self, group: str, option: Choice) -> Mapping[str, Any]:
         return self._values({group: as_override(group, option)})
@@ -223,9 +224,9 @@ class _Trials:
 
     def _has(self, values: Mapping[str, Any], key: str) -> bool:
         if key.startswith(f"{_CONSTANTS}."):
-            reward = validate(dict(values)).reward
+            reward = parse_experiment(dict(values)).reward
             return key.removeprefix(f"{_CONSTANTS}.") in load_reward_source(reward).constants
-        return _place(values, key) is not None
+        return _holder(values, key) is not None
 
 
 def _compose(overrides: list[str]) -> Mapping[str, Any]:
@@ -235,13 +236,13 @@ def _compose(overrides: list[str]) -> Mapping[str, Any]:
 
 
 def _read(experiment: Experiment) -> None:
-    """Refuse what a run would refuse as soon as it begins."""
+    """Refuse what a run would refuse at its start."""
     load_reward_source(experiment.reward)
     build_action_space(experiment.action_space)
 
 
-def _place(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:
-    """Return the mapping that a key is in; None if there is no such key."""
+def _holder(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:
+    """Return the mapping that holds a key; None if the key does not exist."""
     parent, _, leaf = key.rpartition(".")
     node: Any = values
     for part in parent.split(".") if parent else ():
@@ -250,9 +251,9 @@ def _place(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:
 
 
 def _set(values: dict[str, Any], key: str, value: Any) -> None:
-    place = _place(values, key)
-    assert place is not None
-    place[key.rpartition(".")[2]] = value
+    holder = _holder(values, key)
+    assert holder is not None
+    holder[key.rpartition(".")[2]] = value
 
 
 def _lines(key: str, what: Choices | Range) -> list[str]:

@@ -1,5 +1,6 @@
-"""The storage of a study: Optuna's tables and what connects to them, however many processes begin at once."""
+"""The storage of studies: Optuna's tables, opened safely by many processes at once, and the wait for a database."""
 
+import glob
 import logging
 import sqlite3
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from .database import Database, resolve_database
 Result = TypeVar("Result")
 
 DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInternalError)
-"""What a database that is down or locked raises, among others: `patiently` looks closer."""
+"""Errors of a database that is down or locked, among others; see `_may_pass`."""
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 10.0
 _SAY_AFTER_S = 5.0
@@ -34,7 +35,7 @@ _log = logging.getLogger("deepracer_exp")
 
 @dataclass(frozen=True)
 class Storage:
-    """A database that holds studies, connected."""
+    """A connected database of studies."""
 
     optuna: RDBStorage = field(repr=False)
     """Optuna's view of it."""
@@ -44,12 +45,12 @@ class Storage:
 
 
 def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> Storage:
-    """Connect to the database named by `sweep.storage`, or to `sweeps.db` in `runs_dir`; make what is missing.
+    """Connect to the database named by `sweep.storage`, or to `sweeps.db` in `runs_dir`; create what is missing.
 
     Args:
         url: as SQLAlchemy reads it; None: the file.
-        runs_dir: of the file; made if it is not there.
-        patience_s: how long a server that does not answer is waited for.
+        runs_dir: of the file; created if it is missing.
+        patience_s: how long to wait for a server that does not answer, seconds.
 
     Raises:
         BadInput: unknown kind, missing driver, unreachable, not writable, or used by another program.
@@ -64,13 +65,13 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> St
 
 
 def patiently(call: Callable[[], Result], patience_s: float) -> Result:
-    """Call until the database answers; what was begun before it went away may happen twice.
+    """Call until the database answers; a call that was under way when it went down may take effect twice.
 
-    Waits longer and longer between calls, up to ten seconds, and never as long as another process that began to
-    wait at the same moment.
+    Waits longer and longer between calls, up to ten seconds, with jitter, so that processes that began to wait
+    together do not return together.
 
     Raises:
-        RunFailed: it has not answered for `patience_s`, or says something that no waiting changes.
+        RunFailed: it has not answered for `patience_s`, or its error is one that waiting does not change.
     """
     try:
         return _waiting(call, patience_s)
@@ -101,9 +102,9 @@ def _waiting(call: Callable[[], Result], patience_s: float) -> Result:
 
 
 def _may_pass(error: BaseException) -> bool:
-    """Return whether an error is one of a database that is down, starting, full of connections, or locked."""
+    """Return whether an error may pass: the database is down, starting, out of connections, or locked."""
     if isinstance(error, StorageInternalError):
-        # Optuna's word for whatever SQLAlchemy raised.
+        # Optuna wraps errors of SQLAlchemy in it.
         return error.__cause__ is None or _may_pass(error.__cause__)
     if not isinstance(error, DOWN):
         return isinstance(error, DBAPIError) and error.connection_invalidated
@@ -114,7 +115,7 @@ def _may_pass(error: BaseException) -> bool:
 
 
 def _reason(error: BaseException) -> str:
-    """Return what the database said, in one line, without the statement and its values."""
+    """Return the error in one line, without the statement and its values."""
     if isinstance(error, StorageInternalError) and error.__cause__ is not None:
         return _reason(error.__cause__)
     if isinstance(error, DBAPIError) and isinstance(error.orig, Exception):
@@ -136,17 +137,17 @@ def _open_file(database: Database, file: Path) -> RDBStorage:
     if not _is_ready_file(database, file):
         with database.creation_lock(None):
             if not file.exists() or file.stat().st_size == 0:
-                _make_aside(database, file)
+                _create_file(database, file)
             elif not _is_ready_file(database, file):
                 _rdb(database, create=True).engine.dispose()
                 _write_ahead(file)
     return _rdb(database, create=False)
 
 
-def _make_aside(database: Database, file: Path) -> None:
-    """Make the file under another name and give it its own when it is whole: a killed process leaves no half of it."""
+def _create_file(database: Database, file: Path) -> None:
+    """Create the file under another name and rename it when it is complete: a killed process leaves no half of it."""
     new = file.with_name(f"{file.name}.new")
-    for left in file.parent.glob(f"{_literally(new.name)}*"):
+    for left in file.parent.glob(f"{glob.escape(new.name)}*"):
         left.unlink()
     aside = Database(sa.URL.create("sqlite", database=str(new)), database.shown)
     rdb = _rdb(aside, create=True)
@@ -156,17 +157,13 @@ def _make_aside(database: Database, file: Path) -> None:
     new.replace(file)
 
 
-def _literally(name: str) -> str:
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)
-
-
 def _write_ahead(file: Path) -> None:
-    """Let readers read while somebody writes; the file itself keeps this setting."""
+    """Let processes read while another one writes; the file itself keeps this setting."""
     connection = sqlite3.connect(file, timeout=60.0)
     try:
         connection.execute("PRAGMA journal_mode=WAL")
     except sqlite3.OperationalError as error:
-        # Somebody has it open. It stays as it is, which is slower and as safe.
+        # Another process has it open. It stays as it is, which is slower and as safe.
         _log.warning("%s: %s", file, error)
     finally:
         connection.close()
@@ -180,10 +177,10 @@ def _is_ready_file(database: Database, file: Path) -> bool:
 
 
 def _is_ready(database: Database, engine: sa.Engine) -> bool:
-    """Return whether Optuna's tables are all there: the version is what it writes last.
+    """Return whether all of Optuna's tables exist; it writes the version last.
 
     Raises:
-        BadInput: the version is there and the tables are not: another program keeps its version there.
+        BadInput: there is a version without the tables: that of another program.
     """
     with engine.connect() as connection:
         tables = set(sa.inspect(connection).get_table_names())
@@ -198,7 +195,7 @@ def _is_ready(database: Database, engine: sa.Engine) -> bool:
 
 
 def _rdb(database: Database, *, create: bool) -> RDBStorage:
-    # Optuna formats the URL; a brace of a password or a folder is doubled for it.
+    # Optuna formats the URL, so braces of a password or a folder are doubled.
     url = database.url.render_as_string(hide_password=False).replace("{", "{{").replace("}", "}}")
     try:
         return RDBStorage(url, engine_kwargs=database.engine_options(), skip_table_creation=not create)

@@ -1,4 +1,4 @@
-"""Studies begun and found again."""
+"""Studies: begun, found by name, and resumed with the overrides they were begun with."""
 
 import warnings
 from collections.abc import Sequence
@@ -8,25 +8,26 @@ import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.study import Study, StudyDirection
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.overrides import group_of
-from deepracer_exp.config.sweep import SweepRequest
+from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
 
-from .labels import MEASURES
+from .objectives import MEASURES
 from .space import SearchSpace
-from .storage import Storage
+from .storage import Storage, open_storage
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
     *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps", "runs_dir"),
 )
-"""Keys that change nothing of what the trials are."""
+"""Keys that do not change the trials themselves."""
 _SAME = ("objectives", "seeds", "protocol", "parent")
-"""What trials that are to be compared have in common, beside space and base."""
+"""Attributes that comparable trials share, beside space and base."""
 
 
 def find_study(name: str, storage: Storage) -> Study | None:
-    """Return a study, None if there is none of that name."""
+    """Return a study, None if none has that name."""
     try:
         return optuna.load_study(study_name=name, storage=storage.optuna)
     except KeyError:
@@ -34,10 +35,10 @@ def find_study(name: str, storage: Storage) -> Study | None:
 
 
 def load_study(name: str, storage: Storage) -> Study:
-    """Return a study that is there.
+    """Return a study that exists.
 
     Raises:
-        BadInput: there is none of that name; the message says which there are.
+        BadInput: none has that name; the message lists those that exist.
     """
     study = find_study(name, storage)
     if study is None:
@@ -47,26 +48,41 @@ def load_study(name: str, storage: Storage) -> Study:
     return study
 
 
-def goes_on(overrides: Sequence[str]) -> bool:
-    """Tell whether overrides say nothing of what the trials are: they name a study to go on with."""
+def _names_only(overrides: Sequence[str]) -> bool:
+    """Return whether overrides leave the trials as they are, so that they name a study to resume."""
     return not {override.partition("=")[0].strip().lstrip("+~") for override in overrides} - {*MAY_DIFFER}
 
 
-def completed(overrides: Sequence[str], study: Study) -> list[str]:
-    """Return the overrides that go on with a study, for which no more than its name need be given.
+def load_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Study | None]:
+    """Return the overrides of a sweep, the request they make, and its study if that exists.
 
-    Args:
-        overrides: as given.
-        study: which they name.
+    Overrides that only name a study are preceded by those that the study was begun with.
 
-    Returns:
-        Those it was begun with and the given ones; only the given ones if they say themselves what the trials are.
+    Raises:
+        BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
-    if not goes_on(overrides):
-        return list(overrides)
-    # The total of the start before this one: it may have been raised since the study was begun.
-    total = [f"sweep.trials={study.user_attrs['trials']}"] if "trials" in study.user_attrs else []
-    return [*study.user_attrs.get("overrides", ()), *total, *overrides]
+    request = compose_sweep(overrides)
+    known = _known(request, _names_only(overrides), runs_dir_of(request))
+    if known is None:
+        return list(overrides), request, None
+    whole = list(overrides)
+    if _names_only(overrides):
+        # The total of the last start: it may have been raised since the study was begun.
+        total = [f"sweep.trials={known.user_attrs['trials']}"] if "trials" in known.user_attrs else []
+        whole = [*known.user_attrs.get("overrides", ()), *total, *overrides]
+    request = compose_sweep(whole)
+    if not request.space:
+        raise BadInput(
+            f"study={request.study}: exists; to resume it, give only {', '.join(MAY_DIFFER)} beside its "
+            "name; for anything else give the whole search again"
+        )
+    return whole, request, known
+
+
+def runs_dir_of(request: SweepRequest) -> Path:
+    """Return where the runs of a sweep are."""
+    given = [line.partition("=")[2] for line in request.base if line.partition("=")[0] == "runs_dir"]
+    return Path(compose_experiment([f"runs_dir={given[-1]}"] if given else [])[0].runs_dir)
 
 
 def open_study(
@@ -77,21 +93,21 @@ def open_study(
     storage: Storage,
     runs_dir: Path,
 ) -> Study:
-    """Begin a study, or go on with the one of that name.
+    """Begin a study, or open the one of that name.
 
     Args:
-        request: what is asked for.
+        request: of the sweep.
         overrides: that it was composed from.
         space: of the request.
-        parent: as `Plan.parent`.
+        parent: as `WorkerConfig.parent`.
         storage: where studies are.
         runs_dir: where its runs are.
 
     Raises:
-        BadInput: there is a study of that name whose trials could not be compared with these.
+        BadInput: a study of that name exists, and its trials cannot be compared with these.
     """
     name, sweep = request.study, request.entry.sweep
-    asked = {
+    wanted = {
         "base": list(request.base),
         "objectives": list(sweep.objectives),
         "seeds": sweep.seeds,
@@ -99,9 +115,9 @@ def open_study(
         "parent": request.entry.parent,
         "parent_run": list(parent),
         "runs_dir": str(runs_dir),
-        # The address may have a password in it, and whoever goes on knows it.
+        # The address may contain a password, and is given again to resume.
         "overrides": [line for line in overrides if not line.lstrip("+").startswith("sweep.storage=")],
-        # The last: a study that has it has all of them.
+        # The last one: a study that has it has all of them.
         "space": space.as_text(),
     }
     directions = [
@@ -113,15 +129,15 @@ def open_study(
     except optuna.exceptions.DuplicatedStudyError:
         study = load_study(name, storage)
     stored = study.user_attrs
-    if "space" not in stored:  # it is new, or whoever began it was killed at this very place
-        for key, value in asked.items():
+    if "space" not in stored:  # it is new, or the process that began it was killed right here
+        for key, value in wanted.items():
             study.set_user_attr(key, value)
     else:
-        found = [*space.difference(stored["space"]), *_differences(stored, asked)]
+        found = [*space.difference(stored["space"]), *_differences(stored, wanted)]
         if found:
             raise BadInput(
                 f"study={name}: exists with another search: {'; '.join(found)}; give another name, or "
-                f"`deepracer-exp sweep study={name}` alone to go on with it"
+                f"resume it with `deepracer-exp sweep study={name}` alone"
             )
     study.set_user_attr("trials", sweep.trials)
     with warnings.catch_warnings():
@@ -131,14 +147,24 @@ def open_study(
     return study
 
 
-def _differences(stored: dict[str, object], asked: dict[str, object]) -> list[str]:
-    found = [f"{key}: {stored.get(key)} -> {asked[key]}" for key in _SAME if stored.get(key) != asked[key]]
-    # With which collector a worker runs a trial does not make it another one.
+def _differences(stored: dict[str, object], wanted: dict[str, object]) -> list[str]:
+    found = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
+    # The collector that a worker runs a trial with does not change the trial.
     before, now = (
         [line for line in one if group_of(line) != "collector"] if isinstance(one, list) else []
-        for one in (stored.get("base"), asked["base"])
+        for one in (stored.get("base"), wanted["base"])
     )
     if before != now:
         gone, new = [one for one in before if one not in now], [one for one in now if one not in before]
         found.append(f"every trial: {' '.join(gone) or 'nothing'} -> {' '.join(new) or 'nothing'}")
     return found
+
+
+def _known(request: SweepRequest, must_exist: bool, runs_dir: Path) -> Study | None:
+    """Return the study that the request names, if it exists; no file is created by looking."""
+    if request.entry.study is None:
+        return None
+    if request.entry.sweep.storage is None and not (runs_dir / "sweeps.db").exists():
+        return None
+    find = load_study if must_exist else find_study
+    return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))

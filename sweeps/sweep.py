@@ -16,54 +16,53 @@ from rich.console import Console
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
-from deepracer_exp.config.running import TrackingConfig, TrackingOff
-from deepracer_exp.config.sweep import SweepConfig, SweepRequest, compose_sweep
-from deepracer_exp.env.reward import RewardFunction
+from deepracer_exp.config.running import MLflowTracking, TrackingConfig
+from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
+from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
 from .best import best_line, best_shown, best_trial, best_values, complete_trials, write_best
+from .claims import Claim, TrialClaims, fail_unclaimed_trials, report_results
 from .database import resolve_database
 from .driver import Driver
-from .launch import Launcher, LocalLauncher
-from .ledger import Ledger, Slot
-from .plan import Plan
+from .launcher import Launcher, LocalLauncher
 from .pruners import build_pruner
 from .samplers import build_sampler
 from .space import SearchSpace
 from .storage import Storage, open_storage, patiently
-from .study import MAY_DIFFER, completed, find_study, goes_on, load_study, open_study
-from .table import SweepView
-from .telling import tell_settled, tell_strays
+from .study import load_request, open_study, runs_dir_of
 from .trial_run import Interrupted
+from .view import SweepView
+from .worker_config import WorkerConfig
 
 _DELIVERY_S, _FAREWELL_S = 30.0, 2.0
-"""How long MLflow is waited for when a sweep is over, and when it was interrupted and can resume."""
+"""How long to wait for MLflow when a sweep is done, and when it was interrupted and can resume."""
 REPORT = "sweep.html"
 """A study's page, in the folder of its runs."""
 
 
 def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]:
-    """Make the trials of a study that are still missing.
+    """Make the missing trials of a study.
 
     Args:
         overrides: as given on the command line.
-        console: stderr's, for the view.
+        console: of stderr, for the view.
 
     Returns:
         The study, the folder of its runs, and the exit code.
 
     Raises:
-        BadInput: before anything is begun; nothing is left.
+        BadInput: before anything is begun; nothing is left behind.
         RunFailed: all trials fail, or the database stays away.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    overrides, request, known = whole_request(overrides)
-    runs_dir = _runs_dir(request)
+    overrides, request, known = load_request(overrides)
+    runs_dir = runs_dir_of(request)
     config = request.entry.sweep
     protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
     request = _without_rules(request, overrides)
@@ -72,12 +71,13 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     build_sampler(config, space)
     build_pruner(config)
     experiment = _experiment(request, parent, space, runs_dir)
-    store = _store(experiment, runs_dir)
+    tracking = experiment.tracking
+    store = resolve_store(tracking.uri, runs_dir) if isinstance(tracking, MLflowTracking) else None
     with contextlib.closing(_launcher(config, runs_dir, store)) as launcher:
         storage = open_storage(config.storage, runs_dir)
         study = open_study(request, overrides, space, parent, storage, runs_dir)
-        study_run, study_run_id = begin_study_run(request, space, experiment.tracking, storage, runs_dir)
-        plan = Plan(
+        study_run, study_run_id = begin_study_run(request, space, tracking, storage, runs_dir)
+        worker_config = WorkerConfig(
             study=request.study,
             runs_dir=launcher.folder(runs_dir),
             config=config,
@@ -89,115 +89,95 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
             evaluations=_evaluations(experiment, request),
             cores=launcher.cores,
         )
-        if plan.study_run_id is not None:
-            study.set_user_attr("mlflow_run_id", plan.study_run_id)
+        if study_run_id is not None:
+            study.set_user_attr("mlflow_run_id", study_run_id)
         status: Status = "FAILED"
         code = 0
         try:
-            code = _driven(plan, storage, study, launcher, console, study_run)
+            code = _run(worker_config, storage, study, launcher, console, study_run)
             status = "KILLED" if code else "FINISHED"
         except KeyboardInterrupt:  # the second one
             status, code = "KILLED", 130
         finally:
             if study_run is not None:
                 study_run.finish(status, _FAREWELL_S if code else _DELIVERY_S)
-        return study, plan.folder, code
-
-
-def whole_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Study | None]:
-    """Return what is asked for, with what a study that is to go on knows itself, and that study.
-
-    Raises:
-        BadInput: an override is not accepted, there is nothing to search, or no study of that name to go on with.
-    """
-    request = compose_sweep(overrides)
-    known = _known(request, goes_on(overrides), _runs_dir(request))
-    if known is None:
-        return list(overrides), request, None
-    whole = completed(overrides, known)
-    request = compose_sweep(whole)
-    if not request.space:
-        raise BadInput(
-            f"study={request.study}: exists; to go on with it only {', '.join(MAY_DIFFER)} may be given beside its "
-            "name; for anything else give the whole search again"
-        )
-    return whole, request, known
+        return study, worker_config.folder, code
 
 
 def begin_study_run(
     request: SweepRequest, space: SearchSpace, tracking: TrackingConfig, storage: Storage, runs_dir: Path
 ) -> tuple[StudyRun | None, str | None]:
-    """Begin the run of a study in MLflow, or go on with it; return it with its id.
+    """Begin or continue the run of a study in MLflow; return it with its id.
 
     Args:
-        request: what is asked for.
+        request: of the sweep.
         space: of the request.
         tracking: of the trials.
         storage: of the study.
         runs_dir: where its runs are.
 
     Returns:
-        None, None with `tracking=off`; no id where the store does not answer.
+        None, None with `tracking=off`; no id if the store does not answer.
     """
-    # MLflow cannot be told to make a run only where there is none: one driver at a time looks and makes it.
+    # MLflow cannot create a run only if there is none: one driver at a time looks and creates it.
     with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
         objectives = request.entry.sweep.objectives
         run = open_study_run(tracking, runs_dir, request.study, objectives, space.as_text(), request.base)
         return run, None if run is None else run.wait_for_id()
 
 
-def _driven(
-    plan: Plan,
+def _run(
+    worker_config: WorkerConfig,
     storage: Storage,
     study: Study,
     launcher: Launcher,
     console: Console,
     study_run: StudyRun | None,
 ) -> int:
-    ledger, patience_s = Ledger(storage.engine, plan.study), plan.config.patience_s
+    """Run the workers, then derive everything else from the trial claims; return the exit code."""
+    claims, patience_s = TrialClaims(storage.engine, worker_config.study), worker_config.config.patience_s
 
-    def record(slots: Sequence[Slot]) -> None:
+    def track(found: Sequence[Claim]) -> None:
         if study_run is not None:
-            study_run.update(_progress(slots, plan, study))
+            study_run.update(_progress(found, worker_config.config, study))
 
-    with Interruption() as interruption, SweepView(plan, launcher.workers, console) as view:
-        slots = patiently(ledger.slots, patience_s)
-        view.show(slots)
-        if not ledger.is_done(plan.config.trials):
-            code = Driver(plan, storage, launcher, view, record).run(interruption)
+    with Interruption() as interruption, SweepView(worker_config, launcher.workers, console) as view:
+        view.show(patiently(claims.all, patience_s))
+        if not claims.is_done(worker_config.config.trials):
+            code = Driver(worker_config, storage, launcher, view, track).run(interruption)
             if code is not None:
                 return code
-        for call in (tell_settled, tell_strays):
-            patiently(partial(call, plan.study, ledger, storage.optuna), patience_s)
+        for derive in (report_results, fail_unclaimed_trials):
+            patiently(partial(derive, claims, storage.optuna), patience_s)
         try:
-            _conclude(plan, study, view, ledger, interruption)
+            _conclude(worker_config, study, view, claims, interruption)
         except Interrupted:
             assert interruption.exit_code is not None
             return interruption.exit_code
-        record(patiently(ledger.slots, patience_s))
+        track(patiently(claims.all, patience_s))
     if study_run is not None:
-        study_run.pictures([plan.folder / REPORT])
+        study_run.log_files([worker_config.folder / REPORT])
     return 0
 
 
-def _progress(slots: Sequence[Slot], plan: Plan, study: Study) -> Progress:
-    """Return how far the study is, for MLflow."""
-    counts = collections.Counter(slot.outcome for slot in slots)
-    steps = sum(slot.attrs.get("env_steps", 0) for slot in slots)
-    told: dict[str, Any] = {
-        "total": plan.config.trials,
+def _progress(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Progress:
+    """Return the progress of the study, for MLflow."""
+    results = [one.result for one in claims if one.result is not None]
+    counts = collections.Counter(result.state for result in results)
+    known: dict[str, Any] = {
+        "total": config.trials,
         "complete": counts["COMPLETE"],
         "pruned": counts["PRUNED"],
         "failed": counts["FAIL"],
-        "env_steps": steps,
+        "env_steps": sum(result.attrs.get("env_steps", 0) for result in results),
     }
     if not complete_trials(study):
-        return Progress(**told)
+        return Progress(**known)
     best = best_trial(study)
     return Progress(
-        **told,
+        **known,
         best_trial=best.number,
-        best_values=dict(zip(plan.config.objectives, best_values(study), strict=True)),
+        best_values=dict(zip(config.objectives, best_values(study), strict=True)),
         best_shown=best_shown(study),
         best_line=best_line(study),
         lap_time_s=best.user_attrs.get("lap_time_s"),
@@ -205,79 +185,74 @@ def _progress(slots: Sequence[Slot], plan: Plan, study: Study) -> Progress:
     )
 
 
-def _conclude(plan: Plan, study: Study, view: SweepView, ledger: Ledger, interruption: Interruption) -> None:
-    """Find the winner, and write what is told of the study.
+def _conclude(
+    worker_config: WorkerConfig,
+    study: Study,
+    view: SweepView,
+    claims: TrialClaims,
+    interruption: Interruption,
+) -> None:
+    """Find the winner, and write best_of_sweep.json and the page.
 
     Raises:
-        Interrupted: the process was told to end while the best trials drove.
+        Interrupted: the process was asked to end during the fresh laps.
     """
-    # Both take seconds to import, and workers shall begin before.
-    from .report import write_report
+    # Both take seconds to import, and the workers are to start before.
+    from .report import write_study_page
 
-    if complete_trials(study) and plan.config.rerank:
+    if complete_trials(study) and worker_config.config.rerank:
         import torch
 
         from .rerank import rerank
 
         torch.set_num_threads(1)
 
-        def heed(*_: object) -> None:
+        def check(*_: object) -> None:
             if interruption.signum is not None:
                 raise Interrupted
 
-        def tell(trial: FrozenTrial) -> None:
-            heed()
-            view.stage = f"trial {trial.number} drives {plan.config.rerank_laps} fresh laps"
-            view.show(ledger.slots())
+        def show(trial: FrozenTrial) -> None:
+            check()
+            view.stage = f"trial {trial.number} drives {worker_config.config.rerank_laps} fresh laps"
+            view.show(claims.all())
 
-        again = [{**asdict(one), "interval": list(one.interval)} for one in rerank(plan, study, tell, heed)]
+        again = [
+            {**asdict(one), "interval": list(one.interval)}
+            for one in rerank(worker_config, study, show, check)
+        ]
         study.set_user_attr("reranked_of", len(complete_trials(study)))
         study.set_user_attr("reranked", again)
         view.stage = ""
-        view.show(ledger.slots())
+        view.show(claims.all())
     else:
         study.set_user_attr("reranked", [])
     if complete_trials(study):
-        write_best(study, plan.runs_dir)
-    write_report(study, plan.folder / REPORT)
-
-
-def _runs_dir(request: SweepRequest) -> Path:
-    given = [line.partition("=")[2] for line in request.base if line.partition("=")[0] == "runs_dir"]
-    return Path(compose_experiment([f"runs_dir={given[-1]}"] if given else [])[0].runs_dir)
-
-
-def _known(request: SweepRequest, must_be_there: bool, runs_dir: Path) -> Study | None:
-    """Return the study that is asked for by its name, if it is there; no file is made for looking."""
-    if request.entry.study is None:
-        return None
-    if request.entry.sweep.storage is None and not (runs_dir / "sweeps.db").exists():
-        return None
-    find = load_study if must_be_there else find_study
-    return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))
+        write_best(study, worker_config.runs_dir)
+    write_study_page(study, worker_config.folder / REPORT)
 
 
 def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequest:
-    """Let trials end by a stopping rule only where the pruner `entropy` is asked for, or a rule beside the pruners.
+    """Remove the stopping rule unless the pruner `entropy` or a rule beside the pruners is asked for.
 
     Args:
-        request: what is asked for.
-        overrides: of it; where they choose the pruners, the rule that a ready-made sweep has with its own is not meant.
+        request: of the sweep.
+        overrides: of it; if they choose the pruners, the rule that a ready-made sweep pairs with its own does not
+            count.
     """
     if "entropy" in request.entry.sweep.pruners:
         return request
     chosen = any(key_of(line) == "sweep.pruners" for line in overrides)
-    told = overrides if chosen else (*request.base, *request.space)
-    if "stopping" in map(group_of, told):
+    given = overrides if chosen else (*request.base, *request.space)
+    if "stopping" in map(group_of, given):
         return request
     base = [line for line in request.base if group_of(line) != "stopping"]
     return replace(request, base=(*base, "stopping=none"))
 
 
 def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple[str, ...]:
-    """Return what names the parent's run and checkpoint, as `Plan.parent`.
+    """Return the overrides that name the parent's run and checkpoint, as `WorkerConfig.parent`.
 
-    `best:NAME` and aliases lead elsewhere some day: they are looked up when a study is begun.
+    `best:NAME` and aliases may name another run later: they are resolved when a study is begun.
     """
     parent = request.entry.parent
     if parent is None:
@@ -290,12 +265,12 @@ def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple
     try:
         _, lineage = prepare_clone([f"run={parent}", f"name={request.study}"], runs_dir, None).start
     except BadInput as error:
-        raise BadInput(f"parent={parent}: {str(error).removeprefix(f'run={parent}: ')}") from error
+        raise BadInput(f"parent={parent}: {str(error).removeprefix(f'{parent}: ')}") from error
     return f"run={lineage.parent_dir}", f"checkpoint={int(lineage.checkpoint)}"
 
 
 def _check(request: SweepRequest, parent: tuple[str, ...], runs_dir: Path) -> Any:
-    """Return what tries overrides: None as a training does, else as clones of the parent do."""
+    """Return what checks overrides of a trial: None as for a training, or a function that clones the parent."""
     if not parent:
         return None
 
@@ -311,7 +286,7 @@ def _check(request: SweepRequest, parent: tuple[str, ...], runs_dir: Path) -> An
 def _experiment(
     request: SweepRequest, parent: tuple[str, ...], space: SearchSpace, runs_dir: Path
 ) -> Experiment:
-    """Return the experiment of one trial, and read its files."""
+    """Return the experiment of one trial, after reading its files."""
     if parent:
         from deepracer_exp.training.clone import prepare_clone
 
@@ -323,13 +298,8 @@ def _experiment(
     return experiment
 
 
-def _store(experiment: Experiment, runs_dir: Path) -> Store | None:
-    tracking = experiment.tracking
-    return None if isinstance(tracking, TrackingOff) else resolve_store(tracking.uri, runs_dir)
-
-
 def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
-    """Return how often a trial is evaluated on its way, None where that is not known or differs between trials."""
+    """Return how often a trial is evaluated before its end, None if unknown or different between trials."""
     if {key.partition(".")[0] for key in request.space} & {"budget", "checkpoints", "experiment"} or any(
         key == "algorithm" or key.endswith("_per_iteration") for key in request.space
     ):
@@ -346,6 +316,6 @@ def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
 def _launcher(config: SweepConfig, runs_dir: Path, store: Store | None) -> Launcher:
     if config.executor.kind == "local":
         return LocalLauncher(config.workers)
-    from .ray_launch import RayLauncher
+    from .ray_launcher import RayLauncher
 
     return RayLauncher(config, config.executor, runs_dir, store)

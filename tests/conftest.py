@@ -85,7 +85,7 @@ class Ended:
         assert self.complaint.startswith("deepracer-exp: run failed: ")
         for word in words:
             assert word in self.complaint
-        assert f"what is known: {self.folder.relative_to(self.cwd)}" in self.stderr
+        assert f"details: {self.folder.relative_to(self.cwd)}" in self.stderr
         assert self.summary["status"] == "failed"
         assert self.summary["reason"] in self.complaint
         assert "finished" not in self.stdout

@@ -8,7 +8,7 @@ import yaml
 
 from deepracer_exp import __version__
 from deepracer_exp.config.options import groups
-from deepracer_exp.formats.worlds import leaders, worlds
+from deepracer_exp.deepracer.worlds import leaders, worlds
 
 HEAVY = (
     "torch",
@@ -86,8 +86,8 @@ def test_options_may_stand_between_overrides(call):
     ]
 
 
-@pytest.mark.parametrize("arguments", [["train", "seed=1", "--fast"], ["tracks", "a", "b"], ["ui", "seed=1"]])
-def test_an_argument_nobody_knows_is_refused(call, arguments):
+@pytest.mark.parametrize("arguments", [["train", "seed=1", "--fast"], ["tracks", "a", "b"]])
+def test_an_unknown_argument_is_refused(call, arguments):
     ended = call(*arguments)
     assert ended.code == 2
     assert f"unrecognized arguments: {arguments[-1]}" in ended.stderr
@@ -183,7 +183,7 @@ def test_an_imported_experiment_trains(call, tmp_path):
         "conf/experiment/mine.yaml",
     ]
     assert "deepracer-exp train experiment=mine" in ended.stdout
-    assert "taken as reward.file" in ended.stderr
+    assert "used as reward.file" in ended.stderr
     assert "mine" in call("train", "--options", "reward").stdout.split()
     cfg = call("train", "experiment=mine", "--cfg").stdout
     assert yaml.safe_load(cfg)["reward"]["file"] == str(tmp_path / "conf/reward/mine.py")
@@ -206,7 +206,7 @@ def test_import_of_no_folder_is_bad_input(call):
     assert call("import", "nowhere").code == 2
 
 
-def test_what_was_taken_from_files_is_told_once_and_logged(train_here, tmp_path):
+def test_notes_on_imported_files_are_printed_once_and_logged(train_here, tmp_path):
     folder = tmp_path / "model_3"
     folder.mkdir()
     (folder / "reward_function.py").write_text("def reward_function(params):\n    return params['speed']\n")

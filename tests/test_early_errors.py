@@ -1,4 +1,4 @@
-"""What is wrong with a command line is said at once, and in one line."""
+"""Errors in a command line are reported at once, and in one line."""
 
 import json
 import os
@@ -27,46 +27,70 @@ CASES = {
     ("import", "nowhere", "--name", "mine"): "nowhere",
     ("validate", "reward.file=nothing.py"): "nothing.py",
     ("validate", "reward=racing"): "reward=racing",
-    ("evaluate", "run=nobody"): "run=nobody",
-    ("evaluate", "run=runs/a/run", "checkpoint=120"): "checkpoint=120",
-    ("evaluate", "run=runs/a/run", "evaluation=sumit"): "did you mean summit?",
-    ("resume", "nobody"): "run=nobody",
+    ("evaluate", "unknown"): "unknown: no such run in runs (1 there)",
+    ("evaluate", "runs/a/run", "checkpoint=120"): "checkpoint=120",
+    ("evaluate", "runs/a/run", "evaluation=sumit"): "did you mean summit?",
+    ("evaluate", "evaluation=summit"): "RUN: missing; write deepracer-exp evaluate RUN",
+    ("evaluate", "one", "two"): "one two: 2 runs given",
+    ("resume", "unknown"): "unknown: no such run",
     ("resume", "~no_such_user"): "~no_such_user",
     ("resume", "a" * 300): "File name too long",
     ("resume", "runs/a/run", "budget.stepz=1"): "budget.stepz",
-    ("clone", "run=nobody"): "run=nobody",
-    ("clone", "run=runs/a/run", "checkpoint=120"): "checkpoint=120",
-    ("checkpoints", "nobody"): "run=nobody",
+    ("clone", "unknown"): "unknown: no such run",
+    ("clone", "runs/a/run", "checkpoint=120"): "checkpoint=120",
+    ("checkpoints", "unknown"): "unknown: no such run",
     ("checkpoints", "runs/a/run"): "checkpoints",
-    ("compare", "nobody", "none"): "run=nobody",
-    ("lineage", "nobody"): "run=nobody",
-    ("promote", "nobody"): "run=nobody",
-    ("promote", "nobody", "--checkpoint", "../x"): "--checkpoint",
-    ("export", "run=nobody", "format=onnx"): "run=nobody",
-    ("export", "run=runs/a/run", "format=onnx"): "checkpoint",
-    ("export", "run=runs/a/run", "format=onx"): "format",
-    ("analyze", "nobody"): "nobody",
+    ("runs", "lst"): "did you mean list?",
+    ("runs", "runs_dir=nowhere"): "runs_dir=nowhere: is not a folder",
+    ("runs", "run_dir=nowhere"): "did you mean runs_dir?",
+    ("runs", "compare", "unknown", "none"): "unknown: no such run",
+    ("runs", "lineage", "unknown"): "unknown: no such run",
+    ("runs", "promote", "unknown"): "unknown: no such run",
+    ("runs", "promote", "unknown", "checkpoint=../x"): "checkpoint=../x",
+    ("runs", "clean", "runs_dir=nowhere"): "runs_dir=nowhere: is not a folder",
+    ("export", "unknown", "format=onnx"): "unknown: no such run",
+    ("export", "runs/a/run", "format=onnx"): "checkpoint",
+    ("export", "runs/a/run", "format=onx"): "format",
+    ("analyze", "unknown"): "unknown: no such file or folder, and no run",
     ("analyze", "pipe"): "pipe: is a pipe",
     ("analyze", "log.txt", "--reward", "nothing.py"): "nothing.py",
     ("analyze", "log.txt", "--target", "soon"): "--target soon",
-    ("analyze", "log.txt", "--out", "nowhere/page.html"): "--out nowhere",
-    ("stopping", "replay", "nobody"): "run=nobody",
+    ("analyze", "log.txt", "--output", "nowhere/page.html"): "--output nowhere",
+    ("stopping", "replay", "unknown"): "unknown: no such run",
+    ("stopping", "replay", "unknown", "seed=1"): "seed=1: accepted: stopping=NAME",
     ("tracks", "nowhere"): "nowhere",
     ("sweep", "algorithm.lr=1e-4,1e-3", "sweep.workers=100000"): "sweep.workers=100000",
     ("sweep", "track=../x,Oval_track"): "track=../x",
     ("sweep", "algorithm.lr=1e-4,1e-3", "reward.file=nothing.py"): "nothing.py",
     ("sweep", "algorithm.lr=1e-4,1e-3", "sweep.protocol=../x", "--cfg"): "sweep.protocol=../x",
     ("sweep", "study=../x", "algorithm.lr=1e-4,1e-3", "--cfg"): "study",
-    ("sweep", "best", "nobody"): "sweeps.db",
+    ("sweep", "best", "unknown"): "sweeps.db",
+    ("sweep", "best", "unknown", "seed=1"): "seed=1: no such key",
     ("sweep", "best", "../x"): "../x",
     ("ui", "--port", "http"): "--port",
-    ("clean", "--runs-dir", "nowhere"): "nowhere",
+    # Spellings of before.
+    ("evaluate", "run=x"): "run=x: write deepracer-exp evaluate x",
+    ("evaluate", "run=x", "--video", "lap.mp4"): "run=x: write deepracer-exp evaluate x",
+    ("clone", "run=x", "checkpoint=last"): "run=x: write deepracer-exp clone x",
+    ("export", "format=onnx", "run=my runs/x"): "write deepracer-exp export 'my runs/x'",
+    ("checkpoints", "run=x"): "run=x: write deepracer-exp checkpoints x",
+    ("compare", "a", "b"): "compare: write deepracer-exp runs compare a b",
+    ("lineage", "a"): "lineage: write deepracer-exp runs lineage a",
+    ("promote", "best:a", "--alias", "rain"): "write deepracer-exp runs promote best:a --alias rain",
+    ("clean", "--apply"): "clean: write deepracer-exp runs clean --apply",
+    ("resume", "x", "--runs-dir", "there"): "--runs-dir: write runs_dir=there",
+    ("ui", "--uri=http://host:5000"): "--uri: write tracking.uri=http://host:5000",
+    ("runs", "lineage", "x", "--tracking-uri", "http://h"): "--tracking-uri: write tracking.uri=http://h",
+    ("runs", "promote", "x", "--checkpoint", "120"): "--checkpoint: write checkpoint=120",
+    ("sweep", "best", "x", "--storage", "sqlite:///x.db"): "--storage: write sweep.storage=sqlite:///x.db",
+    ("analyze", "x", "--out", "page.html"): "--out: write --output page.html",
+    ("evaluate", "x", "tracking_uri=http://h"): "did you mean tracking.uri?",
 }
 
 
 @pytest.fixture(scope="module")
 def refused(tmp_path_factory, call_at):
-    """Call all of them in one fresh process; by its words what each said, its code, and what it imported."""
+    """Call all of them in one fresh process: exit code, output and heavy imports of each."""
     folder = tmp_path_factory.mktemp("early")
     os.mkfifo(folder / "pipe")
     (folder / "log.txt").write_text("nothing\n")
@@ -96,7 +120,7 @@ for words in {list(CASES)!r}:
 
 
 @pytest.mark.parametrize("words", CASES, ids=" ".join)
-def test_what_is_wrong_is_said_in_one_line_before_anything_heavy_is_imported(refused, words):
+def test_an_error_is_one_line_before_anything_heavy_is_imported(refused, words):
     code, said, heavy = refused[words]
     assert code == 2, said
     assert CASES[words] in said
@@ -113,7 +137,7 @@ def test_what_is_wrong_is_said_in_one_line_before_anything_heavy_is_imported(ref
         ("action_space=model_metadata.json", "action_space.file=model_metadata.json"),
     ],
 )
-def test_a_file_in_the_place_of_an_option_is_told_where_it_belongs(call, given, meant):
+def test_a_file_given_as_an_option_is_answered_with_the_right_key(call, given, meant):
     call("train", given).assert_bad_input(f"did you mean {meant}?")
 
 

@@ -6,19 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import binomtest, norm
+from scipy.stats import norm
+
+from deepracer_exp.deepracer.recording import Recording
 
 from .log_view import LogView
+from .statistics import wilson
 
 LEAST_LAPS = 3
-"""Complete laps of an iteration below which its 25th percentile says nothing."""
+"""Complete laps of an iteration below which its 25th percentile means nothing."""
 DENSE = 0.5
 """Share of complete laps an iteration must have, of the highest share that any iteration has."""
 MOST = 3
 
 
 def candidates_of(view: LogView) -> pd.DataFrame:
-    """Return the candidates of a log; none of a run of ours, which keeps few checkpoints and has evaluated them."""
+    """Return the candidates of a log; none of our own runs, which keep few checkpoints and have evaluated them."""
     return candidates(view.iterations if view.recording.best is None else view.iterations.iloc[:0])
 
 
@@ -36,9 +39,22 @@ def candidates(iterations: pd.DataFrame) -> pd.DataFrame:
     return iterations[enough & dense].sort_values("lap_time_p25_s", kind="stable").head(MOST)
 
 
+def evaluated_candidates(recording: Recording) -> pd.DataFrame:
+    """Return the iterations after which the service's evaluation completed every lap it tried, the fastest first.
+
+    Returns:
+        By iteration: `laps` and `lap_time_s`, their mean.
+    """
+    rows = recording.metrics
+    rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
+    groups = rows.groupby("iteration")
+    found = pd.DataFrame({"laps": groups.size(), "lap_time_s": groups["time_s"].mean()})
+    return found[groups["completion"].min() >= 100.0].sort_values("lap_time_s", kind="stable")
+
+
 @dataclass(frozen=True, kw_only=True)
 class LapChance:
-    """How likely a complete lap is not above a target."""
+    """The chance that a complete lap takes no longer than a target."""
 
     target_s: float
     laps: int
@@ -70,7 +86,7 @@ def lap_chance(lap_times_s: NDArray[np.float64], target_s: float) -> LapChance |
     if not len(laps):
         return None
     faster = int((laps <= target_s).sum())
-    low, high = binomtest(faster, len(laps)).proportion_ci(method="wilson")
+    low, high = map(float, wilson(faster, len(laps)))
     sd_s = float(laps.std(ddof=1)) if len(laps) > 1 else math.nan
     return LapChance(
         target_s=target_s,

@@ -1,40 +1,12 @@
-"""Runs side by side: in what their configurations differ, and what came of them."""
+"""The results of runs side by side."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from deepracer_exp.config import stored
-from deepracer_exp.formats.run_files import RunRecord
-from deepracer_exp.formats.run_result import FIGURES, result_of
-
-NOTHING = stored.ABSENT
-_NO_MATTER = ("runs_dir", "debug", "report", "tracking")  # whatever they are, the car drives the same
-
-
-def differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
-    """Return the values in which the runs differ, by dotted key; NOTHING where a run has no such key.
-
-    The reward's text and the code are compared as well, by their hashes.
-    """
-    configs = [
-        {key: value for key, value in record.config.items() if key not in _NO_MATTER} for record in records
-    ]
-    courses = [course_names(config.get("track")) for config in configs]
-    if len(set(courses)) > 1:  # the points of a track say less than its name
-        for config, course in zip(configs, courses, strict=True):
-            config["track"] = course
-    for config, record in zip(configs, records, strict=True):
-        sha256 = record.provenance.get("reward", {}).get("sha256")
-        config["reward_function.py"] = NOTHING if sha256 is None else f"sha256 {sha256[:8]}"
-        config["code"] = str(record.provenance.get("git_commit") or NOTHING)[:16]
-    return stored.differences(configs)
-
-
-def course_names(track: Any) -> str:
-    """Return the name of the track of a configuration, or those of several."""
-    known = isinstance(track, Mapping)
-    return str(track["name"]) if known and "name" in track else ", ".join(track) if known else NOTHING
+from deepracer_exp.config.stored import ABSENT as NOTHING
+from deepracer_exp.runs.files import RunRecord
+from deepracer_exp.runs.result import FIGURES, result_of
 
 
 def value_text(value: Any, most: int = 48) -> str:
@@ -96,15 +68,14 @@ RESULTS: tuple[Result, ...] = (
     ("return", _last("mean_return"), "{:.1f}", 0),
     ("entropy, nats", _last("entropy"), "{:.2f}", 0),
 )
-"""What is compared: the best checkpoint as its evaluation found it, and of the training the last iteration, as in its
-view and in summary.json. Of each: name, value, format, and whether a higher value is better (1), a lower one (-1), or
-neither."""
+"""The results that are compared: of the evaluation of the best checkpoint, and of the last iteration of the training.
+Each has a name, a value, a format, and whether a higher value is better (1), a lower one (-1), or neither (0)."""
 
 
 def results(records: Sequence[RunRecord]) -> list[tuple[str, list[str], int | None]]:
-    """Return what came of the runs: name, a text a run, and the number of the best one if there is one.
+    """Return the results of the runs: name, a text for each run, and the number of the best one if there is one.
 
-    What no run has is left out.
+    Results that no run has are left out.
     """
     lines = []
     for name, value, form, better in RESULTS:

@@ -1,37 +1,45 @@
-"""What a log says in words: rules over its tables, each with its figure (docs/findings.md)."""
+"""Findings of a log in words: rules over its tables, each with its figure (docs/findings.md)."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
 
-from deepracer_exp.formats.run_result import RunResult
+from deepracer_exp.runs.convergence import (
+    EVALUATION_DROP,
+    LOG_RULE,
+    POOR,
+    convergence,
+    convergence_rule,
+    overfitting,
+)
+from deepracer_exp.runs.result import RunResult
 
 from . import candidates as chosen
-from . import learning, off_track
-from .candidates import candidates, lap_chance
-from .learning import convergence, overfitting
+from . import off_track
+from .candidates import candidates, evaluated_candidates, lap_chance
 from .log_view import LogView
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
-from .sectors import Sectors, sector_times, sectors_of, theoretical_best_s
+from .sectors import Sectors, sectors_of, theoretical_best_s, times_by_sector
+from .statistics import wilson
 
 LATE_SHARE = 1 / 3
-"""Share of the iterations, the last ones, that say how the car drives now."""
+"""Share of the iterations, the last ones, that show how the car drives now."""
 LEAST_LAPS = 5
-"""Complete laps in them below which all laps of the log are looked at, and below which nothing is said of chances."""
+"""Complete laps in them below which all laps of the log are used, and below which no chances are given."""
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""
 MOST_LOST = 3
 WORTH_S = 0.02
-"""Time lost in a sector that is worth a word."""
+"""Time lost in a sector from which on it is mentioned."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One thing a log says."""
+    """A finding of a log."""
 
     rule: str
     sentence: str
@@ -39,12 +47,12 @@ class Finding:
     figure: str
     """Name of the chart that shows it."""
     values: Mapping[str, float | int | str] = field(default_factory=dict)
-    """What was compared."""
+    """The numbers that were compared."""
     thresholds: Mapping[str, float | int] = field(default_factory=dict)
 
 
 def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
-    """Return what the rules find in a log, the most important first.
+    """Apply all rules to a log; the most important findings are first.
 
     Args:
         view: the log.
@@ -66,7 +74,7 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
 
 @dataclass(frozen=True, eq=False)
 class _Laps:
-    """The steps of the car as it drives now; where there is no training, of the evaluations."""
+    """The steps of the car as it drives now; without a training, those of the evaluations."""
 
     steps: pd.DataFrame
     lap_times_s: np.ndarray
@@ -85,7 +93,7 @@ class _Laps:
 
 
 def _now(view: LogView) -> tuple[pd.DataFrame, str]:
-    """Return the episodes that say how the car drives now, and which these are."""
+    """Return the episodes that show how the car drives now, and which they are."""
     if not view.trained:
         return view.episodes, "in the evaluations"
     late = _late(view)
@@ -100,19 +108,23 @@ def _late(view: LogView) -> pd.DataFrame:
 
 
 def _converged(view: LogView) -> Finding:
-    found = convergence(view.iterations, view.action_count)
+    decision = view.recording.decision
+    if decision is not None:
+        return _decided(decision)
+    found = convergence(view.iterations, view.action_count, view.recording.stopping)
+    rule = convergence_rule(view.recording.stopping)
     thresholds = {
-        "completion_gain": learning.COMPLETION_GAIN,
-        "reward_gain": learning.REWARD_GAIN,
-        "laps_gain": learning.LAPS_GAIN,
-        "completion_near": learning.COMPLETION_NEAR,
-        "entropy_change": learning.ENTROPY_CHANGE,
+        "completion_gain": rule.completion_gain,
+        "reward_gain": rule.return_gain,
+        "laps_gain": rule.laps_gain,
+        "completion_near": rule.completion_near,
+        "entropy_change": rule.entropy_change,
     }
     if found is None:
         driven = int((view.iterations["episodes"] > 0).sum())
         sentence = (
             f"Too short to say whether the training has converged: {_count(driven, 'iteration')}, and at least "
-            f"{learning.PATIENCE + 1} are needed."
+            f"{rule.patience + 1} are needed."
         )
         return Finding(
             rule="converged", sentence=sentence, figure="training_progress", values={"iterations": driven}
@@ -131,31 +143,45 @@ def _converged(view: LogView) -> Finding:
             f"Converged at iteration {found.iteration}: since then completion ({found.completion:.0f} %), reward and "
             "complete laps have not grown."
         )
-        if found.completion < learning.POOR:
+        if found.completion < POOR:
             sentence += (
                 " That is far from a lap: change reward, action space or learning rate, do not train longer."
             )
-    elif found.completion < found.completion_best - learning.COMPLETION_NEAR:
+    elif found.completion < found.completion_best - rule.completion_near:
         sentence = (
             f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f} %. "
             "A lower learning rate or an earlier checkpoint may hold it."
         )
-    elif found.completion > found.completion_before + learning.COMPLETION_GAIN:
+    elif found.completion > found.completion_before + rule.completion_gain:
         sentence = (
             f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f} % in "
             f"the last {found.patience} iterations. Train on."
         )
     else:
-        what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still moves"
-        sentence = f"Not converged yet: completion stands at {found.completion:.0f} %, but {what}. Train on."
+        what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still changes"
+        sentence = f"Not converged yet: completion is {found.completion:.0f} %, but {what}. Train on."
     return Finding(
         rule="converged", sentence=sentence, figure="training_progress", values=values, thresholds=thresholds
     )
 
 
+def _decided(decision: Mapping[str, Any]) -> Finding:
+    """Report the decision of the run's own stopping rule: whatever else the log shows, that is why it ended."""
+    rule = str(decision["rule"]).replace("_", " ")
+    return Finding(
+        rule="converged",
+        sentence=f"The run's stopping rule ended it ({rule}): {decision['why']}.",
+        figure="training_progress",
+        values=decision["values"],
+        thresholds={
+            key: value for key, value in decision["thresholds"].items() if isinstance(value, int | float)
+        },
+    )
+
+
 def _race_with(best: RunResult) -> Finding:
     """Name the best checkpoint of a run of ours, as its summary does."""
-    sentence = "No checkpoint was evaluated: `deepracer-exp checkpoints RUN` lets those that were kept race."
+    sentence = "No checkpoint was evaluated: `deepracer-exp checkpoints RUN` races the ones that were kept."
     values: dict[str, float | int | str] = {}
     if best.iteration is not None:
         sentence = f"Race with checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
@@ -171,9 +197,12 @@ def _submit(view: LogView) -> Finding:
     if not len(best):
         farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
         laps = int(view.iterations["complete"].sum())
+        evaluated = evaluated_candidates(view.recording)
+        if len(evaluated):
+            return _submit_evaluated(evaluated, laps, thresholds)
         sentence = (
             f"Nothing to submit yet: no iteration has {chosen.LEAST_LAPS} complete laps ({_count(laps, 'lap')} in "
-            f"all); the farthest episode came to {farthest['progress']:.0f} % of the lap in iteration "
+            f"all); the farthest episode drove {farthest['progress']:.0f} % of the lap in iteration "
             f"{farthest['iteration']}."
         )
         values = {"laps": laps, "progress": float(farthest["progress"])}
@@ -185,7 +214,7 @@ def _submit(view: LogView) -> Finding:
             thresholds=thresholds,
         )
     first = best.iloc[0]
-    low, high = _range(int(first["complete"]), int(first["episodes"]))
+    low, high = map(float, wilson(first["complete"], first["episodes"]))
     which = f"the checkpoint {first['checkpoint']}, which" if first["checkpoint"] else "the checkpoint that"
     sentence = (
         f"Submit {which} drove iteration {first['iteration']:.0f}: a quarter of its laps are below "
@@ -202,6 +231,24 @@ def _submit(view: LogView) -> Finding:
     values |= {"lap_share": float(first["lap_share"]), "laps": int(first["complete"])}
     return Finding(
         rule="submit", sentence=sentence, figure="lap_time_percentile", values=values, thresholds=thresholds
+    )
+
+
+def _submit_evaluated(evaluated: pd.DataFrame, laps: int, thresholds: Mapping[str, float]) -> Finding:
+    first = evaluated.iloc[0]
+    count = int(first["laps"])
+    did = {1: "completed its lap", 2: "completed both laps"}.get(count, f"completed all {count} laps")
+    sentence = (
+        f"Submit the checkpoint saved after iteration {evaluated.index[0]}: its evaluation {did}, in "
+        f"{first['lap_time_s']:.2f} s{'' if count == 1 else ' on average'}. The training itself has too few complete "
+        f"laps to judge by ({laps})."
+    )
+    return Finding(
+        rule="submit",
+        sentence=sentence,
+        figure="training_progress",
+        values={"iteration": int(evaluated.index[0]), "lap_time_s": float(first["lap_time_s"]), "laps": laps},
+        thresholds=thresholds,
     )
 
 
@@ -245,7 +292,7 @@ def _time_lost(view: LogView, laps: _Laps) -> Finding | None:
     if view.course is None:
         return None
     sectors = sectors_of(view.course)
-    times = sector_times(laps.steps, sectors)
+    times = times_by_sector(laps.steps, sectors)
     if len(times) < 2 or len(sectors.parts) < 2:
         return None
     lost = (times.median() - times.min()).sort_values(ascending=False, kind="stable").head(MOST_LOST)
@@ -294,7 +341,7 @@ def _crashes(view: LogView) -> Finding | None:
     if len(here) >= off_track.LEAST:
         sentence += (
             f", {len(here)} times at one place: waypoint {waypoint} (x {x_m:.2f} m, y {y_m:.2f} m), where an "
-            "object stands or drives."
+            "object is."
         )
     else:
         sentence += ", at no place often."
@@ -347,10 +394,10 @@ def _runs_off(view: LogView) -> list[Finding]:
 
 
 def _steering(places: list[OffTrackPlace]) -> Finding:
-    # What holds at several places is said once.
+    # A mistake made at several places is mentioned once.
     at: dict[str, list[str]] = {}
     for one in places:
-        said = JUDGEMENTS[one.judgement] if one.judgement else "it does now this, now that"
+        said = JUDGEMENTS[one.judgement] if one.judgement else "its mistakes vary"
         at.setdefault(said, []).append(str(one.waypoint))
     words = [f"at waypoint{'s' * (len(some) > 1)} {_and(some)} {said}" for said, some in at.items()]
     return Finding(
@@ -377,8 +424,9 @@ def _in(sectors: Sectors | None, place: OffTrackPlace) -> str:
 
 
 def _overfits(view: LogView) -> Finding | None:
+    decision = view.recording.decision
     found = overfitting(view.iterations)
-    if found is None:
+    if found is None or (decision is not None and decision["rule"] == "overfitting"):  # said already
         return None
     if found.overfits:
         sentence = (
@@ -388,7 +436,7 @@ def _overfits(view: LogView) -> Finding | None:
         )
     else:
         sentence = (
-            f"No sign of overfitting: completion in the {found.evaluated} stands at {found.now:.0f} % "
+            f"No sign of overfitting: completion in the {found.evaluated} is {found.now:.0f} % "
             f"(best {found.best:.0f} %), in the training at {found.training_now:.0f} %."
         )
     return Finding(
@@ -403,8 +451,8 @@ def _overfits(view: LogView) -> Finding | None:
             "training_now": found.training_now,
         },
         thresholds={
-            "evaluation_drop": learning.EVALUATION_DROP,
-            "training_near": learning.COMPLETION_NEAR,
+            "evaluation_drop": EVALUATION_DROP,
+            "training_near": LOG_RULE.completion_near,
         },
     )
 
@@ -418,12 +466,6 @@ def _share(share: float) -> str:
     return (
         f"{share:.0%}" if share >= 0.1 or share == 0 else f"{share:.1%}" if share >= 0.001 else "below 0.1%"
     )
-
-
-def _range(hits: int, tries: int) -> tuple[float, float]:
-    """Return the 95 per cent interval of a share (Wilson 1927)."""
-    low, high = binomtest(hits, tries).proportion_ci(method="wilson")
-    return float(low), float(high)
 
 
 def _and(words: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Which courses a recording was driven on."""
+"""The courses of a recording, found by name or recognised by where the car drove."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,25 +8,26 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import shapely
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.deepracer.recording import LogProblem, Recording
+from deepracer_exp.deepracer.routes import read_knots, read_route
+from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.formats.recording import LogProblem, Recording
-from deepracer_exp.formats.routes import read_knots, read_route
-from deepracer_exp.formats.run_files import read_config
-from deepracer_exp.formats.worlds import find_world, worlds
+from deepracer_exp.runs.files import CONFIG, read_config
 from deepracer_exp.tracks.catalogue import recognise, world_rows, world_track
 from deepracer_exp.tracks.track import Track
 
 _SAMPLE = 2000
-"""Rows of a course that are looked at to find out which it is."""
+"""Rows of a course that are used to recognise it."""
 _LENGTH_NEAR = 0.01
 """Share by which a logged length may differ from that of the course."""
 _INSIDE = 0.95
 """Share of the rows that must be on or just beside the road."""
 _BESIDE_M = 0.3
-"""How far beside the road a car still gets before its episode ends."""
+"""How far beside the road a car may be before its episode ends."""
 _SAME_NUMBERS = 0.9
 """Share of the rows whose waypoint must be one of the two around them; the rest is rounding."""
 _LEAST_WAYPOINTS = 20
@@ -42,14 +43,15 @@ class Courses:
     tracks: Mapping[str, Track]
     """By the name in `steps.track`."""
     problems: tuple[LogProblem, ...]
-    """Courses that were not found, with the reason."""
+    """Courses that were not recognised, with the reason."""
 
 
 def find_courses(recording: Recording) -> Courses:
     """Find the course of each name in a recording's `steps.track`.
 
-    A run of ours has its courses in its config.yaml. Other names are looked up among the service's worlds; one that is
-    unknown, not told, or not where the car drove is found by waypoint numbers, length and places.
+    One of our own runs has its courses in its config.yaml. Other names are looked up among the service's worlds; a
+    course without a known name, or with one that does not match where the car drove, is recognised by its waypoint
+    numbers, its length and the positions of the car.
     """
     own, problems = _own_courses(recording)
     tracks: dict[str, Track] = {}
@@ -59,10 +61,10 @@ def find_courses(recording: Recording) -> Courses:
         if not len(rows):
             continue
         sample = recording.steps.iloc[rows[:: max(1, len(rows) // _SAMPLE)]]
-        told = str(name) or recording.track or ""
-        config, world = own.get(told), None if told in own else _driven_on(told, sample)
+        logged = str(name) or recording.track or ""
+        config, world = own.get(logged), None if logged in own else _recognised(logged, sample)
         if config is None and world is None:
-            problems.append(LogProblem(recording.name, None, _unknown(told, sample)))
+            problems.append(LogProblem(recording.name, None, _unknown(logged, sample)))
             continue
         try:
             both = [
@@ -101,7 +103,7 @@ def catalogue_track(name: str, reversed: bool = False) -> Track:
 def _own_courses(recording: Recording) -> tuple[dict[str, TrackConfig], list[LogProblem]]:
     """Return the courses of a run's config.yaml by their names in its trace."""
     for file in recording.files:
-        if file.name == "config.yaml":
+        if file.name == CONFIG:
             try:
                 track = read_config(file.parent).get("track")
                 one = isinstance(track, Mapping) and "name" in track
@@ -125,17 +127,17 @@ def _typed(values: Mapping[str, Any], source: str) -> TrackConfig:
         ) from None
 
 
-def _driven_on(told: str, sample: pd.DataFrame) -> str | None:
-    """Return the world on which the rows lie: the one told, one with the log's numbers, or one of that length."""
+def _recognised(logged: str, sample: pd.DataFrame) -> str | None:
+    """Return the world of the rows: the one logged, one with the same waypoint numbers, or one of the same length."""
     points = sample[["X", "Y"]].to_numpy(np.float64)
     known = np.isfinite(points).all(axis=1) & (sample["closest_waypoint"].to_numpy() >= 0)
     points, waypoint = points[known], sample["closest_waypoint"].to_numpy(np.intp)[known]
     if not len(points):
         return None
     length_m = float(sample["track_len"].median())
-    named = find_world(told)
+    named = find_world(logged)
     numbered = [one.name for one in recognise(points, waypoint)]
-    # Courses of one shape differ in their floors only; the first one stands for all.
+    # Courses of the same shape differ in their floors only, so the first one will do.
     for name in dict.fromkeys([*([named] if named else []), *numbered, *worlds()]):
         steps_m = np.linalg.norm(np.diff(world_rows(name)[:, :2], axis=0), axis=1)
         if abs(steps_m.sum() - length_m) > _LENGTH_NEAR * length_m:
@@ -148,12 +150,12 @@ def _driven_on(told: str, sample: pd.DataFrame) -> str | None:
 
 
 def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
-    """Return the course with the log's waypoint numbers, so that a page has one numbering.
+    """Return the course with the waypoint numbers of the log.
 
-    A route that was sampled in another way has other numbers: then the waypoints are put where the log has them.
+    A route that was sampled differently has other numbers; then the waypoints are moved to where the log has them.
 
     Args:
-        course: what was driven on, in driving direction.
+        course: in driving direction.
         steps: rows with `X`, `Y` and `closest_waypoint`.
     """
     sample = steps.iloc[:: max(1, len(steps) // (10 * _SAMPLE))]
@@ -161,7 +163,7 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
     found = course.project(sample[["X", "Y"]].to_numpy(np.float64))
     if np.mean((waypoint == found.previous) | (waypoint == found.next)) >= _SAME_NUMBERS:
         return course
-    # The first row of a closed course is at 0 and at 1: places are means on the circle.
+    # The first waypoint of a closed course is at 0 and at 1, so the mean is taken on the circle.
     circle = pd.DataFrame({"x": np.cos(2 * np.pi * found.ndist), "y": np.sin(2 * np.pi * found.ndist)})
     mean = circle.groupby(waypoint).mean()
     known = mean.index.to_numpy()
@@ -171,10 +173,10 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
     numbers = np.arange(known[-1] + 1)
     pace = (place[-1] - place[0]) / (known[-1] - known[0])
     placed = np.interp(numbers, known, place) + pace * np.minimum(numbers - known[0], 0)
-    # Beyond the highest number in the log nobody drove: the course's own waypoints do.
+    # No car drove beyond the highest number in the log, so the spacing there is arbitrary.
     rest = np.arange(placed[-1] + pace, placed[0] + 1.0 - 0.5 * pace, pace)
     at = np.concatenate([placed, rest])
-    own = _waypoint_positions(course)
+    own = waypoint_positions(course)
     borders = (course.inner[:, 0], course.inner[:, 1], course.outer[:, 0], course.outer[:, 1])
     rows = np.column_stack([course.points_at(at % 1.0), *(np.interp(at % 1.0, own, one) for one in borders)])
     rows = np.vstack([rows, rows[:1]]) if course.closed else rows
@@ -182,9 +184,9 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
 
 
 def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
-    """Return a course of the recorded positions, for drawing; None where the car never came all around.
+    """Return a course estimated from the recorded positions, for drawing; None if they do not cover the whole lap.
 
-    Its centre line is the middle of the places at which each waypoint was the closest, its width what the car used
+    Its centre line is the median of the positions at which each waypoint was the closest, its width what the car used
     with all wheels on the road.
     """
     rows = steps[(steps["closest_waypoint"] >= 0) & (steps["episode_status"] != "prepare")]
@@ -217,13 +219,14 @@ def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
         return None
 
 
-def _waypoint_positions(course: Track) -> np.ndarray:
+def waypoint_positions(course: Track) -> NDArray[np.float64]:
+    """Return the lap position of each waypoint, 0 to 1."""
     steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
     return np.r_[0.0, np.cumsum(steps_m)] / course.length_m
 
 
 def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
-    """Return the direction of a course in which progress grows in most of the first rows."""
+    """Return the course in the direction in which progress grows in most of the first rows."""
     head = steps.iloc[: 10 * _SAMPLE].sort_values("episode", kind="stable")
     points = head[["X", "Y"]].to_numpy(np.float64)
     gone = np.diff(forward.project(points).ndist)
@@ -235,7 +238,7 @@ def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
 
 
 def _unknown(name: str, rows: pd.DataFrame) -> str:
-    who = f"track {name!r} is" if name else "the name of the track is not told, and it is"
+    who = f"track {name!r} is" if name else "the log does not name its track, which is"
     return (
         f"{who} none of the service's {len(worlds())} worlds ({float(rows['track_len'].median()):.3f} m long); "
         "`--track ROUTE` takes the file of its route (.npy)"

@@ -1,21 +1,42 @@
-"""One HTML page that tells all of a log, findings first, and needs nothing beside it."""
+"""The report of a log: one HTML page with findings, figures and tables that needs no other file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from deepracer_exp.deepracer.recording import Recording, readable
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import Recording, readable
-from deepracer_exp.formats.run_files import read_head
-from deepracer_exp.formats.whole_file import write_whole
+from deepracer_exp.files import atomic_write
+from deepracer_exp.runs.files import read_head
 
-from .chart import Chart
-from .chart_plotly import draw
-from .chart_plotly_panel import NARROW_WIDTH
-from .charts import Section, draw_sections
+from .charts.actions import action_use_by_section, entropy_along_track, zero_steering_top_speed
+from .charts.driving_line import (
+    acceleration_map,
+    lap_line,
+    racing_line,
+    sector_times,
+    slide_map,
+    speed_steering_by_waypoint,
+    waypoint_map,
+)
+from .charts.figure import Chart
+from .charts.laps import correlations, lap_delta, lap_time_histogram, lap_time_percentile, start_position
+from .charts.mistakes import episode_ends_map, off_track_risk, visits_map
+from .charts.rewards import (
+    common_rewards,
+    discount_factors,
+    reward_by_waypoint,
+    reward_distribution,
+    reward_map,
+    reward_terms,
+    scatter_time_reward,
+    value_map,
+)
+from .charts.runs import generalisation_matrix, generations, runs_compared
+from .charts.training import evaluations, learning_vs_lap_time, quarters, stability, training_progress
 from .findings import Finding, findings
 from .log_tables import (
     MOST_FILES,
@@ -30,9 +51,71 @@ from .log_tables import (
 )
 from .log_view import LogView, prepare
 from .next_steps import next_steps, outcome
-from .page import Plot, plot, render
+from .page import Plot, plot_of, render
 from .reward_comparison import RewardComparison
-from .run_folders import run_folder
+from .run_folders import clone_chain, evaluation_results, run_folder
+
+_BESIDE, _PAID = "Generations, runs and tracks", "What the reward pays for"
+SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
+    "How it learned": (training_progress, learning_vs_lap_time, evaluations, quarters, stability),
+    _BESIDE: (),
+    "Lap times": (lap_time_percentile, lap_time_histogram, lap_delta, correlations, start_position),
+    "The line it drives": (
+        *(lap_line, sector_times, speed_steering_by_waypoint, racing_line, acceleration_map, slide_map),
+    ),
+    "Where it goes wrong": (off_track_risk, episode_ends_map, visits_map),
+    "What it does": (action_use_by_section, zero_steering_top_speed, entropy_along_track),
+    _PAID: (
+        *(reward_map, reward_by_waypoint, value_map, reward_distribution, common_rewards),
+        *(scatter_time_reward, discount_factors),
+    ),
+    "The course": (waypoint_map,),
+}
+"""The figures of a training, in the order of the page; a new one is added here."""
+RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
+    "How it raced": (evaluations,),
+    _BESIDE: (),
+    "Lap times": (lap_time_histogram, lap_delta),
+    "The line it drives": (lap_line, sector_times, speed_steering_by_waypoint, racing_line),
+    "Where it goes wrong": (episode_ends_map,),
+    _PAID: (),
+    "The course": (waypoint_map,),
+}
+"""The figures of a recording without a training."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Figures that belong together."""
+
+    title: str
+    charts: Sequence[Chart]
+
+
+def draw_sections(
+    view: LogView, others: Sequence[LogView] = (), terms: pd.DataFrame | None = None
+) -> list[Section]:
+    """Return all figures for which there is data, in the order of the page.
+
+    Args:
+        view: the recording.
+        others: recordings to compare it with.
+        terms: of its reward function, as `reward_terms` takes them.
+    """
+    sections = SECTIONS if view.trained else RACES
+    charts: dict[str, list[Chart | None]] = {
+        title: [draw_one(view) for draw_one in some] for title, some in sections.items()
+    }
+    if terms is not None:
+        charts[_PAID].append(reward_terms(view, terms))
+    views = [view, *others]
+    charts[_BESIDE] = [
+        runs_compared(views),
+        generations(clone_chain(views) or [view]),
+        generalisation_matrix(views, [evaluation_results(one) for one in views]),
+    ]
+    known = {title: [chart for chart in some if chart is not None] for title, some in charts.items()}
+    return [Section(title, some) for title, some in known.items() if some]
 
 
 def write_report(
@@ -42,13 +125,13 @@ def write_report(
     target_s: float | None = None,
     replay: RewardComparison | None = None,
 ) -> Path:
-    """Write the page of a recording, whole or not at all.
+    """Write the page of a recording atomically.
 
     Args:
-        recording: what was recorded.
+        recording: of any format.
         path: of the page.
-        compare: other recordings to stand beside it.
-        target_s: lap time whose chance is told.
+        compare: other recordings to compare it with.
+        target_s: lap time whose chance is estimated.
         replay: of another reward function.
 
     Raises:
@@ -62,26 +145,26 @@ def write_report(
 
 @dataclass(frozen=True)
 class LogPage:
-    """What a page tells."""
+    """The contents of a page."""
 
     view: LogView
     findings: Sequence[Finding]
     """The most important first."""
     others: Sequence[LogView] = ()
-    """Views of the recordings beside it."""
+    """Recordings that it is compared with."""
     replay: RewardComparison | None = None
-    """What another reward function makes of it."""
+    """The same driving, paid by another reward function."""
     terms: pd.DataFrame | None = None
-    """What each term of its reward function contributed, as `charts_of_rewards.reward_terms` takes it."""
+    """What each term of the reward function contributed, as `reward_terms` takes it."""
 
 
 def write_page(path: Path, page: LogPage) -> Path:
-    """Write the page of a prepared recording, whole or not at all.
+    """Write the page of a prepared recording atomically.
 
     Raises:
         OSError: it cannot be written.
     """
-    return write_whole(path, html(page))
+    return atomic_write(path, html(page))
 
 
 def html(page: LogPage) -> str:
@@ -90,26 +173,27 @@ def html(page: LogPage) -> str:
     sections = draw_sections(view, page.others, page.terms)
     if page.replay is not None and page.replay.charts:
         sections = [Section("Another reward function", page.replay.charts), *sections]
-    drawn = [(section.title, [_Figure.of(chart) for chart in section.charts]) for section in sections]
-    figures = {figure.name: figure for _, some in drawn for figure in some}
+    plots = {chart.name: plot_of(chart) for section in sections for chart in section.charts}
+    captions = {chart.name: chart.caption for section in sections for chart in section.charts}
     came_of_it, steps = _first_screen(page)
     files = [readable(str(file)) for file in recording.files]
     return render(
         __package__,
         "log_report.html.j2",
-        [figure.plot for figure in figures.values()],
+        list(plots.values()),
         name=view.name,
         headline=headline(view),
         outcome=came_of_it,
         steps=steps,
-        picture=figures["lap_line"].plot if "lap_line" in figures else None,
-        findings=[_finding(one, figures) for one in page.findings],
+        picture=plots.get("lap_line"),
+        findings=[_finding(one, plots) for one in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
-        names=set(figures),
+        names=set(plots),
         replay=page.replay,
         candidates=candidate_rows(view),
         laps=best_laps(view),
-        sections=[{"title": title, "figures": some} for title, some in drawn],
+        sections=[(one.title, [plots[chart.name] for chart in one.charts]) for one in sections],
+        captions=captions,
         iterations=iteration_rows(view),
         facts=facts(view),
         settings=settings(recording.hyperparameters),
@@ -122,9 +206,9 @@ def html(page: LogPage) -> str:
 
 
 def _first_screen(page: LogPage) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """Return what came of a training, in names and values, and what to do next: commands, each with what it does.
+    """Return the result of a training in names and values, and the next steps: commands, each with what it does.
 
-    No command of ours takes a checkpoint of the service: what to do with those is to submit one of them.
+    Our commands do not take checkpoints of the service: the next step with those is to submit one of them.
     """
     folder = run_folder(page.view)
     try:
@@ -136,26 +220,11 @@ def _first_screen(page: LogPage) -> tuple[list[tuple[str, str]], list[tuple[str,
     return facts(page.view), [("", one.sentence) for one in page.findings if one.rule == "submit"]
 
 
-@dataclass(frozen=True)
-class _Figure:
-    """A figure as the template takes it."""
-
-    name: str
-    title: str
-    caption: str
-    plot: Plot
-
-    @classmethod
-    def of(cls, chart: Chart) -> "_Figure":
-        packed = plot(draw(chart), chart.name, chart.title, draw(chart, NARROW_WIDTH))
-        return cls(chart.name, chart.title, chart.caption, packed)
-
-
-def _finding(one: Finding, figures: Mapping[str, _Figure]) -> dict[str, Any]:
+def _finding(one: Finding, plots: Mapping[str, Plot]) -> dict[str, Any]:
     numbers = [*one.values.items(), *((f"{key} (threshold)", value) for key, value in one.thresholds.items())]
     return {
         "sentence": one.sentence,
-        "figure": one.figure if one.figure in figures else None,
+        "figure": one.figure if one.figure in plots else None,
         "numbers": [(key.replace("_", " "), _shown(value)) for key, value in numbers],
     }
 

@@ -1,4 +1,4 @@
-"""The tables of a log's page: iterations, best laps, what was trained with, what could not be read."""
+"""The tables of a report: iterations, candidates, best laps, facts, settings, and problems while reading."""
 
 import json
 import math
@@ -25,22 +25,22 @@ class Table:
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     words: int = 0
-    """How many columns, from the first on, are words; the others are numbers."""
+    """The first columns that hold words; the others hold numbers."""
     left_out: int = 0
-    """Rows that the page would be too long with."""
+    """Number of rows that were left out to keep the page short."""
 
 
 def iteration_rows(view: LogView) -> Table:
-    """Return how each iteration drove and learned; of very many, every second, third, ... and the last."""
+    """Return results and metrics of each iteration; of very many, every second, third, ... and the last."""
     table = view.iterations
-    told = {
+    known = {
         name: column
         for name, column in _ITERATION_COLUMNS.items()
         if (table[name] != "" if name == "checkpoint" else table[name].notna()).any()
     }
     every = math.ceil(len(table) / MOST_ITERATIONS) or 1
     shown = table.iloc[::-1].iloc[::every].iloc[::-1]
-    return _table(shown, told, len(table) - len(shown))
+    return _table(shown, known, len(table) - len(shown))
 
 
 def candidate_rows(view: LogView) -> Table:
@@ -67,7 +67,7 @@ def problem_rows(view: LogView) -> Table:
 
 
 def facts(view: LogView) -> list[tuple[str, str]]:
-    """Return what was driven, with names and values."""
+    """Return course, action space and evaluations in names and values."""
     recording, course = view.recording, view.course
     found: list[tuple[str, str]] = []
     if course is not None:
@@ -97,7 +97,7 @@ def settings(values: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def headline(view: LogView) -> str:
-    """Return in one sentence how much was driven, and how well; an episode cut off by the end is not counted."""
+    """Return in one sentence how much was driven and how well; episodes cut off by the end of the log do not count."""
     finished = count(int(view.episodes["ended"].sum()), "finished episode")
     laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
     if view.trained:

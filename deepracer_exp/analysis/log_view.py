@@ -1,44 +1,47 @@
-"""One course of a recording, prepared for figures and findings."""
+"""A recording on one course, prepared for figures and findings."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from deepracer_exp.deepracer.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.tracks.track import Track
 
-from .episode_table import episode_table, first_rows
-from .iteration_table import iteration_table
 from .log_course import catalogue_track, directed, estimated_course, find_courses, numbered_as_logged
-from .step_columns import add_derived
+from .tables import add_derived, episode_table, first_rows, iteration_table
 
 DISCOUNT = 0.99
-"""Where the hyperparameters tell none: the service's default."""
+"""The service's default, for logs without hyperparameters."""
+PREPARE = "prepare"
+"""Status of the row in which an episode starts, before the first action."""
+STARTING_STEPS = 10
+"""First control steps of an episode, in which the car pulls away from standing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LogView:
-    """A recording on one course; made by `prepare`."""
+    """A recording on one course, as `prepare` returns it."""
 
     name: str
     recording: Recording
     course: Track | None
-    """None: not known; what needs its shape is then left out."""
+    """None: unknown; figures that need its shape are then left out."""
     track_name: str
-    """Name of the course as logged, "" where it is neither told nor found."""
+    """Name of the course as logged, "" if it was neither logged nor recognised."""
     trained: bool
-    """Whether a training is recorded; else `steps` and `episodes` are those of the evaluations and races, numbered
-    through."""
+    """Whether a training is recorded; else `steps` and `episodes` are those of the evaluations and races, with
+    consecutive numbers."""
     steps: pd.DataFrame
     """Training steps on the course, ordered by episode and time, prepare rows among them; columns
-    `recording.STEP_COLUMNS` and `step_columns.DERIVED_COLUMNS`."""
+    `recording.STEP_COLUMNS` and `tables.DERIVED_COLUMNS`."""
     episodes: pd.DataFrame
-    """Their episodes, `episode_table.EPISODE_COLUMNS`."""
+    """Their episodes, `tables.EPISODE_COLUMNS`."""
     iterations: pd.DataFrame
-    """Their iterations, `iteration_table.ITERATION_COLUMNS`."""
+    """Their iterations, `tables.ITERATION_COLUMNS`."""
     evaluations: pd.DataFrame
     """Steps on the course of all other streams, ordered by stream, episode and time, with the same columns."""
     evaluation_episodes: pd.DataFrame
@@ -50,20 +53,73 @@ class LogView:
 
     @property
     def action_count(self) -> int | None:
-        """Return how many actions a discrete policy has, None of a continuous one."""
+        """Number of actions of a discrete policy, None of a continuous one."""
         if not self.steps["action"].notna().any():
             return None
         metadata = self.recording.metadata
         return len(metadata.actions if metadata is not None else ()) or int(self.steps["action"].max()) + 1
+
+    @property
+    def waypoint_count(self) -> int:
+        """Number of waypoints of the course, or where it is unknown of those in the log."""
+        logged = int(self.steps["closest_waypoint"].max()) + 1 if len(self.steps) else 0
+        return logged if self.course is None else max(len(self.course.waypoints), logged)
+
+    @property
+    def is_driven(self) -> NDArray[np.bool_]:
+        """Which rows of `steps` follow an action; prepare rows do not, and have no reward."""
+        return (self.steps["episode_status"] != PREPARE).to_numpy()
+
+    @property
+    def episode_index(self) -> NDArray[np.intp]:
+        """Position in `episodes` of the episode of each row of `steps`."""
+        episode = self.steps["episode"].to_numpy()
+        return np.cumsum(np.diff(episode, prepend=episode[:1]) != 0)
+
+    def driven(self, *columns: str) -> pd.DataFrame:
+        """Return columns of the training's driven rows."""
+        return self._select(self.is_driven, columns)
+
+    def recent(self, *columns: str) -> pd.DataFrame:
+        """Return columns of the driven rows of the last third of the iterations: of the policy as it is now."""
+        return self._select(self.is_driven & (thirds(self.steps["iteration"].to_numpy()) == 2), columns)
+
+    def of_episodes(self, wanted: NDArray[np.bool_], *columns: str) -> pd.DataFrame:
+        """Return columns of the driven rows of the wanted episodes, (n,) in the order of `episodes`."""
+        return self._select(wanted[self.episode_index] & self.is_driven, columns)
+
+    def fastest_lap(self, *columns: str) -> pd.DataFrame | None:
+        """Return columns of the driven rows of the fastest complete lap, None without a lap."""
+        times_s = self.episodes["lap_time_s"].to_numpy(np.float64)
+        if not np.isfinite(times_s).any():
+            return None
+        return self.of_episodes(np.arange(len(times_s)) == np.nanargmin(times_s), *columns)
+
+    def _select(self, wanted: NDArray[np.bool_], columns: Sequence[str]) -> pd.DataFrame:
+        # Column by column: a frame of all columns would take seconds on millions of rows.
+        rows = np.flatnonzero(wanted)
+        return pd.DataFrame({name: self.steps[name].to_numpy()[rows] for name in columns})
+
+
+def thirds(iteration: NDArray[np.integer]) -> NDArray[np.intp]:
+    """Return the third of the training, 0 to 2, that each iteration belongs to."""
+    first, last = (int(iteration.min()), int(iteration.max())) if len(iteration) else (0, 0)
+    # Counted from the end, so that with one or two iterations the last one is in the last third.
+    return 2 - 3 * (last - iteration.astype(np.intp)) // (last - first + 1)
+
+
+def closest_waypoints(steps: pd.DataFrame) -> NDArray[np.intp]:
+    """Return the closest waypoint of each row; -1 where none is logged."""
+    return np.maximum(steps["closest_waypoint"].to_numpy(np.intp), -1)
 
 
 def prepare(recording: Recording, track: str | None = None) -> LogView:
     """Prepare one course of a recording.
 
     Args:
-        recording: what was recorded.
-        track: a course of its steps; None: the one with the most training steps. A name of the catalogue or a file
-            (.npy route, .yaml knots) says which course it is where the log's own name does not.
+        recording: of any format.
+        track: a course of its steps; None: the one with the most training steps. If the log's own name of the course
+            is unknown, a name of the catalogue or a file (.npy route, .yaml knots) replaces it.
 
     Raises:
         BadInput: the recording has no steps on the course.

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.formats.run_files import RunRecord
-from deepracer_exp.formats.run_result import FIGURES, read_result
+from deepracer_exp.runs.files import RunRecord
+from deepracer_exp.runs.result import FIGURES, read_result
 
 COMMAND = "deepracer-exp"
 
@@ -60,9 +60,9 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         steps = []
     if summary["iteration"]:
         steps += [
-            (f"{COMMAND} evaluate run={word}", "race the best checkpoint"),
-            (f"{COMMAND} evaluate run={word} --video lap.mp4", "film its fastest lap"),
-            (f"{COMMAND} clone run={word}", "train on from it, at a tenth of the learning rate"),
+            (f"{COMMAND} evaluate {word}", "race the best checkpoint"),
+            (f"{COMMAND} evaluate {word} --video lap.mp4", "film its fastest lap"),
+            (f"{COMMAND} clone {word}", "train on from it, at a tenth of the learning rate"),
         ]
     return [*steps, resume] if resume else steps
 

@@ -1,4 +1,4 @@
-"""Where the car runs off the road, and what it did before."""
+"""Where the car leaves the road, and what it did before: understeer, oversteer, or a late correction."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
-from .episode_table import first_rows
 from .racing_line import WHEELBASE_M
+from .statistics import Values, wilson
+from .tables import first_rows
 
-Values = NDArray[np.float64]
 Rows = NDArray[np.intp]
 PLACE_M = 1.5
 """Length of road that counts as one place."""
@@ -24,7 +23,7 @@ BEFORE = 8
 STEERS_DEG = 5.0
 """Mean steering below which the car counts as going straight on."""
 UNUSUAL = 2.0
-"""Turning so many standard deviations less than predicted is understeer; more, on the side it steers to, oversteer."""
+"""Turning so many standard deviations less than predicted is understeer; more, to the side it steers to, oversteer."""
 SLIDE_DEG = 15.0
 """Slide of the rear axle from which on the tail comes round."""
 
@@ -35,7 +34,7 @@ JUDGEMENTS: Mapping[str, str] = {
     LATE: "it steers back and turns as usual, but too late for its speed",
     AWAY: "it does not steer back",
 }
-"""What the car did before it left the road, in words."""
+"""Mistakes before the car leaves the road, in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +108,7 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
         most, times = counts.most_common(1)[0]
         passes = len(np.unique(episode[_apart(position, at[busiest]) <= half]))
         offs = int(here.sum())
-        low, high = binomtest(offs, max(passes, offs)).proportion_ci(method="wilson")
+        low, high = map(float, wilson(offs, max(passes, offs)))
         ahead = (at[here] - at[busiest] + 0.5) % 1.0
         middle = rows[here][np.argsort(ahead, kind="stable")[len(ahead) // 2]]
         found.append(
@@ -129,13 +128,13 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
 
 
 def judge(steps: pd.DataFrame, rows: Rows) -> NDArray[np.str_]:
-    """Say for each time the car left the road what it did before: keys of `JUDGEMENTS`.
+    """Return for each time the car left the road which mistake it made before: keys of `JUDGEMENTS`.
 
-    Looked at are the `BEFORE` control steps up to the row. A simulated car turns less and later than a bicycle, so
-    that its turning is compared with what the same steering usually does in the same recording. The yaw rate follows
+    The `BEFORE` control steps up to the row count. A simulated car turns less and later than a bicycle, so its turning
+    is compared with what the same steering usually does in the same recording. The yaw rate follows
     the commanded one, u = speed * tan(steering) / wheelbase, with a lag: r' = a r + b u + c, fitted to all steps by
-    least squares. It is predicted from the yaw rate `BEFORE` steps ago and the steering since; unusual is what
-    differs by more than `UNUSUAL` standard deviations (1.4826 times the median deviation) of all such predictions
+    least squares. It is predicted from the yaw rate `BEFORE` steps ago and the steering since; it is unusual if
+    it differs by more than `UNUSUAL` standard deviations (1.4826 times the median deviation) of all such predictions
     that do not end off the road.
     """
     steer, turned_more, slide = _stretches(steps)
@@ -166,7 +165,7 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
         np.nan_to_num(steps[name].to_numpy(np.float64))
         for name in ("steer", "yaw_rate_dps", "track_speed_mps")
     )
-    # What is commanded in a row acts until the next one.
+    # A command acts until the next row.
     asked = np.degrees(_before(speed, 1) * np.tan(np.radians(_before(steer, 1))) / WHEELBASE_M)
     inside = since >= 2
     columns = np.column_stack([_before(rate, 1), asked, np.ones(len(rate))])

@@ -1,4 +1,4 @@
-"""HTML pages that need nothing beside them: words and tables as they are, figures packed until they are seen."""
+"""HTML pages in a single file: text and tables, and figures that are packed until they are seen."""
 
 import base64
 import gzip
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -16,7 +17,11 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 from plotly.utils import PlotlyJSONEncoder
 
-from .chart_plotly import DARK
+from deepracer_exp.files import atomic_write
+
+from .charts.figure import Chart
+from .charts.layout import draw
+from .charts.style import DARK, NARROW_WIDTH
 
 
 @dataclass(frozen=True)
@@ -53,13 +58,30 @@ def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int
     return Plot(name, title, int(figure.layout.height), int(narrow.layout.height), least_width, packed(text))
 
 
+def plot_of(chart: Chart) -> Plot:
+    """Draw a chart for desk and phone, and pack it."""
+    return plot(draw(chart), chart.name, chart.title, draw(chart, NARROW_WIDTH))
+
+
+def write_chart(path: Path, chart: Chart) -> Path:
+    """Write a page with one chart atomically.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    drawn = plot_of(chart)
+    return atomic_write(
+        path, render(__package__, "chart.html.j2", [drawn], plot=drawn, caption=chart.caption)
+    )
+
+
 def packed(text: str) -> str:
     """Return a text as gzip in base64, the same for the same text."""
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode("ascii")
 
 
 def render(package: str, template: str, plots: Sequence[Plot], **values: Any) -> str:
-    """Return a page that extends `page.html.j2`; what it holds is escaped, and it can load nothing.
+    """Return a page that extends `page.html.j2`; all values are escaped, and it can load nothing.
 
     Args:
         package: where the template is.
@@ -95,9 +117,9 @@ def _themed(color: str) -> str:
 
 
 def _policy(*scripts: str) -> str:
-    """Return what the browser is to allow: these scripts, no others, and no address.
+    """Return the content security policy: these scripts only, and no network.
 
-    Plotly makes functions of text to draw with WebGL.
+    Plotly compiles functions from text to draw with WebGL.
     """
     hashes = " ".join(f"'sha256-{_sha256(script)}'" for script in scripts)
     return (

@@ -1,30 +1,31 @@
-"""The racing line of a course: the line of least curvature between its borders, and what it asks of a car."""
+"""The racing line of a course: the line of minimum curvature between its borders, its steering and its speed."""
 
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from deepracer_exp.tracks.track import Track
 
-Values = NDArray[np.float64]
+from .log_course import waypoint_positions
+from .statistics import Values
+
 MARGIN_M = 0.1
 """Room between the line and a border: half a car's width, so that all wheels stay on the road."""
 SAMPLE_M = 0.15
 """Distance of the line's points along the centre line, where the course is not longer than `MOST` of them."""
 MOST = 200
-"""Points of a line; the work grows with their cube."""
+"""Points of a line; the computing time grows with their cube."""
 ROUNDS = 5
-"""Half of the way to each round's answer is gone, which keeps the line from swinging; after these 97 per cent."""
+"""Each round goes half of the way to its solution, which keeps the line from oscillating; five go 97 per cent."""
 WHEELBASE_M = 0.164
 """Of every car of the service (deepracer-simapp urdf/deepracer)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Line:
-    """A way along a course, at evenly spaced places of the centre line."""
+    """A line along a course, at evenly spaced places of the centre line."""
 
     lap_position: Values
     """Places (n,), 0 to 1; a closed course ends where it began."""
@@ -41,7 +42,7 @@ class Line:
         return np.degrees(np.arctan(WHEELBASE_M * self.curvature_pm))
 
     def speed_mps(self, lateral_mps2: float, top_mps: float) -> Values:
-        """Return the speed at which cornering takes `lateral_mps2`, at most `top_mps`; braking takes no room."""
+        """Return the speed that needs `lateral_mps2` of lateral acceleration, at most `top_mps`, braking ignored."""
         return np.minimum(top_mps, np.sqrt(lateral_mps2 / np.maximum(np.abs(self.curvature_pm), 1e-9)))
 
     def at(self, lap_position: Values, values: Values) -> Values:
@@ -50,17 +51,17 @@ class Line:
 
 
 def center_line(course: Track) -> Line:
-    """Return the centre line as a way to drive."""
+    """Return the centre line."""
     center, _, _, lap_position = _sampled(course)
     return _line(course, center, np.zeros(len(center)), center, lap_position)
 
 
 @lru_cache(maxsize=8)
-def racing_line(course: Track) -> Line:
+def minimum_curvature_line(course: Track) -> Line:
     """Return the line of least curvature, squared and summed along it, that keeps `MARGIN_M` from both borders.
 
-    Moving point i sideways changes the second differences linearly; with direction and pace of the line found
-    before, their part across it is the curvature. So each round is a bounded linear least squares problem.
+    Moving point i sideways changes the second differences linearly; given the direction and the pace of the last
+    round's line, their component across it is the curvature. So each round is a bounded linear least squares problem.
     """
     center, left_m, right_m, lap_position = _sampled(course)
     along = _tangents(course, center)
@@ -87,8 +88,7 @@ def _sampled(course: Track) -> tuple[Values, Values, Values, Values]:
     center = course.points_at(lap_position)
     pose = course.start_pose(lap_position)
     sideways = np.column_stack([-np.sin(pose.yaw_rad), np.cos(pose.yaw_rad)])
-    steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
-    rows = np.r_[0.0, np.cumsum(steps_m)] / course.length_m
+    rows = waypoint_positions(course)
     rooms = []
     for border in (course.inner, course.outer):
         points = np.column_stack([np.interp(lap_position, rows, border[:, k]) for k in (0, 1)])

@@ -1,4 +1,4 @@
-"""What another reward function would have preferred, in words, tables and figures."""
+"""The same driving paid by another reward function, in sentences, tables and figures."""
 
 import math
 from dataclasses import dataclass
@@ -7,17 +7,18 @@ from typing import Protocol
 import numpy as np
 import pandas as pd
 
-from .chart import BLUE, FAINT, ORANGE, Chart, Layer, Line, Panel, Points
+from .charts.figure import Chart, Panel, colored_points, line, points
+from .charts.maps import map_panel
+from .charts.style import BLUE, ORANGE
 from .log_tables import Table, count, number
 from .log_view import LogView
-from .maps import map_panel
 
 MOST_LAPS = 10
 MOST_PLACES = 10
 
 
 class Replayed(Protocol):
-    """Recorded steps paid by another reward function, as `evaluation.reward_replay` does it."""
+    """Recorded steps paid by another reward function, as `evaluation.reward_replay` returns them."""
 
     @property
     def reward(self) -> str:
@@ -41,7 +42,7 @@ class Replayed(Protocol):
 
 @dataclass(frozen=True)
 class RewardComparison:
-    """What the page says of another reward function."""
+    """What a report says about another reward function."""
 
     sentences: tuple[str, ...]
     tables: tuple[tuple[str, Table], ...]
@@ -50,11 +51,11 @@ class RewardComparison:
 
 
 def compare_rewards(view: LogView, replayed: Replayed) -> RewardComparison:
-    """Tell how the ranking of laps and of places on a course changes with another reward function.
+    """Describe how another reward function would rank the laps and the places of a course.
 
     Args:
-        view: the course.
-        replayed: of the view's recording.
+        view: the recording on one course.
+        replayed: of the whole recording.
     """
     laps = replayed.laps[replayed.laps["track"].astype(str) == view.track_name]
     places = replayed.waypoints[replayed.waypoints["track"].astype(str) == view.track_name]
@@ -155,16 +156,13 @@ def _places_table(places: pd.DataFrame) -> Table:
 def _laps_chart(laps: pd.DataFrame, name: str) -> Chart | None:
     if not len(laps):
         return None
-    time_s = laps["time_s"].to_numpy(np.float64)
     hover = [
-        f"episode {row['episode']}: {row['time_s']:.2f} s\nranks {row['new_rank']} new, {row['rank']} recorded"
-        for row in laps.to_dict("records")
+        f"episode {row.episode}: {row.time_s:.2f} s\nranks {row.new_rank} new, {row.rank} recorded"
+        for row in laps.itertuples()
     ]
     panels = [
         Panel(
-            layers=[
-                Points(x=time_s, y=laps[column].to_numpy(np.float64), color=color, size=6.5, hover=hover)
-            ],
+            layers=[points(laps["time_s"], laps[column], color, size=6.5, hover=hover)],
             x_label="lap time (s)",
             y_label="reward of the lap",
             title=title,
@@ -173,10 +171,10 @@ def _laps_chart(laps: pd.DataFrame, name: str) -> Chart | None:
     ]
     return Chart(
         name="replayed_laps",
-        title="What fast laps are paid",
+        title="The rewards of fast laps",
         caption="Each point is a complete lap, with its lap time and the sum of its rewards. A reward that asks for "
         "speed falls from the left to the right; where slow laps are paid like fast ones, the car has no reason to "
-        "hurry.",
+        "be faster.",
         rows=[panels],
         share_x=True,
         table=laps,
@@ -186,41 +184,25 @@ def _laps_chart(laps: pd.DataFrame, name: str) -> Chart | None:
 def _places_chart(view: LogView, places: pd.DataFrame, name: str) -> Chart | None:
     if not len(places):
         return None
-    waypoint = places["closest_waypoint"].to_numpy(np.float64)
-    lines: list[Layer] = [
-        Line(x=waypoint, y=100 * places[column].to_numpy(np.float64), name=label, color=color)
+    waypoint = places["closest_waypoint"].to_numpy(np.intp)
+    lines = [
+        line(waypoint, 100 * places[column], color, label)
         for column, color, label in (("share", ORANGE, "recorded"), ("new_share", BLUE, name))
     ]
-    rows = [
-        [
-            Panel(
-                layers=lines,
-                x_label="waypoint",
-                y_label="per cent of its range",
-                y_range=(-4.0, 104.0),
-            )
-        ]
-    ]
+    rows = [[Panel(layers=lines, x_label="waypoint", y_label="per cent of its range", y_range=(-4.0, 104.0))]]
     if view.course is not None and waypoint.max() < len(view.course.waypoints):
-        xy = view.course.waypoints[places["closest_waypoint"].to_numpy(np.intp)]
-        change = 100 * places["change"].to_numpy(np.float64)
-        reach = float(np.abs(change).max()) or 1.0
-        points = Points(
-            x=xy[:, 0],
-            y=xy[:, 1],
-            color=FAINT,
-            values=change,
-            value_range=(-reach, reach),
-            scale="change (% of the range)",
-            size=8.0,
-        )
-        rows.append([map_panel(view.course, [points])])
+        change = 100 * places["change"]
+        reach = float(change.abs().max()) or 1.0
+        xy = view.course.waypoints[waypoint]
+        scale = "change (% of the range)"
+        spots = colored_points(xy[:, 0], xy[:, 1], change, scale, value_range=(-reach, reach), size=8.0)
+        rows.append([map_panel(view.course, [spots])])
     return Chart(
         name="replayed_places",
         title="Where the new reward pays more, and where less",
         caption="Mean reward of a step at each waypoint, between the least and the most that each reward function pays "
-        "anywhere (2nd and 98th percentile). What differs are the places that the new reward finds more or less "
-        "important than the recorded one.",
+        "anywhere (2nd and 98th percentile). The curves differ at places that the new reward considers more or less "
+        "important than the recorded one does.",
         rows=rows,
         table=places,
     )

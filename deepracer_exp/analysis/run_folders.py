@@ -8,7 +8,8 @@ from typing import Any
 import pandas as pd
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.lineage_file import LINEAGE, read_lineage
+from deepracer_exp.runs.files import EVALUATIONS, METRICS
+from deepracer_exp.runs.lineage import LINEAGE, read_lineage
 
 from .log_view import LogView
 
@@ -19,7 +20,7 @@ USUAL = "usual"
 
 def run_folder(view: LogView) -> Path | None:
     """Return the folder of a run of ours, None of other recordings."""
-    return next((file.parent for file in view.recording.files if file.name == "metrics.jsonl"), None)
+    return next((file.parent for file in view.recording.files if file.name == METRICS), None)
 
 
 def clone_chain(views: Sequence[LogView]) -> list[LogView]:
@@ -57,7 +58,7 @@ def evaluation_results(view: LogView) -> pd.DataFrame:
     """
     rows = {str(row["track"]): row for row in _driven(view)}
     folder = run_folder(view)
-    for file in sorted((folder / "evaluations").glob("*.json")) if folder is not None else ():
+    for file in sorted((folder / EVALUATIONS).glob("*.json")) if folder is not None else ():
         try:
             groups = json.loads(file.read_text(encoding="utf-8"))["groups"]
             for group in groups:

@@ -1,4 +1,4 @@
-"""Sectors of a course by its bends, the time each lap spends in them, and two laps side by side."""
+"""Sectors of a course by its bends, the time that laps spend in them, and the time one lap loses to another."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 
 from deepracer_exp.tracks.track import Track
 
-from .episode_table import first_rows, whole_from_start
+from .log_course import waypoint_positions
+from .statistics import Values
+from .tables import first_rows, whole_from_start
 
-Values = NDArray[np.float64]
 BEND_PM = 0.3
 """Curvature from which on the centre line counts as a bend, 1/m: radii below 3.3 m."""
 SMOOTH_M = 0.6
 """Length over which curvature is averaged: half the length of a short corner."""
 SHORTEST_M = 0.8
-"""A sector is not shorter; shorter ones go to the neighbour they are more like."""
+"""Shorter sectors are merged with the neighbour of the more similar curvature."""
 _SAMPLE_M = 0.05
 _APART = 4.0
-"""Between the places of two laps in one row of interpolation."""
+"""Distance of the lap positions of two laps that are interpolated together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +85,7 @@ def sectors_of(course: Track) -> Sectors:
 
 
 def _joined(cuts: Sequence[int], curvature: Values) -> list[int]:
-    """Drop the cuts between neighbours that became of one kind."""
+    """Drop the cuts between neighbours that are of one kind by now."""
     kept = [cuts[0]]
     for before, cut, after in zip(cuts[:-2], cuts[1:-1], cuts[2:], strict=True):
         if _kind(float(curvature[before:cut].mean())) != _kind(float(curvature[cut:after].mean())):
@@ -93,8 +94,7 @@ def _joined(cuts: Sequence[int], curvature: Values) -> list[int]:
 
 
 def _named(course: Track, curvature: Values, edges: Values, cuts: Sequence[int]) -> list[Sector]:
-    steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
-    waypoint_at = np.r_[0.0, np.cumsum(steps_m)] / course.length_m
+    waypoint_at = waypoint_positions(course)
     last = len(waypoint_at) - 1 - course.closed
     found = []
     for number, (a, b) in enumerate(pairwise(cuts), start=1):
@@ -131,16 +131,16 @@ def _curvature(course: Track, place: Values) -> Values:
 def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     """Return the seconds each complete lap spends between places, interpolated along the lap position.
 
-    An interval in which the lap begins is driven in two parts, at its beginning and at its end: the times of a lap
-    always sum up to its lap time.
+    The interval in which a lap begins is driven in two parts, at its beginning and at its end, so that the times of a
+    lap always add up to its lap time.
 
     Args:
         steps: of a `LogView`, training or evaluations.
         bounds: lap positions (n + 1,), growing from 0 to 1.
 
     Returns:
-        A row a complete lap whose beginning is recorded, a column an interval; the index is the lap's place among
-        the episodes, that of `LogView.episodes`.
+        A row for each complete lap whose beginning is recorded, a column for each interval; the index is that of
+        `LogView.episodes`.
     """
     first = first_rows(steps)
     begin = np.flatnonzero(first)
@@ -156,7 +156,7 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     begin_s = columns["tstamp"][begin] - steps["delta_time_s"].to_numpy(np.float64)[begin]
     lap_time_s = columns["tstamp"][end] - begin_s
     gone = np.clip(columns["progress"][row] / 100.0, 0.0, 1.0)
-    # Every lap begins with a point of its own, so that no place is looked for between two laps.
+    # Every lap begins with a point of its own, so that nothing is interpolated between two laps.
     starts = np.cumsum(rows) - rows
     at = np.insert(np.maximum.accumulate(_APART * lap + gone), starts, _APART * np.arange(len(laps)))
     time_s = np.insert(columns["tstamp"][row] - np.repeat(begin_s, rows), starts, 0.0)
@@ -169,31 +169,31 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     return pd.DataFrame(spent_s, index=laps)
 
 
-def sector_times(steps: pd.DataFrame, sectors: Sectors) -> pd.DataFrame:
+def times_by_sector(steps: pd.DataFrame, sectors: Sectors) -> pd.DataFrame:
     """Return `interval_times` of the sectors, columns by their names."""
     return interval_times(steps, sectors.bounds).set_axis(list(sectors.names), axis=1)
 
 
 def theoretical_best_s(times: pd.DataFrame) -> float:
-    """Return the lap time put together of the best time of each sector, NaN without a lap."""
+    """Return the sum of the best times of all sectors, NaN without a lap."""
     return float(times.min().sum()) if len(times) else float("nan")
 
 
-def lap_delta(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> pd.DataFrame:
-    """Return by how much one lap is behind another along the course.
+def time_lost(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> pd.DataFrame:
+    """Return how far one lap is behind another along the course, in seconds.
 
     Args:
         steps: of a `LogView`.
-        lap: its place among the episodes, as in the index of `interval_times`.
-        other: what it is compared with.
+        lap: its index in `LogView.episodes`.
+        other: likewise, of the lap that it is compared with.
         places: number of intervals.
 
     Returns:
-        `lap_position` and `delta_s`: what the lap has lost since lap position 0, negative where it has won time; at 1
-        it is the difference of the lap times.
+        `lap_position` and `delta_s`, the time lost since lap position 0, negative if the lap is ahead; at 1 it is the
+        difference of the lap times.
 
     Raises:
-        KeyError: one of them is no complete lap.
+        KeyError: one of them is not a complete lap.
     """
     bounds = np.linspace(0.0, 1.0, places + 1)
     times = interval_times(steps, bounds)

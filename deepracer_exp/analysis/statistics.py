@@ -1,13 +1,12 @@
-"""Numbers that several charts need: moving averages, histograms, fits, intervals."""
+"""Statistics of what was driven: moving averages, histograms, fits, intervals, and sums by place."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .chart import Values
-
+Values = NDArray[np.float64]
 MOVING = 3
 """Iterations in a moving average, as racers have used since 2020."""
 RESAMPLES = 2000
@@ -15,7 +14,7 @@ CONFIDENCE = 0.95
 
 
 def moving_average(values: Values, over: int = MOVING) -> Values:
-    """Return the mean of each value and those before it, leaving unknown ones out; NaN where the value itself is."""
+    """Return the mean of each value and those before it without unknown ones; NaN where the value itself is NaN."""
     series = pd.Series(values, dtype=np.float64)
     return series.rolling(over, min_periods=1).mean().where(series.notna()).to_numpy()
 
@@ -70,7 +69,7 @@ class Fit:
         return np.polyval(np.array(self.coefficients), x)
 
 
-def fit(x: Values, y: Values, degree: int) -> Fit | None:
+def fit_polynomial(x: Values, y: Values, degree: int) -> Fit | None:
     """Fit a polynomial, None where the points do not decide on one."""
     if len(np.unique(x)) <= degree + 1 or np.ptp(y) == 0:
         return None
@@ -125,3 +124,58 @@ def percentiles_by(group: NDArray[np.int64], values: Values, at: tuple[float, ..
     """Return percentiles of the values of each group, indexed by it, one column each."""
     groups = pd.Series(values).groupby(group)
     return pd.DataFrame({p: groups.quantile(p / 100) for p in at})
+
+
+def subsample(count: int, most: int) -> NDArray[np.intp]:
+    """Return the indices of at most so many of `count` rows, evenly spaced, with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
+
+
+def totals(place: NDArray[np.intp], values: ArrayLike | None, n: int) -> Values:
+    """Return the sum of values (None: the number of rows) at each of n places; -1 is no place, NaN no value."""
+    known = place >= 0
+    if values is None:
+        return np.bincount(place[known], minlength=n).astype(np.float64)
+    numbers = np.asarray(values, np.float64)
+    known &= np.isfinite(numbers)
+    return np.bincount(place[known], numbers[known], minlength=n).astype(np.float64)
+
+
+def means(place: NDArray[np.intp], values: ArrayLike, n: int, least: int = 1) -> Values:
+    """Return the mean of values at each of n places; NaN where fewer than `least` are known."""
+    values = np.asarray(values, np.float64)
+    known = totals(np.where(np.isfinite(values), place, -1), None, n)
+    return totals(place, values, n) / np.where(known >= least, known, np.nan)
+
+
+def quantiles(place: NDArray[np.intp], values: ArrayLike, n: int, shares: tuple[float, ...]) -> Values:
+    """Return quantiles (len(shares), n) of the values at each of n places, between two values the lower one."""
+    numbers = np.asarray(values, np.float64)
+    known = (place >= 0) & np.isfinite(numbers)
+    place, numbers = place[known], numbers[known]
+    order = np.argsort(numbers)
+    # Stable, so that the values of each place stay in order.
+    numbers = numbers[order][
+        np.argsort(place[order].astype(np.int16 if n < 2**15 else np.int32), kind="stable")
+    ]
+    count = np.bincount(place, minlength=n)
+    first = np.r_[0, np.cumsum(count)[:-1]]
+    if not len(numbers):
+        return np.full((len(shares), n), np.nan)
+    found = [
+        numbers[np.minimum(first + ((count - 1) * share).astype(int), len(numbers) - 1)] for share in shares
+    ]
+    return np.where(count > 0, np.stack(found), np.nan)
+
+
+def wilson(hits: ArrayLike, tries: ArrayLike, z: float = 1.959964) -> tuple[Values, Values]:
+    """Return the ends of the Wilson score interval of hits / tries (by default 95 per cent); NaN where never tried.
+
+    Source: E. B. Wilson, Probable inference, the law of succession, and statistical inference (1927).
+    """
+    tries = np.where(np.asarray(tries) > 0, tries, np.nan)
+    share = np.asarray(hits) / tries
+    middle = share + z**2 / (2 * tries)
+    reach = z * np.sqrt(share * (1 - share) / tries + z**2 / (4 * tries**2))
+    scale = 1 + z**2 / tries
+    return np.maximum((middle - reach) / scale, 0.0), np.minimum((middle + reach) / scale, 1.0)

@@ -1,20 +1,23 @@
-"""`deepracer-exp analyze`: what a training's logs tell, as one page."""
+"""`deepracer-exp analyze`: findings and figures from the logs of a training, as one page."""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, reading
-from deepracer_exp.formats.user_file import LOG_BYTES, open_user_file
+from deepracer_exp.files import LOG_BYTES, open_user_file
+from deepracer_exp.runs.files import REPORT
+
+from .arguments import RUN, Stores, add_overrides, complete_runs, is_override, read_stores
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
 
-_EPILOG = """\
-  deepracer-exp analyze RUN                                 RUN: a run's folder, its name or the beginning of it,
-                                                            MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS
+_EPILOG = f"""\
+  deepracer-exp analyze RUN                                 RUN: {RUN[: RUN.index("MLflow")].strip()}
+                                                            {RUN[RUN.index("MLflow") :]}
   deepracer-exp analyze ~/Downloads/training.tar.gz         logs of the service, the console or deepracer-for-cloud:
-                                                            a folder, an archive or a file, found by looking
+                                                            a folder, an archive or a file of any layout
   deepracer-exp analyze RUN --compare RUN logs/             others beside it: how each of them learned
   deepracer-exp analyze RUN --reward racing_line            what another reward function would have paid for
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
@@ -23,49 +26,55 @@ The page needs no network: findings in words first, then figures and tables, the
 """
 
 
-def register(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_analyze(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command."""
-    analyze = commands.add_parser(
+    parser = commands.add_parser(
         "analyze",
         help="find out from logs how a training went",
-        description="Read the logs of a training, ours or the service's of any year, print what they tell, and write "
-        "a page of figures.",
+        description="Read the logs of a training, ours or the service's of any year, print the findings, and write a "
+        "page of figures.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    analyze.add_argument("what", metavar="PATH | RUN", help="logs, or a run")
-    analyze.add_argument(
-        "--compare", nargs="+", action="extend", default=[], metavar="PATH | RUN", help="others beside it"
+    what = parser.add_argument("what", metavar="RUN | LOGS", help="a run, or logs of the service")
+    what.completer = complete_runs  # type: ignore[attr-defined]
+    add_overrides(parser, "runs_dir=DIR | tracking.uri=URI")
+    parser.add_argument(
+        "--compare", nargs="+", action="extend", default=[], metavar="RUN | LOGS", help="others beside it"
     )
-    analyze.add_argument("--open", action="store_true", help="open the page in the browser")
-    analyze.add_argument(
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
         "--reward", metavar="NAME | FILE", help="of the reward zoo, or a file: replayed on the recorded steps"
     )
-    analyze.add_argument("--target", metavar="S", help="lap time in seconds whose chance is told")
-    analyze.add_argument(
+    parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
+    parser.add_argument(
         "--track",
         metavar="NAME | ROUTE",
-        help="of several courses, or the route (.npy) of an unknown one",
+        help="one of several tracks, or the route (.npy) of an unknown one",
     )
-    analyze.add_argument(
-        "--out", metavar="FILE", help="page to write (default: report.html of a run, else NAME-analysis.html)"
+    parser.add_argument(
+        *("-o", "--output"),
+        metavar="FILE",
+        help="page to write (default: report.html of a run, else NAME-analysis.html)",
     )
-    analyze.add_argument("--runs-dir", default="runs", help="where runs given by name are (default: runs)")
-    analyze.add_argument(
-        "--tracking-uri", help="MLflow store of ids and aliases (default: the one in --runs-dir)"
-    )
-    analyze.set_defaults(command=_analyze, runs_rewards=True)
+    parser.set_defaults(command=_analyze, runs_rewards=True)
 
 
 def _analyze(args: argparse.Namespace) -> int:
     target_s = None if args.target is None else _seconds(args.target)
 
-    place = _place(args.what, args)
-    beside = [_place(what, args) for what in args.compare]
-    if args.out is not None and not Path(args.out).absolute().parent.is_dir():
-        raise BadInput(f"--out {args.out}: its folder is not there; accepted: a file in a folder")
+    # `--compare RUN LOGS runs_dir=DIR` takes all three words.
+    words = [args.what, *args.overrides]
+    stores = read_stores(word for word in [*words, *args.compare] if is_override(word))
+    logs = [word for word in words if not is_override(word)]
+    if len(logs) != 1:
+        raise BadInput(f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one")
+    place = _place(logs[0], stores)
+    beside = [_place(what, stores) for what in args.compare if not is_override(what)]
+    if args.output is not None and not Path(args.output).absolute().parent.is_dir():
+        raise BadInput(f"--output {args.output}: its folder does not exist; accepted: a file in a folder")
     if args.reward is not None:
-        from deepracer_exp.env.reward_source import named_reward_source
+        from deepracer_exp.rewards.source import named_reward_source
 
         named_reward_source(args.reward)
 
@@ -75,20 +84,20 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.analysis.reward_comparison import compare_rewards
     from deepracer_exp.evaluation.reward_replay import replay_reward
-    from deepracer_exp.evaluation.run_terms import run_terms
-    from deepracer_exp.formats.recording_reader import read_recording
+    from deepracer_exp.evaluation.reward_terms import run_terms
+    from deepracer_exp.runs.own_recording import read_log
 
-    recording = read_recording(place)
+    recording = read_log(place)
     view, terms = run_terms(prepare(recording, args.track))
-    others = [_light(prepare(read_recording(other))) for other in beside]
+    others = [_light(prepare(read_log(other))) for other in beside]
     replay = None if args.reward is None else compare_rewards(view, replay_reward(recording, args.reward))
-    out = Path(args.out) if args.out else _default_out(place, recording.name)
+    out = Path(args.output) if args.output else _default_out(place, recording.name)
     found = findings(view, target_s)
     try:
         write_page(out, LogPage(view, found, others, replay, terms))
     except OSError as error:
         raise BadInput(
-            f"--out {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
+            f"--output {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
         ) from error
 
     print(f"{view.name}: {headline(view)}")
@@ -106,11 +115,11 @@ def _analyze(args: argparse.Namespace) -> int:
     return 0
 
 
-def _place(what: str, args: argparse.Namespace) -> Path:
-    """Return the file or folder that is meant.
+def _place(what: str, stores: Stores) -> Path:
+    """Return the file or folder of logs, or the folder of a run.
 
     Raises:
-        BadInput: there is none, or it is a run's name that several have.
+        BadInput: there is none, or the name of a run is ambiguous.
     """
     with reading(what, "logs of the service, or a run"):
         path = Path(what).expanduser()
@@ -118,17 +127,17 @@ def _place(what: str, args: argparse.Namespace) -> Path:
             if not path.is_dir():
                 open_user_file(path, "logs of the service, or a run", LOG_BYTES).close()
             return path
-    from deepracer_exp.evaluation.run import find_run
+    from deepracer_exp.runs.resolve import resolve
 
     try:
-        return find_run(what, Path(args.runs_dir), args.tracking_uri)
+        return resolve(what, stores.runs_dir, stores.uri).path
     except BadInput as error:
-        why = str(error).removeprefix(f"run={what}: ")
+        why = str(error).removeprefix(f"{what}: ")
         raise BadInput(f"{what}: no such file or folder, and no run: {why}") from None
 
 
 def _light(view: "LogView") -> "LogView":
-    """Return a view without the steps of its training: what stands beside another is its iterations and races."""
+    """Return a view without the steps of its training: a comparison shows iterations and races only."""
     from dataclasses import replace
 
     steps = view.recording.steps
@@ -137,10 +146,10 @@ def _light(view: "LogView") -> "LogView":
 
 
 def _default_out(place: Path, name: str) -> Path:
-    from deepracer_exp.formats.own_recording import is_own_run
+    from deepracer_exp.runs.own_recording import is_own_run
 
     if is_own_run(place):
-        return place / "report.html"
+        return place / REPORT
     safe = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name).strip("-.")
     return Path(f"{safe[:80] or 'log'}-analysis.html")
 

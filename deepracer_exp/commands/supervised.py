@@ -62,9 +62,9 @@ def supervised(call: Callable[[], int]) -> int:
     # Not until its end: a process that the child has forked may still hold the pipe.
     os.set_blocking(results, False)
     with contextlib.suppress(BlockingIOError):
-        told = os.read(results, 1)
-        if told:
-            return told[0]
+        received = os.read(results, 1)
+        if received:
+            return received[0]
     if -ended in _SIGNALS:
         return 128 - ended
     how = f"left it with exit code {ended}" if ended >= 0 else f"was ended by {signal.Signals(-ended).name}"

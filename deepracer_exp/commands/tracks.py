@@ -1,27 +1,58 @@
-"""`deepracer-exp tracks`: the courses there are, and one of them drawn."""
+"""`deepracer-exp tracks`: the list of tracks, and a drawing of one."""
 
+import argparse
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from rich.console import Console
-from rich.table import Table
-
-from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.options import options
-from deepracer_exp.config.overrides import override_line
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.routes import world_rows
-from deepracer_exp.formats.worlds import World, leaders, worlds
-from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
-from deepracer_exp.tracks.track import Track
+
+from .output import table_console
+
+if TYPE_CHECKING:
+    from deepracer_exp.deepracer.worlds import World
+    from deepracer_exp.tracks.track import Track
 
 COLUMNS, ROWS = 100, 32
-"""Characters and lines of a drawing at most."""
+"""Largest size of a drawing, in characters and lines."""
 
 
-def list_tracks(out: Console) -> None:
-    """Print a line for each family of worlds, then the tracks of one's own."""
+def add_tracks(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "tracks",
+        help="list the tracks, or draw one",
+        description="List the tracks with length, width and variants; with a name, draw that track.",
+    )
+    name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
+    name.completer = _names  # type: ignore[attr-defined]
+    parser.add_argument("-o", "--output", metavar="FILE", help="also write a picture of it")
+    parser.set_defaults(command=_tracks)
+
+
+def _names(**_: object) -> list[str]:
+    from deepracer_exp.config.options import options
+
+    return options("track")
+
+
+def _tracks(args: argparse.Namespace) -> int:
+    if args.name is None:
+        _list_tracks()
+    else:
+        _show_track(args.name, args.output)
+    return 0
+
+
+def _list_tracks() -> None:
+    """Print a line for each family of worlds, then the user's own tracks."""
+    from rich.table import Table
+
+    from deepracer_exp.config.options import options
+    from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.deepracer.worlds import leaders, worlds
+
+    out = table_console(160)
     table = Table(box=None, pad_edge=False, header_style="dim")
     table.add_column("track", no_wrap=True)
     table.add_column("course", overflow="fold")
@@ -45,17 +76,15 @@ def list_tracks(out: Console) -> None:
             track = _track(override_line("track", name))
             measures = f"{track.length_m:.2f}", f"{track.width_m:.2f}", str(len(track.waypoints))
             table.add_row(name, track.title, *measures, "")
-    out.print(table, highlight=False)
+    out.print(table)
     out.print(
-        f"\ntrack=NAME takes each of {len(options('track'))} tracks, variants and official names too "
+        f"\ntrack=NAME accepts each of {len(options('track'))} tracks, also variants and official names "
         "(track='Ace Speedway').\n`deepracer-exp tracks NAME` draws one.",
-        highlight=False,
-        markup=False,
         soft_wrap=True,
     )
 
 
-def show_track(name: str, output: str | None) -> None:
+def _show_track(name: str, output: str | None) -> None:
     """Draw a track in the terminal, and as a picture where one is asked for.
 
     Args:
@@ -65,6 +94,9 @@ def show_track(name: str, output: str | None) -> None:
     Raises:
         BadInput: there is no such track, or the picture cannot be written.
     """
+    from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
+
     is_file = Path(name).suffix in (".npy", ".yaml", ".yml")
     track = _track(override_line("track.file" if is_file else "track", name))
     if output is not None:
@@ -82,7 +114,10 @@ def show_track(name: str, output: str | None) -> None:
         print(f"\npicture: {output}")
 
 
-def _track(override: str) -> Track:
+def _track(override: str) -> "Track":
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.tracks.track import Track
+
     tracks = compose_experiment([override])[0].tracks
     if len(tracks) > 1:
         raise BadInput(f"{override}: {len(tracks)} tracks; accepted: one to draw")
@@ -92,10 +127,14 @@ def _track(override: str) -> Track:
 
 def _measures(name: str) -> tuple[float, float]:
     """Return a world's length and median width in metres."""
+    import numpy as np
+
+    from deepracer_exp.deepracer.routes import world_rows
+
     center, inner, outer = np.split(world_rows(name), 3, axis=1)
     length_m = np.linalg.norm(np.diff(center, axis=0), axis=1).sum()
     return float(length_m), float(np.median(np.linalg.norm(outer - inner, axis=1)))
 
 
-def _variant(world: World) -> str:
+def _variant(world: "World") -> str:
     return world.name.replace(world.family, "…", 1)

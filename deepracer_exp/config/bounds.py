@@ -8,7 +8,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-# Beyond these a number is a slip of the finger.
+# Larger numbers are typing errors.
 Count = Annotated[int, Field(ge=1, le=10**12)]
 """A whole number of at least one."""
 Natural = Annotated[int, Field(ge=0, le=10**12)]
@@ -16,4 +16,4 @@ Natural = Annotated[int, Field(ge=0, le=10**12)]
 UpTo100 = Annotated[int, Field(ge=1, le=100)]
 UpTo1000 = Annotated[int, Field(ge=1, le=1000)]
 Seconds = Annotated[float, Field(gt=0, le=7 * 86400, allow_inf_nan=False)]
-"""Of patience, up to a week."""
+"""A waiting time, up to a week."""

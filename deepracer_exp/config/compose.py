@@ -1,53 +1,53 @@
-"""Override expressions to a validated experiment; the only place that speaks Hydra."""
+"""Override expressions to a validated experiment; Hydra composes here and nowhere else."""
 
 import difflib
 import itertools
 import json
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.override_parser.types import Glob, Override, RangeSweep
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.addresses import without_passwords
+from deepracer_exp.deepracer.worlds import find_world
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.formats.worlds import find_world
+from deepracer_exp.files import read_yaml
 
-from . import (
-    custom_files,
-    option_files,  # noqa: F401 - how Hydra reads them
-)
-from .contradictions import check_together
-from .custom_files import Beneath, beneath, read_custom_files
-from .dimension import length
-from .evaluation import EvaluateConfig, EvaluationConfig
+from . import custom_files
+from .custom_files import FileOverrides, file_overrides, read_custom_files
+from .dimension import range_length
+from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
 from .experiment import Experiment
-from .export import ExportConfig
 from .options import conf_dirs, find, groups, listed, options
 from .overrides import PLAIN_TEXT, line_for_hydra, override_line, parse_single, parse_sweep
-from .track_options import ALL, by_world_name, complete, in_own_words, register_worlds, several_tracks
+from .parse import parse_config, parse_experiment
+from .track_options import ALL, by_world_name, complete, register_worlds, several_tracks, without_placeholders
 from .track_options import GROUP as TRACK
 
 Config = TypeVar("Config")
 
 MOST_RUNS = 1000
-"""Of one `-m`; one after the other they take a day."""
+"""Limit of one `-m`: one after the other they take a day."""
 
 _FILES = (".json", ".npy", ".py", ".yaml", ".yml")
 _NO_EXPERIMENT = ("experiment", None)
 
-_adapters: dict[type, TypeAdapter[Any]] = {}
-
-# Option files name the files beside them by it, whatever the working folder: ${conf:'reward/mine.py'}.
+# Lets option files refer to files beside them, whatever the working directory: ${conf:'reward/mine.py'}.
 OmegaConf.register_new_resolver("conf", find, replace=True)
 
 
@@ -61,9 +61,9 @@ class Composition:
     mapping: dict[str, Any]
     """All values, as plain Python."""
     names: Mapping[str, str]
-    """What a racer calls the choices that come from `custom_files`, by group."""
+    """Display names of the choices that come from `custom_files`, by group."""
     notes: tuple[str, ...]
-    """What was taken from `custom_files` and what was not, a line each."""
+    """What was used of `custom_files` and what was not, a line each."""
 
     def yaml(self) -> str:
         """Return the values as YAML, in the order of the entry point's groups."""
@@ -77,14 +77,14 @@ def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Compositio
 
     Args:
         overrides: Hydra override expressions without sweeps, e.g. ``track=Oval_track``; paths and addresses need
-            no quotes. ``custom_files=DIR`` stands for the values of DeepRacer's files in a folder; they win over
-            defaults and experiments, and all other overrides over them.
+            no quotes. ``custom_files=DIR`` uses the values of DeepRacer's files in a folder; they override defaults and
+            experiments, and every other override has priority over them.
 
     Raises:
         BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
     """
     composition = compose_entry("train", overrides)
-    experiment = validate(composition.mapping)
+    experiment = parse_experiment(composition.mapping)
     _check_names(experiment.evaluation)
     return experiment, composition
 
@@ -97,7 +97,7 @@ def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Compos
     """
     composition = compose_entry("evaluate", overrides)
     _require_run(composition)
-    config = typed(composition.mapping, EvaluateConfig)
+    config = parse_config(composition.mapping, EvaluateConfig)
     _check_names(config.evaluation)
     return config, composition
 
@@ -112,14 +112,14 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     _require_run(composition)
     if composition.mapping["format"] is None:
         raise BadInput("format: missing; write format=onnx, format=aws or format=aws-logs")
-    return typed(composition.mapping, ExportConfig), composition
+    return parse_config(composition.mapping, ExportConfig), composition
 
 
 def _require_run(composition: Composition) -> None:
     if composition.mapping["run"] is None:
         raise BadInput(
-            "run: missing; write run=RUN: a run's folder, its name or the beginning of it, MLflow's id, "
-            "best:EXPERIMENT, MODEL@ALIAS or ALIAS"
+            "RUN: missing; accepted: a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, "
+            "MODEL@ALIAS or ALIAS"
         )
 
 
@@ -159,21 +159,65 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     if several is None and has_tracks and isinstance(mapping.get(TRACK), dict):
         mapping[TRACK] = complete(choices[TRACK], mapping[TRACK])
     elif several is not None:
-        several.put_in_place(mapping)
+        several.move_to_track(mapping)
         choices[TRACK] = f"[{','.join(several.names)}]"
     return Composition(
         overrides=tuple(overrides),
         choices={group: option for group, option in choices.items() if group in groups(entry)},
-        # An option file of the user may hold an address, too.
+        # Option files of the user may contain addresses, too.
         mapping=without_passwords(mapping),
         names=files.names,
         notes=files.notes,
     )
 
 
+class OptionFiles(FileConfigSource):
+    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read an option.
+
+        Raises:
+            BadInput: the file cannot be read, or is not YAML with keys and values.
+        """
+
+        def load(text: str) -> ConfigResult:
+            config = OmegaConf.load(StringIO(text))
+            if not isinstance(config, DictConfig):
+                raise ValueError("has no keys")
+            header = self._get_header_dict(text[:512])
+            return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
+
+        return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
+
+    def is_config(self, config_path: str) -> bool:
+        """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
+        path = self._file(config_path)
+        return self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
+
+    def is_group(self, config_path: str) -> bool:
+        """Return whether there is such a folder."""
+        return self._is_below(config_path) and super().is_group(config_path)
+
+    def _file(self, config_path: str) -> Path:
+        return Path(self.path, self._normalize_file_name(config_path))
+
+    @staticmethod
+    def _is_below(config_path: str) -> bool:
+        # Names in `defaults:` of an option file must not lead out of the folder either.
+        return not Path(config_path).is_absolute() and ".." not in Path(config_path).parts
+
+
+def register_option_files() -> None:
+    """Replace the one reader of files that Hydra has by `OptionFiles`."""
+    Plugins.instance()  # registers Hydra's own reader
+    SourcesRegistry.instance().types[OptionFiles.scheme()] = OptionFiles
+
+
 def _composed(name: str | None, lines: list[str]) -> DictConfig:
-    """Let Hydra put together a file of `conf/`, or what the overrides alone choose, with Hydra's own settings."""
+    """Let Hydra compose a file of `conf/`, or the overrides alone; the result includes Hydra's own settings."""
     project, *more = conf_dirs()
+    register_option_files()
     register_worlds()
     if more:
         lines = [*lines, override_line("hydra.searchpath", [f"file://{folder}" for folder in more])]
@@ -182,27 +226,27 @@ def _composed(name: str | None, lines: list[str]) -> DictConfig:
 
 
 def compose_option(group: str, option: str, kind: type[Config]) -> Config:
-    """Compose one option by itself, a quarter of the work of an experiment, and validate it.
+    """Compose and validate a single option, in a quarter of the time of an experiment.
 
     Raises:
-        BadInput: there is no such option, or its values are not accepted or refer to other groups.
+        BadInput: there is no such option, its values are not accepted, or they refer to other groups.
     """
     check_option(group, option)
     with reading(f"{group}={option}"):
         mapping = _plain(_composed(None, [f"+{override_line(group, option)}"])[group])
     try:
-        return typed(mapping, kind)
+        return parse_config(mapping, kind)
     except BadInput as error:
         raise BadInput(f"{group}={option}: {error}") from error
 
 
 def check_option(group: str, name: object, key: str | None = None) -> None:
-    """Refuse what is no name of a group's options: a name never becomes a path.
+    """Refuse a name that is not an option of the group, so that a name never becomes a path.
 
     Args:
         group: of the options.
-        name: as it was given.
-        key: where, if not as an override of the group.
+        name: the given name.
+        key: the key it was given for, if that is not the group.
 
     Raises:
         BadInput: there is no such option.
@@ -219,12 +263,12 @@ def check_option(group: str, name: object, key: str | None = None) -> None:
 
 
 def check_choice(group: str, value: object) -> None:
-    """Refuse an override of a whole group that names no options of it.
+    """Refuse an override of a whole group whose value is not an option.
 
     Raises:
         BadInput: there is no such option.
     """
-    # Of all groups `experiment` alone may be left out; `several_tracks` looks at lists of tracks.
+    # Only `experiment` may be left out of the groups; `several_tracks` checks lists of tracks.
     if (group, value) in (_NO_EXPERIMENT, (TRACK, ALL)) or (group == TRACK and isinstance(value, list)):
         return
     for name in value if isinstance(value, list) else [value]:
@@ -232,7 +276,7 @@ def check_choice(group: str, value: object) -> None:
 
 
 def _check_names(evaluation: EvaluationConfig) -> None:
-    """Refuse names of options that an evaluation would not find."""
+    """Refuse names of options that an evaluation could not find."""
     tracks = [evaluation.tracks] if isinstance(evaluation.tracks, str) else evaluation.tracks or ()
     for name in tracks:
         if name != ALL:
@@ -243,48 +287,17 @@ def _check_names(evaluation: EvaluationConfig) -> None:
 
 
 def _plain(config: DictConfig) -> dict[str, Any]:
-    """Return composed values as plain Python: all keys text, and text for what JSON does not know."""
+    """Return composed values as plain Python: text for all keys, and for values that JSON does not have."""
     values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
     return plain
-
-
-def validate(mapping: dict[str, Any]) -> Experiment:
-    """Turn plain values into a frozen experiment; types are strict (no text for numbers, no bool for int).
-
-    Raises:
-        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
-    """
-    experiment = typed(mapping, Experiment)
-    check_together(experiment)
-    return experiment
-
-
-def typed(mapping: dict[str, Any], kind: type[Config]) -> Config:
-    """Turn plain values into a frozen dataclass; types are strict.
-
-    Raises:
-        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
-    """
-    try:
-        # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
-        return _adapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
-    except ValidationError as error:
-        raise BadInput(_first_finding(mapping, error)) from error
-
-
-def _adapter(kind: type[Config]) -> TypeAdapter[Config]:
-    # Building one takes longer than ten validations.
-    if kind not in _adapters:
-        _adapters[kind] = TypeAdapter(kind)
-    return _adapters[kind]
 
 
 def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     """Return one list of overrides per combination of the sweeps in them (``seed=0,1``, ``range(1,4)``).
 
     Raises:
-        BadInput: an override cannot be parsed or asks for a sweep that is no plain grid.
+        BadInput: an override cannot be parsed or sweeps something other than lists and ranges.
     """
     axes: list[list[str]] = []
     for override in map(parse_sweep, overrides):
@@ -293,8 +306,8 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
             axes.append([line])
             continue
         if not override.is_discrete_sweep() or isinstance(value, Glob):
-            raise BadInput(f"{line}: no plain grid; -m takes lists and ranges (seed=0,1,2 or seed=range(3))")
-        count = length(value, line) if isinstance(value, RangeSweep) else 1
+            raise BadInput(f"{line}: -m takes lists and ranges only (seed=0,1,2 or seed=range(3))")
+        count = range_length(value, line) if isinstance(value, RangeSweep) else 1
         if math.prod(map(len, axes)) * count > MOST_RUNS:
             raise BadInput(f"{line}: more than {MOST_RUNS:,} runs; accepted with -m: up to {MOST_RUNS:,}")
         key = override.get_key_element()
@@ -306,23 +319,23 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     return [list(combination) for combination in itertools.product(*axes)]
 
 
-def _files(given: Sequence[Override], typed: Mapping[str, str]) -> Beneath:
-    """Return what the last `custom_files` stands for, nothing without one; `typed` is every override by its key."""
+def _files(given: Sequence[Override], typed: Mapping[str, str]) -> FileOverrides:
+    """Return the overrides of the last `custom_files`, if any; `typed` has every other override by its key."""
     folders = [override.value() for override in given if override.key_or_group == custom_files.KEY]
     if not folders or folders[-1] is None:
-        return Beneath((), {}, ())
-    return beneath(read_custom_files(str(folders[-1])), typed)
+        return FileOverrides((), {}, ())
+    return file_overrides(read_custom_files(str(folders[-1])), typed)
 
 
 def _check_key(entry: str, override: Override) -> None:
-    """Refuse what Hydra would take without a word, or with a traceback."""
+    """Refuse what Hydra would accept silently, or refuse with a traceback."""
     key, value = override.key_or_group, override.value()
     if re.match(r"hydra\b", key):
         raise BadInput(
             f"{key}: Hydra's own settings have no effect here; runs_dir says where runs are written"
         )
     if override.package is not None:
-        raise BadInput(f"{key}@{override.package}: an option's place is its group's; write {key}=OPTION")
+        raise BadInput(f"{key}@{override.package}: packages are not accepted; write {key}=OPTION")
     if key in groups(entry) and not override.is_delete():
         check_choice(key, value)
 
@@ -335,8 +348,8 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
 
 
 def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
-    """Return one line for what Hydra tells in several."""
-    text = in_own_words(str(error))
+    """Return one line for an error message of Hydra, which has several."""
+    text = without_placeholders(str(error))
     missing = re.search(r"Could not find '([^']*)'", text)
     groups_within = [group for group in groups(entry) if missing and missing[1].startswith(f"{group}/")]
     if missing and groups_within:
@@ -360,7 +373,7 @@ def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
 
 
 def _unknown_key(entry: str, key: str, chosen: Composition) -> str:
-    """Tell which keys there are where `key` was looked for; `chosen` is the entry point without other overrides."""
+    """Return the message for an unknown key; `chosen` is composed without the overrides of single values."""
     parent, _, leaf = key.rpartition(".")
     keys = list(_dotted(chosen.mapping))
     siblings = [k.rpartition(".")[2] for k in keys if parent and k.rpartition(".")[0] == parent]
@@ -369,57 +382,8 @@ def _unknown_key(entry: str, key: str, chosen: Composition) -> str:
         return f"{key}: no such key{option}{nearest(leaf, siblings)}; known: {', '.join(siblings)}"
     close = nearest(key, keys)
     if not close:
-        # Perhaps the right key without its group, or in another one.
+        # Perhaps the right key in the wrong group, or without one.
         leaves = {k.rpartition(".")[2]: k for k in reversed(keys)}
         match = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.8)
         close = f" (did you mean {leaves[match[0]]}?)" if match else ""
     return f"{key}: no such key{close}; `deepracer-exp {entry} --cfg` prints all of them"
-
-
-def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
-    finding = error.errors(include_url=False)[0]
-    path = [str(part) for part in finding["loc"]]
-    key = _key_of(mapping, path)
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    if finding["type"] == "missing":
-        return f"{key}: missing{more}"
-    if finding["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        parent = _lookup(mapping, key.split(".")[:-1])
-        siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
-        return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
-    value = finding.get("input")
-    if finding["type"] == "union_tag_invalid":
-        context = finding["ctx"]
-        kind = context["discriminator"].strip("'")
-        return f"{key}.{kind}={context['tag']}: no such {kind}; accepted: {context['expected_tags']}{more}"
-    if finding["type"] == "value_error":
-        # A dataclass whose values contradict each other names them itself.
-        at = key if isinstance(value, dict) else f"{key}={_short(value)}"
-        return f"{at}: {finding['ctx']['error']}{more}"
-    return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
-
-
-def _key_of(mapping: dict[str, Any], path: list[str]) -> str:
-    """Return the dotted key of a finding, without the tags of unions that pydantic puts into its path."""
-    key: list[str] = []
-    node: Any = mapping
-    for index, part in enumerate(path):
-        if isinstance(node, dict) and part in node:
-            node = node[part]
-        elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
-            node = node[int(part)]
-        elif index + 1 < len(path) or not isinstance(node, dict):
-            continue  # a union's tag
-        key.append(part)
-    return ".".join(key)
-
-
-def _lookup(mapping: Any, path: list[str]) -> Any:
-    for part in path:
-        mapping = mapping[int(part)] if isinstance(mapping, list) else mapping[part]
-    return mapping
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""The files of a DeepRacer model as overrides: what is taken from them, and what is not applicable here."""
+"""The files of a DeepRacer model as overrides: which values are used, and which do not apply here."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.deepracer import hyperparameters, model_metadata
+from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperparameters
+from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats import hyperparameters, model_metadata
-from deepracer_exp.formats.hyperparameters import Hyperparameters, read_hyperparameters
-from deepracer_exp.formats.model_metadata import Action, ModelMetadata, read_model_metadata
 
 from .overrides import override_line
 
@@ -20,7 +20,7 @@ PLACES = {
     "model_metadata.json": ("model_metadata.json", "model/model_metadata.json"),
     "hyperparameters.json": ("hyperparameters.json", "ip/hyperparameters.json"),
 }
-"""Each file, in deepracer-for-cloud's `custom_files/` and in the folder of a trained model."""
+"""Where each file is in deepracer-for-cloud's `custom_files/`, and in the folder of a trained model."""
 
 TAKEN = {
     "lr": "algorithm.lr",
@@ -32,39 +32,39 @@ TAKEN = {
     "num_episodes_between_training": "algorithm.episodes_per_iteration",
     "term_cond_max_episodes": "budget.iterations",
 }
-"""Keys of hyperparameters.json and where their values go."""
+"""Keys of hyperparameters.json and our keys for the same values."""
 
 FRAMES = "algorithm.frames_per_iteration"
-"""Our other way to say how long an iteration is; null where the file's episodes decide."""
+"""Our alternative length of an iteration; null where the file's number of episodes is used."""
 
 NOT_APPLICABLE = {
-    "e_greedy_value": "for e-greedy exploration, and actions are drawn from the policy here",
-    "epsilon_steps": "for e-greedy exploration, and actions are drawn from the policy here",
+    "e_greedy_value": "for e-greedy exploration; here actions are drawn from the policy",
+    "epsilon_steps": "for e-greedy exploration; here actions are drawn from the policy",
     "stack_size": "the service ignores it, too",
     "term_cond_avg_score": "the service only stores it",
     "sac_alpha": "for SAC only",
-    "sensor": "the policy sees features, no camera or lidar",
-    "neural_network": "for camera pictures; network=NAME chooses here",
-    "version": "the service's physics; car=NAME chooses here",
-    "lidar_config": "the policy sees features, no lidar",
+    "sensor": "here the policy sees features, no camera or lidar",
+    "neural_network": "for camera images; here use network=NAME",
+    "version": "the service's physics; here use car=NAME",
+    "lidar_config": "here the policy sees features, no lidar",
 }
-"""Keys of both JSON files that have no effect, and why."""
+"""Keys of both JSON files that have no effect here, and why."""
 
 
 @dataclass(frozen=True)
 class CustomFiles:
-    """What a folder of DeepRacer files holds."""
+    """The DeepRacer files of a folder."""
 
     folder: str
-    """As it was given."""
+    """The path as given."""
     paths: Mapping[str, str]
-    """The files that are there, by their names in PLACES."""
+    """Paths of the files found, by their names in PLACES."""
     metadata: ModelMetadata | None
     hyperparameters: Hyperparameters | None
 
     @property
     def name(self) -> str:
-        """Return what a racer calls the folder."""
+        """Return the folder's name for display."""
         return Path(self.folder).resolve().name or self.folder
 
     @property
@@ -74,7 +74,7 @@ class CustomFiles:
             return {}
         low, high = self.metadata.low, self.metadata.high
         if low is None or high is None:
-            actions = [_in_the_files_words(action) for action in self.metadata.actions]
+            actions = [_action_entry(action) for action in self.metadata.actions]
             return {"kind": "discrete", "actions": actions}
         return {
             "kind": "continuous",
@@ -84,17 +84,17 @@ class CustomFiles:
 
     @property
     def learning(self) -> dict[str, Any]:
-        """Return value by key of hyperparameters.json for those that are taken; empty without the file."""
+        """Return the values that are used, by key of hyperparameters.json; empty without the file."""
         given = self.hyperparameters
         if given is None:
             return {}
-        # Without the key the service's limit is so far away that ours are better.
+        # The service's default is no limit in practice, so that ours is kept.
         return {
             key: getattr(given, key) for key in TAKEN if key != "term_cond_max_episodes" or key in given.given
         }
 
     def remarks(self) -> list[str]:
-        """Return a line for each key that is not taken, and for what else a racer should know."""
+        """Return a line for each key that is not used or that needs an explanation."""
         lines: list[str] = []
         if self.metadata is not None:
             lines += _remarks("model_metadata.json", self._metadata_remarks(self.metadata))
@@ -113,19 +113,19 @@ class CustomFiles:
                 shown = f"{key}={values[key]}" if key in values else key
                 yield shown, f"not applicable: {NOT_APPLICABLE[key]}"
         if metadata.renumbered:
-            yield "action_space: index", "not read: an action's number is its position, as in the service"
+            yield "action_space: index", "ignored: an action's number is its position, as in the service"
         yield from _unknown(metadata.given, model_metadata.KEYS)
 
     def _learning_remarks(self, given: Hyperparameters) -> Iterable[tuple[str, str]]:
         missing = [f"{key}={value}" for key, value in self.learning.items() if key not in given.given]
         if missing:
-            yield ", ".join(missing), "not in the file, so the service's default"
+            yield ", ".join(missing), "missing in the file; the service's default is used"
         for key in given.beyond_console():
-            yield f"{key}={getattr(given, key)}", "taken; the AWS console would not accept it"
+            yield f"{key}={getattr(given, key)}", "used, although the AWS console would not accept it"
         if given.exploration_type != "categorical":
             yield (
                 f"exploration_type={given.exploration_type}",
-                "not applicable: actions are drawn from the policy here (categorical)",
+                "not applicable: here actions are drawn from the policy (categorical)",
             )
         for key in given.given:
             if key in NOT_APPLICABLE:
@@ -137,7 +137,7 @@ def read_custom_files(folder: str) -> CustomFiles:
     """Read the JSON files of a folder and find its reward function.
 
     Raises:
-        BadInput: there is no such folder, none of the files is in it, or one of them cannot be used.
+        BadInput: there is no such folder, it has none of the files, or one of them cannot be used.
     """
     accepted = "a folder with reward_function.py, model_metadata.json or hyperparameters.json"
     if not folder:
@@ -146,17 +146,17 @@ def read_custom_files(folder: str) -> CustomFiles:
         names = [path.name for path in Path(folder).iterdir()]
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise BadInput(f"{folder}: cannot be read ({reason}); accepted: {accepted}") from error
+        raise BadInput(f"{KEY} {folder}: cannot be read ({reason}); accepted: {accepted}") from error
     paths = {}
     for name, places in PLACES.items():
-        # A name that is there counts, whatever it is: its reader will say what is wrong with it.
+        # Any kind of file of that name is used: its reader reports what is wrong with it.
         there = [Path(folder, place) for place in places if os.path.lexists(Path(folder, place))]
         if there:
             paths[name] = str(there[0])
     if not paths:
-        # A file's name may have line breaks.
+        # A file's name may contain line breaks.
         held = [" ".join(name.split()) for name in sorted(names)[:5]] + ["..."] * (len(names) > 5)
-        raise BadInput(f"{folder}: holds {', '.join(held) or 'nothing'}; accepted: {accepted}")
+        raise BadInput(f"{KEY} {folder}: holds {', '.join(held) or 'nothing'}; accepted: {accepted}")
     metadata = paths.get("model_metadata.json")
     learning = paths.get("hyperparameters.json")
     files = CustomFiles(
@@ -174,22 +174,22 @@ def read_custom_files(folder: str) -> CustomFiles:
 
 
 @dataclass(frozen=True)
-class Beneath:
-    """Overrides that a folder of files stands for; they go before the racer's own, which win."""
+class FileOverrides:
+    """The overrides that a folder of files stands for; the user's own have priority over them."""
 
     lines: tuple[str, ...]
     names: Mapping[str, str]
-    """What a racer calls the reward and the action space that come from the folder."""
+    """Display names of the reward and the action space that come from the folder."""
     notes: tuple[str, ...]
-    """What was taken, what was not and why, a line each."""
+    """What was used, and what was not and why, a line each."""
 
 
-def beneath(files: CustomFiles, own: Mapping[str, str]) -> Beneath:
+def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
     """Turn files into overrides.
 
     Args:
-        files: what was found.
-        own: the racer's own overrides by key or group; where one of them chooses the same, nothing is taken.
+        files: the files found.
+        own: the user's own overrides by key or group; they have priority.
     """
     lines: list[str] = []
     names: dict[str, str] = {}
@@ -203,22 +203,22 @@ def beneath(files: CustomFiles, own: Mapping[str, str]) -> Beneath:
         if winner is None:
             names["reward"] = files.name
             lines += [override_line("reward.file", reward), override_line("reward.name", files.name)]
-            notes.append("reward_function.py: taken as reward.file")
+            notes.append("reward_function.py: used as reward.file")
         else:
-            notes.append(f"reward_function.py: not used, {winner} takes its place")
+            notes.append(f"reward_function.py: not used, because of {winner}")
 
     if files.action_space:
         winner = _first(own, "action_space", "action_space.kind", "action_space.file")
         if winner is None:
-            # Values instead of the file's path: config.yaml then tells the actions when the file has gone.
+            # Values instead of the file's path, so that config.yaml lists the actions without the file.
             values = dict(files.action_space)
             lines.append(f"action_space={values.pop('kind')}")
             lines += [override_line(f"action_space.{key}", value) for key, value in values.items()]
             names["action_space"] = files.name
             many = f"{len(values['actions'])} actions" if "actions" in values else "continuous"
-            notes.append(f"model_metadata.json: taken as action_space: {many}")
+            notes.append(f"model_metadata.json: used as action_space: {many}")
         else:
-            notes.append(f"model_metadata.json: action_space: not used, {winner} takes its place")
+            notes.append(f"model_metadata.json: action_space: not used, because of {winner}")
 
     taken = []
     for key, value in files.learning.items():
@@ -235,25 +235,25 @@ def beneath(files: CustomFiles, own: Mapping[str, str]) -> Beneath:
             taken.append(f"{target}={value}")
             lines.append(override_line(target, value))
         else:
-            notes.append(f"hyperparameters.json: {key}={value}: not used, {winner} takes its place")
+            notes.append(f"hyperparameters.json: {key}={value}: not used, because of {winner}")
     if taken:
-        notes.append(f"hyperparameters.json: taken as {', '.join(taken)}")
-    return Beneath(tuple(lines), names, (*notes, *files.remarks()))
+        notes.append(f"hyperparameters.json: used as {', '.join(taken)}")
+    return FileOverrides(tuple(lines), names, (*notes, *files.remarks()))
 
 
 def _first(own: Mapping[str, str], *keys: str) -> str | None:
-    """Return the first of these overrides that the racer gave."""
+    """Return the first of these overrides that the user gave."""
     return next((own[key] for key in keys if key in own), None)
 
 
-def _in_the_files_words(action: Action) -> dict[str, float]:
+def _action_entry(action: Action) -> dict[str, float]:
     return {"steering_angle": action.steering_deg, "speed": action.speed_mps}
 
 
 def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, str]]:
     unknown = [key for key in given if key not in known]
     if unknown:
-        yield ", ".join(unknown), "not read, and not by the service either"
+        yield ", ".join(unknown), "ignored, as by the service"
 
 
 def _remarks(file: str, findings: Iterable[tuple[str, str]]) -> list[str]:

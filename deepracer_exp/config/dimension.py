@@ -1,4 +1,4 @@
-"""What a sweep expression searches: a list of choices, or a range of numbers."""
+"""One dimension of a search space, from a sweep expression: a list of choices, or a range of numbers."""
 
 import math
 import re
@@ -25,7 +25,7 @@ from .overrides import override_line, parse_single, parse_sweep
 _MOST_VALUES = 100_000
 Number = int | float
 Choice = str | int | float | bool | None
-"""A number, a truth value or null as it is; anything else in the words of an override, quotes included."""
+"""A number, a truth value or null; anything else as an override expression, quotes included."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +42,15 @@ class Range:
     low: Number
     high: Number
     step: Number | None
-    """Distance of neighbours, counted from `low`; None: any number in between."""
+    """Distance between neighbours, counted from `low`; None: continuous."""
     log: bool
-    """Search it by orders of magnitude."""
+    """Whether to search on a logarithmic scale."""
 
     def values(self) -> list[Number] | None:
-        """Return all values in ascending order; None where there is no end of them.
+        """Return all values in ascending order; None for a continuous range.
 
         Raises:
-            BadInput: they are too many.
+            BadInput: there are too many.
         """
         if self.step is None:
             return None
@@ -63,29 +63,29 @@ class Range:
 
 
 def dimension(key: str, expression: str) -> Choices | Range:
-    """Return what `KEY=EXPRESSION` searches, in Hydra's grammar.
+    """Return the dimension of `KEY=EXPRESSION`, in Hydra's grammar.
 
     Args:
-        key: of a value, or a group.
+        key: a key or a group.
         expression: ``a,b``, ``choice()``, ``range()``, ``interval()``, ``tag(log, interval())`` or ``glob()``.
 
     Raises:
-        BadInput: it cannot be parsed, gives one value only, or nothing that could be searched.
+        BadInput: it cannot be parsed, has one value only, or nothing that could be searched.
     """
     override = parse_sweep(f"{key}={expression}")
     if not override.is_sweep_override():
         raise BadInput(
-            f"{key}={expression}: one value, nothing to search; accepted: A,B, choice(A,B), range(FROM,BELOW,STEP), "
+            f"{key}={expression}: one value is nothing to search; accepted: A,B, choice(A,B), range(FROM,BELOW,STEP), "
             "interval(LOW,HIGH), tag(log,interval(LOW,HIGH)) and glob(PATTERN)"
         )
     return _dimension(override)
 
 
 def plain_expression(override: Override, expression: str) -> str:
-    """Return a sweep's expression with the options in the place of a `glob`: later ones are of another search.
+    """Return a sweep's expression with a `glob` replaced by today's options, so that the search space is fixed.
 
     Raises:
-        BadInput: there is no such group, or no option fits.
+        BadInput: there is no such group, or no option matches.
     """
     glob = override.value()
     if not isinstance(glob, Glob):
@@ -94,14 +94,14 @@ def plain_expression(override: Override, expression: str) -> str:
 
 
 def as_override(key: str, value: Choice) -> str:
-    """Return the override that gives `key` a value of its dimension; floats are written with all their digits."""
+    """Return the override that sets `key` to a value of its dimension; floats are written with all digits."""
     if isinstance(value, bool):
         return f"{key}={str(value).lower()}"
     return f"{key}={value}" if isinstance(value, str) else override_line(key, value)
 
 
-def value_of(line: str) -> Any:
-    """Return the plain value that an override gives."""
+def override_value(line: str) -> Any:
+    """Return the plain value of an override."""
     return parse_single(line).value()
 
 
@@ -114,7 +114,7 @@ def _dimension(override: Override) -> Choices | Range:
     tags = value.tags - {"log"}
     if tags or (value.tags and isinstance(value, ChoiceSweep)):
         raise BadInput(
-            f"{line}: tag {', '.join(sorted(value.tags))}; accepted: log, of a range or an interval"
+            f"{line}: tag {', '.join(sorted(value.tags))}; accepted: log, with a range or an interval"
         )
     if isinstance(value, ChoiceSweep):
         return _choices(line, value.list)
@@ -130,13 +130,13 @@ def _options(override: Override, glob: Glob) -> list[str]:
     key, line = override.key_or_group, override.input_line
     if key not in groups():
         raise BadInput(
-            f"{line}: glob() is of a group's options, and {key} is no group{nearest(key, groups())}; "
+            f"{line}: glob() chooses options of a group, and {key} is not a group{nearest(key, groups())}; "
             f"groups: {', '.join(groups())}"
         )
     known = options(key)
     fitting = glob.filter(known)
     if not fitting:
-        raise BadInput(f"{line}: fits no {key}; options: {', '.join(known)}")
+        raise BadInput(f"{line}: matches no {key}; options: {', '.join(known)}")
     return [name if re.fullmatch(r"[\w-]+", name) else override_line("", name)[1:] for name in fitting]
 
 
@@ -145,36 +145,36 @@ def _choices(line: str, elements: Sequence[Any]) -> Choices:
     for element in elements:
         value: Choice = element
         if isinstance(element, str | QuotedString | list | dict):
-            value = _in_words(element)
+            value = _expression(element)
         if any(type(value) is type(one) and value == one for one in values):  # 1 == True
-            raise BadInput(f"{line}: {as_override('', value)[1:]} stands there twice")
+            raise BadInput(f"{line}: {as_override('', value)[1:]} is listed twice")
         values.append(value)
     return Choices(tuple(values))
 
 
-def _in_words(element: str | QuotedString | list[Any] | dict[Any, Any]) -> str:
-    """Return what an override may have after its equals sign; choice() takes the quotes off its texts."""
+def _expression(element: str | QuotedString | list[Any] | dict[Any, Any]) -> str:
+    """Return an element as the value of an override; choice() has removed the quotes of its texts."""
     words, plain = Override._get_value_element_as_str(element), Override._convert_value(element)
-    return words if value_of(f"key={words}") == plain else override_line("", plain)[1:]
+    return words if override_value(f"key={words}") == plain else override_line("", plain)[1:]
 
 
 def _interval(line: str, low: Number, high: Number, log: bool) -> Range:
     _check_finite(line, low, high)
     if low >= high:
-        raise BadInput(f"{line}: the first number is the lower end; accepted: interval(LOW,HIGH), LOW < HIGH")
+        raise BadInput(f"{line}: accepted: interval(LOW,HIGH), LOW < HIGH")
     _check_log(line, low, log)
     return Range(low, high, 1 if isinstance(low, int) and isinstance(high, int) else None, log)
 
 
-def length(sweep: RangeSweep, line: str) -> int:
-    """Return how many values a `range()` has.
+def range_length(sweep: RangeSweep, line: str) -> int:
+    """Return the number of values of a `range()`.
 
     Args:
         sweep: the range.
         line: the override, for messages.
 
     Raises:
-        BadInput: it has none, or no ends.
+        BadInput: it has none, or an end is not finite.
     """
     assert sweep.start is not None
     assert sweep.stop is not None
@@ -183,26 +183,24 @@ def length(sweep: RangeSweep, line: str) -> int:
     if sweep.step != 0:
         count = math.ceil((_exact(sweep.stop) - _exact(sweep.start)) / _exact(sweep.step))
     if count < 1:
-        raise BadInput(f"{line}: holds no value; accepted: range(FROM,BELOW,STEP)")
+        raise BadInput(f"{line}: has no values; accepted: range(FROM,BELOW,STEP)")
     return count
 
 
 def _range(line: str, sweep: RangeSweep, log: bool) -> Range:
-    count = length(sweep, line)
+    count = range_length(sweep, line)
     start, step = sweep.start, sweep.step
     assert start is not None
     first, last = _at(start, step, 0), _at(start, step, count - 1)
     low, high = min(first, last), max(first, last)
     _check_log(line, low, log)
     if log and (isinstance(low, float) or abs(step) != 1):
-        raise BadInput(
-            f"{line}: by orders of magnitude there are no steps; accepted: tag(log,interval(LOW,HIGH))"
-        )
+        raise BadInput(f"{line}: a logarithmic scale has no steps; accepted: tag(log,interval(LOW,HIGH))")
     return Range(low, high, abs(step), log)
 
 
 def _at(start: Number, step: Number, steps: int) -> Number:
-    """Return the number so many steps on, in decimals: three steps of 0.1 on from 0 is 0.3."""
+    """Return `start` plus so many steps, computed in decimals: three steps of 0.1 from 0 are 0.3."""
     if isinstance(start, int) and isinstance(step, int):
         return start + steps * step
     return float(_exact(start) + steps * _exact(step))
@@ -215,9 +213,9 @@ def _exact(number: Number) -> Decimal:
 def _check_finite(line: str, *numbers: Number) -> None:
     for number in numbers:
         if not math.isfinite(number):
-            raise BadInput(f"{line}: {number} is no end of a range; accepted: finite numbers")
+            raise BadInput(f"{line}: {number} cannot be an end of a range; accepted: finite numbers")
 
 
 def _check_log(line: str, low: Number, log: bool) -> None:
     if log and low <= 0:
-        raise BadInput(f"{line}: {low} has no order of magnitude; accepted with tag(log, ...): ends above 0")
+        raise BadInput(f"{line}: {low} is not above 0; accepted with tag(log, ...): ends above 0")

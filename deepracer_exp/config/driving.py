@@ -1,9 +1,9 @@
-"""What the car may do, sees, suffers and is paid for."""
+"""Action space, observation, randomization, episode rules and reward."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from .bounds import Finite, Fraction, Natural, NonNegative, Positive, Seconds, UpTo100
 
@@ -13,7 +13,7 @@ SteeringDeg = Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class DiscreteAction:
-    """One choice of a discrete action space, in the words of model_metadata.json."""
+    """One action of a discrete action space, with the keys of model_metadata.json."""
 
     steering_angle: SteeringDeg
     """Degrees, positive to the left."""
@@ -43,7 +43,7 @@ class DiscreteActionSpace:
     kind: Literal["discrete"]
     actions: Annotated[tuple[DiscreteAction, ...], Field(max_length=1000)]
     file: str | None
-    """A model_metadata.json that takes the place of this whole group."""
+    """A model_metadata.json that replaces this whole group."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +75,10 @@ ActionSpaceConfig = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationConfig:
-    """The features the policy sees, each divided by its scale."""
+    """The features of the observation, each divided by its scale."""
 
     lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
-    """Distances along the centre line at which the road ahead is seen."""
+    """Distances ahead along the centre line at which the road is observed."""
     lookahead_scale_m: Positive
     speed_scale_mps: Positive
     yaw_rate_scale_radps: Positive
@@ -91,13 +91,13 @@ class EpisodeConfig:
     start_offset: Annotated[float, Field(ge=0, lt=1)]
     """Start of the first episode as a fraction of the lap."""
     start_advance: Fraction
-    """Fraction of the lap by which the start moves on after each episode."""
+    """Fraction of the lap by which the start advances after each episode."""
     max_steps: Natural
     """Control steps after which an episode is cut off (0: never)."""
     immobilized_steps: Natural
     """Steps in a row without movement that end an episode (0: never)."""
     immobilized_m: NonNegative
-    """Movement per step up to which a car counts as standing."""
+    """Movement per step, in metres, up to which a car counts as standing."""
     reversed_steps: Natural
     """Steps in a row of falling progress that end an episode (0: never)."""
 
@@ -108,8 +108,73 @@ class RewardConfig:
 
     name: str
     file: str | None
-    """A Python file with `reward_function(params)`; takes the place of `name`."""
+    """A Python file with `reward_function(params)`; replaces `name`."""
     constants: dict[str, Finite]
     """Values for UPPERCASE constants of the module."""
     time_limit_s: Seconds
     """Seconds of CPU that one control step's reward calls may take before the run is failed."""
+
+
+Number = TypeVar("Number", int, float)
+
+
+def _ordered(pair: tuple[Number, ...]) -> tuple[Number, ...]:
+    """Refuse a range whose first number is the larger one."""
+    if pair[0] > pair[1]:
+        raise ValueError("the first number of a range is the lowest, the second the highest")
+    return pair
+
+
+_TWO = Field(min_length=2, max_length=2)
+_ORDERED = AfterValidator(_ordered)
+
+# Beyond half and twice the configured values, light cars with strong motors and servos begin to hop; beyond a fifth
+# and five times the physics diverges.
+Friction = Annotated[float, Field(ge=0.1, le=2, allow_inf_nan=False)]
+Scale = Annotated[float, Field(ge=0.5, le=2, allow_inf_nan=False)]
+Delay = Annotated[int, Field(ge=0, le=15)]
+Offset = Annotated[float, Field(ge=-15, le=15, allow_inf_nan=False)]
+Deviation = Annotated[float, Field(ge=0, le=15, allow_inf_nan=False)]
+
+FrictionRange = Annotated[tuple[Friction, ...], _TWO, _ORDERED]
+ScaleRange = Annotated[tuple[Scale, ...], _TWO, _ORDERED]
+ShareRange = Annotated[tuple[Fraction, ...], _TWO, _ORDERED]
+DelayRange = Annotated[tuple[Delay, ...], _TWO, _ORDERED]
+OffsetRange = Annotated[tuple[Offset, ...], _TWO, _ORDERED]
+DeviationRange = Annotated[tuple[Deviation, ...], _TWO, _ORDERED]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizationConfig:
+    """Domain randomization: the lowest and highest value of each quantity; each episode of each car draws its own.
+
+    Draws are uniform, ends included, and constant for the episode. Their names are columns of the trace.
+    """
+
+    friction_scale: FrictionRange
+    """Factor on the grip of the tyres (1: as configured for the car and the floor)."""
+    mass_scale: ScaleRange
+    """Factor on all masses and inertias."""
+    motor_scale: ScaleRange
+    """Factor on the motors' gain and largest torque."""
+    servo_scale: ScaleRange
+    """Factor on the steering servos' gain: how fast the wheels turn."""
+    battery_sag: ShareRange
+    """Share of the commanded speed that is lost linearly over the first 20 s of driving."""
+    action_delay_steps: DelayRange
+    """Control steps by which commands are delayed; whole numbers."""
+    steering_offset_deg: OffsetRange
+    """Degrees added to every steering command, as by a badly calibrated centre; positive to the left."""
+    steering_noise_deg: DeviationRange
+    """Standard deviation of the Gaussian noise added to each steering command, degrees."""
+    speed_noise: ShareRange
+    """Standard deviation of the Gaussian noise on each speed command, as a fraction of it."""
+    observation_noise: ShareRange
+    """Standard deviation of the Gaussian noise on each measured feature, in units of its scale."""
+    observation_dropout: ShareRange
+    """Probability at each step that the previous observation is repeated."""
+
+
+QUANTITIES = tuple(field.name for field in fields(RandomizationConfig))
+OFF = {name: 1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES}
+"""The value of each quantity that has no effect."""

@@ -1,4 +1,4 @@
-"""How a trained policy is put to the test (`conf/evaluation/`), and the entry point that does it."""
+"""How a policy is evaluated (`conf/evaluation/`), and the entry points of evaluate and export."""
 
 import re
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from .bounds import Natural, NonNegative, UpTo1000
 
 Trials = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
-# An hour and more of driving in one trial is a mistake of units.
+# More than an hour of driving in one trial is a mistake of units.
 Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
-def checkpoint_name(name: str) -> str:
+def checked_checkpoint_name(name: str) -> str:
     """Return a name that a checkpoint may have."""
     if not re.fullmatch(r"best|last|\d{1,9}", name):
         raise ValueError("a checkpoint is best, last or the number of an iteration")
@@ -23,7 +23,7 @@ def checkpoint_name(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PenaltyConfig:
-    """Seconds added to the lap for each time the car is put back."""
+    """Seconds added to the lap each time the car is put back."""
 
     off_track: NonNegative
     reversed: NonNegative
@@ -32,21 +32,21 @@ class PenaltyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
-    """What a trial is, how many there are and on what."""
+    """What a trial is, how many there are, and on which tracks and conditions."""
 
     laps: UpTo1000 | None
     """Completed laps that end a trial; null: as many as fit into `time_s`."""
     time_s: Seconds
-    """Race clock of a trial, penalties included; a lap that is not complete by then does not count."""
+    """Duration of a trial, penalties included; a lap that is not complete by then does not count."""
     resets_per_lap: Natural
-    """How often a lap the car is put back at its last progress, standing; the fault after that fails the lap."""
+    """How often in a lap the car is put back at its last progress, standing; after one more the lap has failed."""
     failed_lap: Literal["ends_trial", "starts_anew"]
-    """After a failed lap the trial is over, or the car begins the next lap, standing."""
+    """After a failed lap the trial ends, or the car starts the next lap, standing."""
     penalty_s: PenaltyConfig
     trials: Trials
-    """On each track, on each of `usual` and `held_out`."""
+    """Number of trials on each track, for each of `usual` and `held_out`."""
     starts: Annotated[tuple[Share, ...], Field(min_length=1, max_length=4096)] | None
-    """Where laps begin, as shares of the lap, the trials taking them in turn; null: spread evenly."""
+    """Where laps start, as shares of the lap, used by the trials in turn; null: spread evenly."""
     tracks: Annotated[tuple[str, ...], Field(min_length=1)] | str | None
     """Options of `track`, or `all`; null: those of the run."""
     usual: str | None
@@ -54,22 +54,47 @@ class EvaluationConfig:
     held_out: str | None
     """Option of `randomization` that the policy was not trained on; null: only `usual` is driven."""
     sample: bool
-    """Draw actions as in training; false: the most probable one, of a continuous policy the mean."""
+    """Sample actions as in training; false: the most probable action, of a continuous policy the mean."""
     seed: Annotated[int, Field(ge=0, lt=2**31)]
-    """Of what the conditions draw: the same for every checkpoint, so that they can be compared."""
+    """Seed of the conditions: the same for every checkpoint, so that they can be compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreConfig:
+    """The MLflow store in which ids and aliases are looked up."""
+
+    uri: str | None
+    """null: the one in `runs_dir`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
-    """What `deepracer-exp evaluate` is asked for."""
+    """The request of `deepracer-exp evaluate`."""
 
     run: Annotated[str, Field(min_length=1)]
-    """Folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias of a
-    registered model."""
-    checkpoint: Annotated[str, AfterValidator(checkpoint_name)] | None
-    """`best`, `last` or an iteration; null: what the alias names that the run is given by, else `best`."""
+    """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
+    of a registered model."""
+    checkpoint: Annotated[str, AfterValidator(checked_checkpoint_name)] | None
+    """`best`, `last` or an iteration; null: the one of the alias that names the run, else `best`."""
     runs_dir: Annotated[str, Field(min_length=1)]
-    tracking_uri: str | None
-    """MLflow store in which ids and aliases are looked up; null: the one in `runs_dir`."""
+    tracking: StoreConfig
     debug: bool
     evaluation: EvaluationConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig:
+    """The request of `deepracer-exp export`."""
+
+    run: Annotated[str, Field(min_length=1)]
+    """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
+    of a registered model."""
+    format: Literal["onnx", "aws", "aws-logs"]
+    """The network as a file, a model for AWS to train on from, or the run's logs as AWS writes them."""
+    layout: Literal["console", "deepracer-for-cloud"]
+    """The folder layout of `aws-logs`."""
+    checkpoint: Annotated[str, AfterValidator(checked_checkpoint_name)] | None
+    """`best`, `last` or an iteration; null: the one of the alias that names the run, else `best`. Network only."""
+    runs_dir: Annotated[str, Field(min_length=1)]
+    tracking: StoreConfig
+    debug: bool

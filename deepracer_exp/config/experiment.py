@@ -6,20 +6,17 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from .budget import BudgetConfig
 from .car import CarConfig
-from .checkpoints import CheckpointsConfig
-from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RewardConfig
+from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
 from .evaluation import EvaluationConfig
 from .learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
-from .randomization import RandomizationConfig
-from .running import CollectorConfig, TrackingConfig
+from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
 from .stopping import StoppingConfig
 from .track import TrackConfig, Tracks
 
 
 def safe_name(name: str) -> str:
-    """Return a name that is fit for a folder or a file.
+    """Return a name that can be used for folders and files.
 
     Raises:
         ValueError: it is not.
@@ -39,13 +36,13 @@ class Experiment:
     """Everything that defines a run."""
 
     name: SafeName
-    """Folder under `runs_dir` and experiment in MLflow."""
+    """Folder under `runs_dir`, and experiment in MLflow."""
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     runs_dir: Annotated[str, Field(min_length=1)]
     debug: bool
     """Show a traceback for errors."""
     report: bool
-    """Write the page of the training at its end."""
+    """Write the report of the training at its end."""
     track: Tracks
     """One, or several by name."""
     car: CarConfig
@@ -59,7 +56,7 @@ class Experiment:
     lr_schedule: LRScheduleConfig
     collector: CollectorConfig
     evaluation: EvaluationConfig
-    """Of the policy, while it is being trained."""
+    """Evaluation of the policy during training."""
     checkpoints: CheckpointsConfig
     stopping: StoppingConfig
     budget: BudgetConfig

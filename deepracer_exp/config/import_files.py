@@ -1,4 +1,4 @@
-"""The files of a DeepRacer model as option files of one's own."""
+"""The files of a DeepRacer model, imported as option files of your own."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.user_file import read_bytes
+from deepracer_exp.files import read_bytes
 
 from .compose import Composition
 from .custom_files import CustomFiles
@@ -25,8 +25,8 @@ _GROUPS = {
 }
 
 _REWARD = """\
-# Brought from {source}.
-# A name to show; the file below is what is used.
+# Imported from {source}.
+# A name for display; the file below is used.
 name: {name}
 # The reward function beside this file.
 file: {file}
@@ -37,37 +37,37 @@ time_limit_s: {time_limit_s}
 """
 
 _DISCRETE = """\
-# Brought from {source}.
+# Imported from {source}.
 # discrete: the policy picks one of the actions below.
 kind: discrete
 # One line per action: steering_angle in degrees, positive to the left; speed in m/s.
 # The position in the list is the action's number.
 actions:
 {actions}
-# A model_metadata.json that takes the place of everything above; null: none.
+# A model_metadata.json that replaces everything above; null: none.
 file: null
 """
 
 _CONTINUOUS = """\
-# Brought from {source}.
-# continuous: the policy gives two numbers between -1 and 1 (steering, speed).
+# Imported from {source}.
+# continuous: the policy outputs two numbers between -1 and 1 (steering, speed).
 kind: continuous
 # Steering angle in degrees, positive to the left: low at -1, high at 1.
 steering_angle: {steering_angle}
 # Speed in m/s: low at -1, high at 1.
 speed: {speed}
-# A model_metadata.json that takes the place of everything above; null: none.
+# A model_metadata.json that replaces everything above; null: none.
 file: null
 """
 
 _ALGORITHM = {
-    "lr": "Learning rate at the start; lr_schedule changes it on the way.",
+    "lr": "Initial learning rate; lr_schedule changes it during training.",
     "batch_size": "Steps per gradient step.",
     "epochs": "Passes over each iteration's steps (num_epochs).",
-    "discount": "Worth of a reward one step (1/15 s) later (discount_factor).",
-    "entropy_coeff": "Reward for staying undecided (beta_entropy).",
+    "discount": "Discount factor per step of 1/15 s (discount_factor).",
+    "entropy_coeff": "Entropy bonus (beta_entropy).",
     "loss_type": "Loss of the value network: huber or mean squared error.",
-    "frames_per_iteration": "Control steps between two updates; null: episodes_per_iteration decides.",
+    "frames_per_iteration": "Control steps between two updates; null: episodes_per_iteration is used.",
     "episodes_per_iteration": "Finished episodes between two updates (num_episodes_between_training).",
 }
 
@@ -76,15 +76,15 @@ def import_files(files: CustomFiles, name: str, composition: Composition) -> lis
     """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
 
     Args:
-        files: what was found in a folder.
-        name: of the options.
-        composition: the experiment that the files make, checked.
+        files: the files of a folder.
+        name: name of the new options.
+        composition: the experiment that the files describe, validated.
 
     Returns:
         The files written, the experiment's last.
 
     Raises:
-        BadInput: the name cannot be used or is taken, or a file cannot be written; nothing is left then.
+        BadInput: the name cannot be used or is taken, or a file cannot be written; then none is.
     """
     _check_name(name)
     texts = _texts(files, name, composition)
@@ -93,7 +93,7 @@ def import_files(files: CustomFiles, name: str, composition: Composition) -> lis
         for folder in (Path("conf"), *searched):
             taken = folder / path.relative_to("conf")
             if os.path.lexists(taken):
-                raise BadInput(f"--name {name}: {taken} is there already; accepted: a name that is not taken")
+                raise BadInput(f"--name {name}: {taken} exists already; accepted: a new name")
     _write_all(texts)
     return list(texts)
 
@@ -106,18 +106,18 @@ def _check_name(name: str) -> None:
         raise BadInput(f"--name {name!r}: {error}") from error
     if not plain or name.endswith(".yaml"):
         raise BadInput(
-            f"--name {name}: would be read as something else than a name; accepted: a name that begins with a letter"
+            f"--name {name}: would not be read as a name; accepted: a name that begins with a letter"
         )
 
 
 def _texts(files: CustomFiles, name: str, composition: Composition) -> dict[Path, str | bytes]:
-    """Return what is to be written by path, `conf/...`."""
-    brought = [group for file, group in _GROUPS.items() if file in files.paths]
+    """Return the files to write, by path (`conf/...`)."""
+    imported = [group for file, group in _GROUPS.items() if file in files.paths]
     texts: dict[Path, str | bytes] = {}
     for file, group in _GROUPS.items():
         if file not in files.paths:
             continue
-        # On one line whatever the folder is called: it goes into a comment.
+        # On one line even if the path has line breaks: it goes into a comment.
         source = re.sub(r"\s+", " ", str(Path(files.paths[file]).resolve()))
         values = composition.mapping[group]
         if group == "reward":
@@ -129,7 +129,7 @@ def _texts(files: CustomFiles, name: str, composition: Composition) -> dict[Path
             text = _algorithm(source, values)
         texts[Path("conf", group, f"{name}.yaml")] = text
     iterations = files.learning.get("term_cond_max_episodes")
-    texts[Path("conf/experiment", f"{name}.yaml")] = _experiment(files, name, brought, iterations)
+    texts[Path("conf/experiment", f"{name}.yaml")] = _experiment(files, name, imported, iterations)
     return texts
 
 
@@ -152,16 +152,19 @@ def _action_space(source: str, values: Mapping[str, Any]) -> str:
 
 
 def _algorithm(source: str, values: Mapping[str, Any]) -> str:
-    lines = [f"# Brought from {source}; all other keys as in algorithm/ppo.yaml.", "defaults:", "  - ppo"]
+    lines = [f"# Imported from {source}; all other keys as in algorithm/ppo.yaml.", "defaults:", "  - ppo"]
     for key, meaning in _ALGORITHM.items():
         lines += [f"# {meaning}", f"{key}: {_flow(values[key])}"]
     return "\n".join(lines) + "\n"
 
 
-def _experiment(files: CustomFiles, name: str, brought: list[str], iterations: int | None) -> str:
+def _experiment(files: CustomFiles, name: str, imported: list[str], iterations: int | None) -> str:
     source = re.sub(r"\s+", " ", str(Path(files.folder).resolve()))
-    lines = ["# @package _global_", f"# What `deepracer-exp import` brought from {source}, on our defaults."]
-    lines += ["defaults:", *(f"  - override /{group}: {_flow(name)}" for group in brought)]
+    lines = [
+        "# @package _global_",
+        f"# Imported by `deepracer-exp import` from {source}; all else as in our defaults.",
+    ]
+    lines += ["defaults:", *(f"  - override /{group}: {_flow(name)}" for group in imported)]
     lines += ["# Folder under runs_dir, and experiment in MLflow.", f"name: {_flow(name)}"]
     if iterations is not None:
         lines += ["budget:", "  # Updates of the policy (term_cond_max_episodes, which counts them)."]
@@ -176,7 +179,7 @@ def _flow(value: Any) -> str:
 
 
 def _write_all(texts: Mapping[Path, str | bytes]) -> None:
-    """Write all files or none; they are made aside first, so that the likely failures come before any is there."""
+    """Write all files or none: they are written under temporary names first, where most failures occur."""
     made: list[Path] = []
     folders: list[Path] = []
     try:
@@ -201,5 +204,5 @@ def _write_all(texts: Mapping[Path, str | bytes]) -> None:
         if not isinstance(error, OSError):
             raise
         raise BadInput(
-            f"{error.filename}: cannot be written ({error.strerror}); options of your own go to ./conf"
+            f"{error.filename}: cannot be written ({error.strerror}); your own options are written to ./conf"
         ) from error

@@ -1,4 +1,4 @@
-"""Where option files lie: the project's `conf/`, and `./conf` of the working folder beside it."""
+"""Where option files are: the project's `conf/`, and `./conf` in the working directory."""
 
 import re
 from collections.abc import Sequence
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import yaml
 
+from deepracer_exp.deepracer.worlds import worlds
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.formats.user_file import read_bytes, read_text
-from deepracer_exp.formats.worlds import worlds
+from deepracer_exp.files import read_bytes, read_text
 
 MOST_LISTED = 24
-"""Options that fit into a message."""
+"""Most options that a message lists."""
 
 
 def conf_dir() -> Path:
@@ -22,10 +22,10 @@ def conf_dir() -> Path:
 
 
 def conf_dirs() -> list[Path]:
-    """Return the absolute folders that are searched: the project's, then `./conf` where there is another one.
+    """Return the absolute folders that are searched: the project's, then `./conf` if it is another one.
 
     Raises:
-        BadInput: both have an option of the same name that is not the same.
+        BadInput: both have an option of the same name with different contents.
     """
     project, own = conf_dir().resolve(), Path("conf")
     try:
@@ -45,33 +45,33 @@ def conf_dirs() -> list[Path]:
 
 
 def find(name: str) -> str:
-    """Return the path of a file that lies among the options, e.g. ``reward/mine.py``; the first folder's if any."""
+    """Return the path of a file among the options, e.g. ``reward/mine.py``, in the first folder that has it."""
     paths = [folder / name for folder in conf_dirs()]
     return str(next((path for path in paths if path.is_file()), paths[-1]))
 
 
 @cache
 def groups(entry: str = "train") -> list[str]:
-    """Return the names of the groups that an entry point (`conf/<entry>.yaml`) puts together, sorted."""
+    """Return the sorted names of the groups that an entry point (`conf/<entry>.yaml`) composes."""
     defaults = yaml.safe_load((conf_dir() / f"{entry}.yaml").read_text(encoding="utf-8"))["defaults"]
     return sorted(group for item in defaults if isinstance(item, dict) for group in item)
 
 
 def options(group: str) -> list[str]:
-    """Return the names of a group's options, sorted; worlds of the service need no file to be tracks."""
+    """Return the sorted names of a group's options; the service's worlds are tracks without a file."""
     files = {path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")}
     return sorted(files | worlds().keys() if group == "track" else files)
 
 
 def listed(group: str, known: Sequence[str]) -> str:
-    """Return a group's options for the end of a message; of many, where they are listed."""
+    """Return a group's options for a message, or the command that lists them if there are many."""
     if len(known) <= MOST_LISTED:
         return ", ".join(known)
     return f"{len(known)}, `deepracer-exp train --options {group}` lists them"
 
 
 def options_of(group: str) -> dict[str, str]:
-    """Return the first sentence about each of a group's options by its name, sorted.
+    """Return a one-sentence description of each option of a group, by its name, sorted.
 
     Raises:
         BadInput: there is no such group.
@@ -82,7 +82,7 @@ def options_of(group: str) -> dict[str, str]:
 
 
 def _first_sentence(file: Path) -> str:
-    """Return the first sentence of the comment at the beginning of an option file, nothing where there is none."""
+    """Return the first sentence of the comment at the top of an option file, or an empty string."""
     if not file.is_file():
         return ""
     words: list[str] = []

@@ -1,4 +1,4 @@
-"""Override expressions as people type them, in Hydra's grammar and a little beyond it."""
+"""Override expressions as users type them: Hydra's grammar, extended for paths and addresses."""
 
 import re
 from collections.abc import Sequence
@@ -10,23 +10,23 @@ from hydra.errors import OverrideParseException
 
 from deepracer_exp.errors import BadInput, reading
 
-# Keys of these mappings are the user's own, so an override may add to them.
+# An override may add keys to these mappings.
 OPEN_MAPPINGS = ("reward.constants",)
-# Options of these groups may leave keys out, which are filled in and checked after Hydra.
+# Options of these groups may omit keys, which are filled in and checked after Hydra.
 COMPLETED = ("track", "several_tracks")
-# Values of these keys are taken as they are typed: Hydra's grammar has no umlaut, bracket or second equals sign
-# in a value without quotes, and a comma makes a sweep.
+# Values of these keys are taken literally: without quotes, Hydra's grammar accepts no umlaut, bracket or second
+# equals sign in a value, and a comma makes a sweep.
 PLAIN_TEXT = (
     *("track.file", "reward.file", "action_space.file", "custom_files", "runs_dir", "tracking.uri"),
-    # Of the commands that read runs back; an id may look like a number.
-    *("run", "checkpoint", "tracking_uri"),
+    # Of commands that read runs; an id may look like a number.
+    *("run", "checkpoint"),
     # Of sweeps.
     *("study", "parent", "sweep.storage"),
 )
 _KEYS = "|".join((*map(re.escape, PLAIN_TEXT), r"(?:track|several_tracks)\.[\w-]+\.file"))
 _PLAIN = re.compile(rf"(\+{{0,2}}(?:{_KEYS})=)(.+)", re.DOTALL)
 _LONGEST = 20_000
-"""Characters of an override; Hydra's parser takes a minute for many more."""
+"""Most characters of an override; Hydra's parser takes a minute for many more."""
 # A track may be called 2022_summit_speedway; Hydra's keys begin with a letter.
 _DIGIT = re.compile(r"([+~]*track\.)(?=\d)")
 
@@ -41,7 +41,7 @@ def parse_single(override: str) -> Override:
     parsed = _parse(plain[1] + _quoted(plain[2]) if plain else override)
     if parsed.is_sweep_override():
         raise BadInput(
-            f"{override}: several values for one run; -m runs each of them, and a list is written KEY=[A,B]"
+            f"{override}: several values for one run; -m runs each of them, a list is written KEY=[A,B]"
         )
     return parsed
 
@@ -62,7 +62,7 @@ def parse_sweep(override: str) -> Override:
 
 
 def line_for_hydra(override: Override) -> str:
-    """Return the expression that Hydra is to compose."""
+    """Return the expression to pass to Hydra."""
     line = override.input_line or ""
     inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in (*OPEN_MAPPINGS, *COMPLETED))
     if inside and not override.is_add() and not override.is_force_add() and not override.is_delete():
@@ -71,7 +71,7 @@ def line_for_hydra(override: Override) -> str:
 
 
 def override_line(key: str, value: object) -> str:
-    """Return the expression that gives `key` a plain value: a number, text, list, mapping or null."""
+    """Return the expression that sets `key` to a plain value: a number, text, list, mapping or null."""
     return f"{key}={_expression(value)}"
 
 
@@ -109,24 +109,24 @@ def _parse(override: str) -> Override:
 
 
 def _quoted(value: str) -> str:
-    """Return the value as one piece of text in Hydra's grammar, unless it is in quotes already or null."""
+    """Return the value as a quoted string of Hydra's grammar, unless it is quoted already or null."""
     if not value or value[0] in "'\"" or value.lower() == "null":
         return value
     if value.startswith("~"):
-        # The shell does so at the beginning of a word only.
+        # The shell expands it at the beginning of a word only.
         with reading(value):
             value = str(Path(value).expanduser())
     return _in_quotes(value)
 
 
 def _in_quotes(value: str) -> str:
-    # Backslashes count as themselves, except in front of a quote.
+    # Backslashes are literal, except in front of a quote.
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
     return f"'{escaped}'"
 
 
 def key_of(line: str) -> str:
-    """Return the key or group that an override is of; nothing of it is parsed, so that its value may be anything."""
+    """Return the key or group of an override without parsing it."""
     return line.partition("=")[0].strip().lstrip("+~")
 
 

@@ -1,23 +1,27 @@
-"""How an experiment is collected, ended and recorded."""
+"""How an experiment is run: collection, checkpoints, budget and tracking."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from .bounds import UpTo1000
+from .bounds import Count, Positive, UpTo1000
+
+Newest = Annotated[int, Field(ge=1, le=100_000)]
+Percent = Annotated[int, Field(ge=1, le=100)]
+EnvironmentVariable = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CollectorConfig:
-    """Where the cars are driven."""
+    """Where experience is collected."""
 
     mode: Literal["in_process", "sync", "async", "ray"]
-    """Cars in this process; in several, all waited for; in several, whichever is ready; as sync, on a Ray cluster."""
+    """In this process; in several processes that wait for each other, or do not; like sync, on a Ray cluster."""
     processes: UpTo1000 | None
-    """Worker processes; null: one per core, which `ray` does not know."""
+    """Worker processes; null: one per core (not with `ray`)."""
     cars: Annotated[int, Field(ge=1, le=10_000)]
-    """Cars per process, stepped together."""
+    """Cars per process, simulated together."""
     threads: Annotated[int, Field(ge=0, le=1024)]
     """Physics threads per process (0: in_process one per core, else one)."""
     hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
@@ -25,13 +29,13 @@ class CollectorConfig:
 
     @property
     def forks(self) -> bool:
-        """Whether cars are driven in processes that the training starts on its own machine."""
+        """Whether the training starts worker processes on its own machine."""
         return self.mode in ("sync", "async")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackingOff:
-    """No MLflow; the run folder alone tells everything."""
+    """No MLflow; the run folder holds everything."""
 
     kind: Literal["off"]
 
@@ -45,4 +49,74 @@ class MLflowTracking:
     """Store or server; null: SQLite in `runs_dir`."""
 
 
-TrackingConfig = Annotated[TrackingOff | MLflowTracking, Field(discriminator="kind")]
+@dataclass(frozen=True, kw_only=True)
+class TensorBoardTracking:
+    """Write TensorBoard's event files into the run folder."""
+
+    kind: Literal["tensorboard"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WandbTracking:
+    """Record the run in Weights & Biases."""
+
+    kind: Literal["wandb"]
+    project: Annotated[str, Field(min_length=1)]
+    """Of W&B; created if it does not exist."""
+    entity: str | None
+    """User or team; null: the default of the account."""
+    mode: Literal["online", "offline"]
+    """Offline: into the run folder only, for `wandb sync`."""
+
+
+TrackingConfig = Annotated[
+    TrackingOff | MLflowTracking | TensorBoardTracking | WandbTracking, Field(discriminator="kind")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckpointsConfig:
+    """How the best policy of a run is chosen, and how many checkpoints are kept."""
+
+    every: Count | None
+    """Iterations between two evaluations (group `evaluation`); the last iteration is evaluated, too. null: never;
+    the best policy is then chosen by the training's own episodes."""
+    metric: Literal["race_score", "lap_time", "progress"]
+    """The metric that ranks evaluations."""
+    keep: Newest
+    """How many of the newest evaluated checkpoints are kept besides the best and the last."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetConfig:
+    """Limits that end a run; null means none. The first one reached ends it."""
+
+    env_steps: Count | None
+    iterations: Count | None
+    minutes: Positive | None
+    max_cost: Positive | None
+    """In the currency of `price_per_hour`."""
+    experiment_env_steps: Count | None
+    """This and the next two: limits for all runs of the same name in `runs_dir` together."""
+    experiment_minutes: Positive | None
+    experiment_max_cost: Positive | None
+    price_per_hour: Positive | None
+    """Price of the machine; needed for limits of cost."""
+    alerts: tuple[Percent, ...]
+    """Per cent of a limit at which an alert is sent."""
+    alert_command: Annotated[str, Field(min_length=1)] | None
+    """A program and its arguments, run without a shell; the message and the run folder are appended."""
+    alert_webhook: EnvironmentVariable | None
+    """The environment variable with the address: an address is a secret, and the config is stored."""
+
+    def __post_init__(self) -> None:
+        """Refuse a run without an end, and a limit of cost without a price."""
+        ends = ("env_steps", "iterations", "minutes", "max_cost")
+        limits = (*ends, *(f"experiment_{name}" for name in ends if name != "iterations"))
+        if all(getattr(self, name) is None for name in limits):
+            raise ValueError(f"{', '.join(limits)} are all null; at least one must end the run")
+        for name in ("max_cost", "experiment_max_cost"):
+            if getattr(self, name) is not None and self.price_per_hour is None:
+                raise ValueError(
+                    f"{name} is {getattr(self, name):g} and price_per_hour null; give the price as well"
+                )

@@ -1,4 +1,4 @@
-"""What ends a run before its budget does (`conf/stopping/`)."""
+"""Stopping rules, which end a run before its budget does (`conf/stopping/`)."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -24,62 +24,62 @@ class ReliableStopping:
     kind: Literal["reliable"]
     lap_share: Fraction
     episodes: Count
-    """How many of the last finished episodes are looked at."""
+    """Number of the last finished episodes that count."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlateauStopping:
-    """Stop once one number no longer grows."""
+    """Stop once a metric no longer improves."""
 
     kind: Literal["plateau"]
     metric: Literal["completion", "mean_return", "eval_completion", "held_out_completion"]
     window: Count
     """Iterations of the moving average."""
     warmup: Natural
-    """Iterations before any verdict."""
+    """Iterations before the rule applies."""
     patience: Count
-    """Iterations without growth."""
+    """Iterations without improvement."""
     gain: NonNegative
-    """Growth that counts, as a share of the range seen so far."""
+    """Improvement that counts, as a share of the range so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConvergedRule:
-    """There is nothing more to gain."""
+    """The policy no longer improves."""
 
     warmup: Natural
     patience: Count
     completion_near: Percent
-    """How far below its best completion may lie, in points."""
+    """How far completion may be below its best, in percentage points."""
     completion_gain: Percent
-    """Points of completion that count as growth."""
+    """Percentage points of completion that count as improvement."""
     return_gain: Fraction
-    """Growth of the return that counts, as a share of the range seen so far."""
+    """Improvement of the return that counts, as a share of the range so far."""
     laps_gain: Fraction
-    """Growth of the laps per step that counts, as a share of their best."""
+    """Improvement of the laps per step that counts, as a share of their best."""
     entropy_change: NonNegative
-    """Change of the normalised entropy that is flat."""
+    """Change of the normalised entropy up to which it counts as constant."""
     best_patience: Count
-    """Iterations without a better policy, as far as policies are evaluated."""
+    """Iterations without a better policy, if policies are evaluated."""
     best_gain: Fraction
-    """How much better its race score must be, as a share."""
+    """Improvement of the race score that counts, as a share."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OverfittingRule:
-    """It learns what holds on the training's conditions only."""
+    """The policy improves on the training's conditions only."""
 
     warmup: Natural
     patience: Count
     held_out_drop: Percent
-    """Points of completion on held-out conditions below the best."""
+    """Drop of held-out completion below its best, in percentage points."""
     return_drop: Fraction
-    """How far below its best the return may lie and still hold, as a share of the range seen so far."""
+    """How far the return may be below its best and still count as stable, as a share of the range so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CollapsedRule:
-    """The policy has made up its mind and drives badly."""
+    """The policy has become almost deterministic and drives badly."""
 
     warmup: Natural
     patience: Count
@@ -89,27 +89,27 @@ class CollapsedRule:
 
 @dataclass(frozen=True, kw_only=True)
 class NotLearningRule:
-    """The policy stays what it was at the start."""
+    """The policy has hardly changed since the start."""
 
     warmup: Natural
     patience: Count
     entropy_near: Fraction
     """Normalised entropy above which the policy counts as unchanged."""
     completion_gain: Percent
-    """Points of completion since the start that count as a movement."""
+    """Percentage points of completion since the start that count as learning."""
     completion_poor: Percent
-    """Completion from which on there is nothing to complain of."""
+    """Completion from which on the rule no longer applies."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EntropyStopping:
-    """Tell a finished training from a hopeless one by entropy, completion, laps and return."""
+    """Stop trainings that have converged, overfit, collapsed or do not learn."""
 
     kind: Literal["entropy"]
     window: Count
     """Iterations of the moving averages."""
     converged: ConvergedRule | None
-    """A rule of null never stops a run."""
+    """null: this rule never stops a run; likewise for the others."""
     overfitting: OverfittingRule | None
     collapsed: CollapsedRule | None
     not_learning: NotLearningRule | None

@@ -1,4 +1,4 @@
-"""The configuration of a run that was kept: changed by overrides, compared."""
+"""The stored configuration of a run: changed by overrides, compared with others."""
 
 import copy
 import json
@@ -14,7 +14,7 @@ from .overrides import OPEN_MAPPINGS, parse_single
 
 _WHOLE = ("experiment", custom_files.KEY)
 ABSENT = "\N{EN DASH}"
-"""Stands for a value that is not there."""
+"""Stands for a missing value."""
 
 
 def with_overrides(
@@ -24,11 +24,11 @@ def with_overrides(
 
     Args:
         config: all values, as in config.yaml.
-        choices: the options they came from, by group.
-        overrides: of whole groups (``track=Oval_track``), whose options are composed anew, and of single values.
+        choices: the options the values came from, by group.
+        overrides: of whole groups (``track=Oval_track``), which are composed again, and of single values.
 
     Raises:
-        BadInput: an override cannot be parsed, names something unknown or stands for a whole experiment.
+        BadInput: an override cannot be parsed, names something unknown or would replace the whole experiment.
     """
     parsed = [parse_single(override) for override in overrides]
     values = copy.deepcopy(dict(config))
@@ -36,8 +36,8 @@ def with_overrides(
     for one in parsed:
         if one.key_or_group in _WHOLE:
             raise BadInput(
-                f"{one.input_line}: would replace what the run was made with; give the groups and values that are "
-                "to change, such as track=Oval_track"
+                f"{one.input_line}: would replace the whole experiment; give the groups and values to change, "
+                "such as track=Oval_track"
             )
     new: dict[str, str] = {}
     if chosen:
@@ -55,25 +55,25 @@ def with_overrides(
     )
 
 
-def differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:
-    """Return the values in which configurations differ, by dotted key; ABSENT where one has no such key.
+def config_differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:
+    """Return the values that differ between configurations, by dotted key; ABSENT for a missing key.
 
     Args:
-        configs: all values of each.
-        prefix: of the keys.
+        configs: the values of each configuration.
+        prefix: prefix of the keys.
     """
     found: dict[str, list[Any]] = {}
     for key in dict.fromkeys(key for config in configs for key in config):
         values = [config.get(key, ABSENT) for config in configs]
         if all(isinstance(value, Mapping) for value in values):
-            found |= differences(values, f"{prefix}{key}.")
+            found |= config_differences(values, f"{prefix}{key}.")
         elif any(value != values[0] for value in values):
             found[f"{prefix}{key}"] = values
     return found
 
 
-def in_words(different: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Return differences in words, e.g. ``algorithm.lr: 0.001 -> 0.0001``."""
+def describe_differences(different: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Return differences as text, e.g. ``algorithm.lr: 0.001 -> 0.0001``."""
     return [f"{key}: {' -> '.join(map(_short, values))}" for key, values in different.items()]
 
 

@@ -30,13 +30,13 @@ class TrackConfig:
     """The world's name in the DeepRacer service; of a track with knots or a file, any."""
     title: str
     direction: Literal["forward", "reversed", "alternate"]
-    """Drive in the order of the waypoints (or knots), against it, or so and so in turn, episode by episode."""
+    """Drive in the order of the waypoints (or knots), against it, or alternating from episode to episode."""
     weight: Positive
-    """How many of the cars drive here, relative to the other tracks of the experiment."""
+    """Share of the cars that drive here, relative to the other tracks of the experiment."""
     file: str | None
-    """A route (.npy) or a YAML of knots that takes the place of the world or the knots."""
+    """A route (.npy) or a YAML of knots, which replaces the world or the knots."""
     knots: tuple[Point, ...] | None
-    """Centre-line spline knots (x, y) in metres, which take the place of the world."""
+    """Centre-line spline knots (x, y) in metres, which replace the world."""
     width_m: Positive | tuple[Positive, ...] | None
     """Distance between the borders of a road of knots in metres: one number, or one per knot."""
     closed: bool
@@ -45,7 +45,7 @@ class TrackConfig:
 
 
 def _kind(value: Any) -> str:
-    """Tell several tracks from one, whose values are not all mappings."""
+    """Return whether this is one track or several; the values of one are not all mappings."""
     several = isinstance(value, dict) and value and all(isinstance(item, dict) for item in value.values())
     return "several" if several else "one"
 

@@ -1,10 +1,10 @@
-"""The options of the group `track`: the service's worlds and tracks of one's own, one or several at once.
+"""The options of the group `track`: the service's worlds and your own tracks, one or several at once.
 
-Worlds need no files: they are registered with Hydra by name. What an option does not say is as in
-`conf/track/reinvent_base.yaml`, so that a track of one's own needs no more than `knots` and `width_m`.
+Worlds need no files: they are registered with Hydra by name. Keys that an option omits have the values of
+`conf/track/reinvent_base.yaml`, so that a track of your own needs `knots` and `width_m` only.
 
-Of several (`track=[A,B]`, `track=all`) Hydra composes each into a place of its own under `PLACE`; afterwards they stand
-by their names under `track`.
+Several tracks (`track=[A,B]`, `track=all`) are composed by Hydra under the placeholder keys `several_tracks.place_0`,
+`place_1`, ...; afterwards they are moved to `track`, by their names.
 """
 
 import re
@@ -18,8 +18,8 @@ import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override
 
+from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.formats.worlds import find_world, leaders, worlds
 
 from .options import conf_dir, listed, options
 from .overrides import override_line, parse_single
@@ -29,28 +29,28 @@ GROUP = "track"
 ALL = "all"
 PLACE = "several_tracks"
 BASE = "reinvent_base"
-"""The option whose values hold where another one says nothing."""
+"""The option with the default values of all others."""
 
 
 @dataclass(frozen=True)
 class SeveralTracks:
-    """What the overrides say of the tracks."""
+    """Several chosen tracks, and the overrides of their values."""
 
     names: tuple[str, ...]
     choosing: tuple[str, ...]
-    """Expressions that make Hydra compose the options."""
+    """Expressions that choose the options."""
     changing: tuple[Override, ...]
-    """Overrides of their values: those of all tracks first, so that a track's own win."""
+    """Overrides of their values: first those of all tracks, so that those of a single track have priority."""
 
-    def put_in_place(self, mapping: dict[Any, Any]) -> None:
-        """Put the tracks under `track`, by their names."""
+    def move_to_track(self, mapping: dict[Any, Any]) -> None:
+        """Move the composed tracks to `track`, by their names."""
         places = mapping.pop(PLACE)
         mapping[GROUP] = {name: complete(name, places[_place(at)]) for at, name in enumerate(self.names)}
 
 
 @cache
 def register_worlds() -> None:
-    """Make every world that has no file in `conf/track` an option that Hydra finds."""
+    """Register every world without a file in `conf/track` with Hydra."""
     store = ConfigStore.instance()
     files = {path.stem for path in (conf_dir() / GROUP).glob("*.yaml")}
     for world in (world for name, world in worlds().items() if name not in files):
@@ -58,8 +58,8 @@ def register_worlds() -> None:
 
 
 def complete(option: str, values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return a track's values with those of `BASE` where it has none; its name is its option's."""
-    return _over(_base() | {"name": option, "title": values.get("name", option)}, values)
+    """Return a track's values, with those of `BASE` for missing keys and the option's name for a missing name."""
+    return _merged(_base() | {"name": option, "title": values.get("name", option)}, values)
 
 
 @cache
@@ -69,16 +69,16 @@ def _base() -> dict[Any, Any]:
     return values
 
 
-def _over(below: Mapping[Any, Any], values: Mapping[Any, Any]) -> dict[Any, Any]:
-    laid = deepcopy(dict(below))
+def _merged(below: Mapping[Any, Any], values: Mapping[Any, Any]) -> dict[Any, Any]:
+    merged = deepcopy(dict(below))
     for key, value in values.items():
-        both = isinstance(value, dict) and isinstance(laid.get(key), dict)
-        laid[key] = _over(laid[key], value) if both else value
-    return laid
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged
 
 
 def by_world_name(override: Override) -> Override:
-    """Return the choice of a track by the world's own name where it is given by its official one."""
+    """Return the choice of a track with official titles of worlds replaced by their names."""
     value = override.value()
     if override.key_or_group != GROUP or not isinstance(value, str | list):
         return override
@@ -92,10 +92,10 @@ def by_world_name(override: Override) -> Override:
 
 
 def several_tracks(own: Sequence[Override]) -> SeveralTracks | None:
-    """Return what the overrides say of several tracks; None where they choose one, or none.
+    """Return the several tracks that the overrides choose; None if they choose one, or none.
 
     Raises:
-        BadInput: a track is unknown or chosen twice, none is chosen, or a value is given to no chosen track.
+        BadInput: a track is unknown or chosen twice, the list is empty, or a value is set for a track not chosen.
     """
     chosen = [override for override in own if override.key_or_group == GROUP and not override.is_delete()]
     value = chosen[-1].value() if chosen else None
@@ -124,13 +124,13 @@ def several_tracks(own: Sequence[Override]) -> SeveralTracks | None:
     return SeveralTracks(names, tuple(choosing), (*of_all, *of_one))
 
 
-def in_own_words(text: str) -> str:
-    """Return a message of Hydra with the keys as they were typed."""
+def without_placeholders(text: str) -> str:
+    """Return a message of Hydra with placeholder keys replaced by `track`."""
     return re.sub(rf"\b{PLACE}\.\w+\b", GROUP, text)
 
 
 def _place(at: int) -> str:
-    # Not its name: Hydra's keys begin with a letter.
+    # Not its name: keys of Hydra begin with a letter.
     return f"place_{at}"
 
 
@@ -150,9 +150,7 @@ def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
                 f"{line}: no such track {name}{nearest(name, known)}; options: {listed(GROUP, known)}"
             )
         if name in names[:at]:
-            raise BadInput(
-                f"{line}: {name} stands there twice; {GROUP}.{name}.weight=2 gives it twice the cars"
-            )
+            raise BadInput(f"{line}: {name} is listed twice; {GROUP}.{name}.weight=2 gives it twice the cars")
 
 
 def _check_single(own: Sequence[Override], known: Sequence[str]) -> None:
@@ -161,8 +159,8 @@ def _check_single(own: Sequence[Override], known: Sequence[str]) -> None:
         name, _, key = key.partition(".")
         if group == GROUP and name in known:
             raise BadInput(
-                f"{override.key_or_group}: accepted where several tracks are chosen ({GROUP}=[A,B]); of one track it "
-                f"is {GROUP}.{key}"
+                f"{override.key_or_group}: accepted with several tracks ({GROUP}=[A,B]) only; with one track write "
+                f"{GROUP}.{key}"
             )
 
 

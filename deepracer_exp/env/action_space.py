@@ -1,4 +1,4 @@
-"""What a policy's action means: steering in degrees and speed in metres per second."""
+"""Action spaces: from a policy's action to steering in degrees and speed in metres per second."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +14,8 @@ from deepracer_exp.config.driving import (
     SpeedRange,
     SteeringRange,
 )
+from deepracer_exp.deepracer.model_metadata import read_model_metadata
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.model_metadata import read_model_metadata
 
 Commands = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Steering in degrees, positive to the left, and speed in metres per second, each (N,)."""
@@ -23,7 +23,7 @@ Commands = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class DiscreteActions:
-    """A list of choices; an action is the position of one of them."""
+    """A list of actions; a policy chooses one by its index."""
 
     steering_deg: NDArray[np.float64]
     """(n,) degrees, positive to the left."""
@@ -32,17 +32,17 @@ class DiscreteActions:
 
     @property
     def n(self) -> int:
-        """Number of choices."""
+        """Number of actions."""
         return len(self.steering_deg)
 
     @property
     def low(self) -> NDArray[np.float64]:
-        """Lowest [steering_deg, speed_mps] of any choice, (2,)."""
+        """Lowest [steering_deg, speed_mps] of any action, (2,)."""
         return np.array([self.steering_deg.min(), self.speed_mps.min()])
 
     @property
     def high(self) -> NDArray[np.float64]:
-        """Highest [steering_deg, speed_mps] of any choice, (2,)."""
+        """Highest [steering_deg, speed_mps] of any action, (2,)."""
         return np.array([self.steering_deg.max(), self.speed_mps.max()])
 
     def commands(self, action: NDArray[Any]) -> Commands:
@@ -61,14 +61,14 @@ class ContinuousActions:
 
     @property
     def n(self) -> None:
-        """None: there is no number of choices."""
+        """None: the space is continuous."""
         return None
 
     def commands(self, action: NDArray[Any]) -> Commands:
         """Clip N actions, (N, 2) floats, to -1..1 and scale them; NaN stays NaN."""
-        # In 64 bits, as 32-bit shares of both ends do not add up to one.
+        # In float64, because float32 shares of both ends do not add up to one.
         share = (np.clip(np.asarray(action, np.float64), -1.0, 1.0) + 1.0) * 0.5
-        # This form of the interpolation is exact at both ends; in between rounding may leave a range of no width.
+        # This form is exact at both ends; in between, rounding may leave a range of zero width.
         scaled = np.clip(self.low * (1.0 - share) + self.high * share, self.low, self.high)
         return scaled[:, 0], scaled[:, 1]
 
@@ -77,13 +77,12 @@ ActionSpace = DiscreteActions | ContinuousActions
 
 
 def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
-    """Build the action space of an experiment; `config.file` takes the place of everything else in it.
+    """Build the action space of an experiment; `config.file` replaces everything else in it.
 
-    The commands are what the policy asked for: the simulator's limits of steering and speed are not
-    applied here, and the trace shows these unclipped values.
+    The simulator's limits of steering and speed are not applied here: the trace has the unclipped commands.
 
     Raises:
-        BadInput: contradictory values (both are named), an empty list, or a bad model_metadata.json.
+        BadInput: contradictory values, an empty list, or a bad model_metadata.json.
     """
     if config.file is not None:
         return _from_file(config.file)

@@ -1,4 +1,4 @@
-"""The race for Gymnasium; importing this module registers `DeepRacer-v0`.
+"""Gymnasium environments; importing this module registers `DeepRacer-v0`.
 
 import gymnasium
 import deepracer_exp.env.gym_env
@@ -18,19 +18,18 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.trace import EPISODE_STATUS, PACKED
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import EPISODE_STATUS, PACKED
 
-from .courses import deal
 from .race import Race
-from .setup import RaceSetup, build_setup
+from .setup import RaceSetup, build_setup, deal
 
 
 class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
-    """One car; where there are several tracks it changes to another with every episode, by their weights.
+    """One car; with several tracks, every episode is on another one, by their weights.
 
-    Observation: the features of `Features`, float32. Action: a number of the action space's list, or steering and
-    speed in -1..1. `info` holds `progress` in per cent and `episode_status` of the pose that was judged.
+    Observation: the features of `Features`, float32. Action: an index into the action space's list, or steering and
+    speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of the pose before the step.
     """
 
     def __init__(self, overrides: Sequence[str] = ()):
@@ -51,12 +50,12 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode, further along the track than the last; with a seed, begin anew."""
+        """Start an episode, further along the track than the last; with a seed, start over."""
         super().reset(seed=seed)
         if seed is not None:
             self._race.seed(seed)
             self._courses = deal(self._weights)
-        # One episode after the other takes the place of one car beside the other.
+        # Successive episodes are distributed over the courses as cars are.
         self._race.reset(course=np.array([next(self._courses)]))
         return self._race.observation[0], {}
 
@@ -75,8 +74,8 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
 class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
 
-    `infos` holds arrays `progress` and `episode_status` (codes of `formats.trace.EPISODE_STATUS`) of the poses that
-    were judged. In a step that ended episodes it also holds, as Gymnasium's own vector environments do, `final_obs`
+    `infos` holds arrays `progress` and `episode_status` (codes of `deepracer.trace.EPISODE_STATUS`) of the poses
+    before the step. In a step that ended episodes it also holds, as Gymnasium's own vector environments do, `final_obs`
     (objects: an observation, or None) with the mask `_final_obs`, and `final_info` with `_final_info`.
     """
 
@@ -95,7 +94,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             num_envs: number of cars.
             overrides: as for `deepracer-exp train`.
             threads: physics threads; 0 means one per core.
-            setup: instead of overrides, what is already built.
+            setup: the race, if it is built already; replaces `overrides`.
 
         Raises:
             BadInput: an override or a file it names is not accepted.
@@ -103,7 +102,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
         setup = setup or build_setup(compose_experiment(overrides)[0])
         if num_envs < len(setup.courses):
             raise BadInput(
-                f"num_envs={num_envs} with {len(setup.courses)} tracks: every track needs a car; accepted there: at "
+                f"num_envs={num_envs} with {len(setup.courses)} tracks: every track needs a car; accepted: at "
                 f"least {len(setup.courses)}"
             )
         self._race = Race(setup, num_envs, threads)
@@ -115,7 +114,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode with every car; with a seed, begin anew (of a list, the first counts)."""
+        """Start an episode with every car; with a seed (of a list, the first), start over."""
         first = seed[0] if isinstance(seed, list) else seed
         super().reset(seed=first)
         if first is not None:

@@ -1,10 +1,10 @@
-"""The features a policy sees."""
+"""The features of an observation."""
 
 import numpy as np
 
 from deepracer_exp.config.driving import ObservationConfig
 
-from .measures import Measures
+from .state import Measures
 
 
 def feature_names(config: ObservationConfig) -> tuple[str, ...]:
@@ -26,7 +26,7 @@ class Features:
 
     In order: `offset` from the centre line over half the road's width, positive to the left; `heading_error_sin`
     and `heading_error_cos` of the car's yaw against the centre line; `speed` and `yaw_rate` as measured;
-    `last_steering` and `last_speed` as last commanded, over the largest the action space has; then for each
+    `last_steering` and `last_speed` as last commanded, over the largest of the action space; then for each
     look-ahead distance `ahead_x_D` and `ahead_y_D`: the centre line's point D metres further on in the frame
     of the car's front point, x forward and y to the left.
     """
@@ -41,14 +41,14 @@ class Features:
         self.names = feature_names(config)
         self.size = len(self.names)
 
-    def ahead(self, ndist: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Return the normalised distances (N, K) along the centre line at which the road is looked at.
+    def ahead(self, ndist: np.ndarray, track_index: np.ndarray) -> np.ndarray:
+        """Return the normalised distances (N, K) along the centre line at which the road is observed.
 
         Args:
-            ndist: where the cars are, (N,).
-            which: place of each car's course among the lengths, (N,).
+            ndist: positions of the cars, (N,).
+            track_index: index of each car's track in the lengths, (N,).
         """
-        ahead: np.ndarray = ndist[:, None] + self._ahead_ndist[which]
+        ahead: np.ndarray = ndist[:, None] + self._ahead_ndist[track_index]
         return ahead
 
     def compute(

@@ -5,19 +5,18 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.config.randomization import RandomizationConfig
+from deepracer_exp.config.driving import RandomizationConfig
+from deepracer_exp.deepracer.trace import PACKED, RANDOMIZED
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.formats.trace import PACKED, RANDOMIZED
+from deepracer_exp.rewards.prints import RewardPrints
+from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.sim.batch import CarBatch, CarState
 
-from .measures import Measures
 from .observation import Features
-from .prints import RewardPrints
 from .randomization import Randomization
-from .referee import Referee, Verdict
-from .reward import RewardFunction
+from .rules import RaceRules, StepResult
 from .setup import RaceSetup
-from .state import fitting
+from .state import Measures, checked_array
 
 _RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
 """Their columns lie side by side in packed rows."""
@@ -27,7 +26,7 @@ _KEPT = (
     *("_return", "_steering_deg", "_commanded_mps"),
     *("observation", "reward", "terminated", "truncated", "trace"),
 )
-"""A race's own arrays that belong into a checkpoint."""
+"""A race's own arrays that belong in a checkpoint."""
 
 
 class NonFinite(RunFailed):
@@ -41,17 +40,17 @@ class NonFinite(RunFailed):
 class Race:
     """The race of N cars, stepped together.
 
-    A step follows the service's order: the pose is read, params are filled and the rules judge it; the action is
-    sent and the car moves on for 1/15 s; the reward is that of the pose read at the start. So reward and end of
-    an episode belong to the pose the action was chosen at, and the observation returned is the new one. An
-    episode's first step is the prepare step: the car stands, the reward is 0 and no rule holds.
+    A step follows the service's order: the rules and the reward function see the pose at which the action was chosen,
+    then the car moves for 1/15 s. So reward and end of an episode belong to the pose before the step, and the
+    observation returned is the new one. An episode's first step is the prepare step: the car stands, the reward is 0
+    and no rule is applied.
 
     Attributes:
         observation: features of the poses now, (N, size), float32.
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step reached `episode.max_steps`, (N,), bool.
-        trace: one row per car for the last step, columns `formats.trace.PACKED_COLUMNS`, (N, C), float64.
+        trace: one row per car for the last step, columns `deepracer.trace.PACKED_COLUMNS`, (N, C), float64.
     """
 
     def __init__(
@@ -71,20 +70,20 @@ class Race:
             threads: physics threads; 0 means one per core.
             first_car: number of the first car over all processes, which its random stream and starts depend on.
             prints: where `print` of a reward function goes; None: nowhere.
-            randomizations: what each car suffers, (N,); None: all what the setup says.
+            randomizations: of each car, (N,); None: the setup's for all.
         """
         self.setup = setup
         self.n_cars = n_cars
-        self.referee = Referee(setup, n_cars, first_car)
-        self.cars = self.referee.cars
+        self.rules = RaceRules(setup, n_cars, first_car)
+        self.cars = self.rules.cars
         self._period_s = setup.car.control_period_s
         self._floors = np.array([course.tracks[0].floor.friction for course in setup.courses])
-        self._batch = CarBatch(setup.car, n_cars, threads, self._floors[self.referee.course])
+        self._batch = CarBatch(setup.car, n_cars, threads, self._floors[self.rules.course])
         self._reward_function = RewardFunction(setup.reward, n_cars, setup.reward_time_limit_s, prints)
         low, high = setup.actions.low, setup.actions.high
         # A space that only drives straight ahead has no largest angle to divide by.
         steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
-        self._features = Features(setup.observation, self.referee.tracks.length_m, steering_max_deg, high[1])
+        self._features = Features(setup.observation, self.rules.tracks.length_m, steering_max_deg, high[1])
         self.randomization = Randomization(
             randomizations or [setup.randomization] * n_cars,
             self.cars.tolist(),
@@ -109,9 +108,9 @@ class Race:
         return self._features.names
 
     def seed(self, seed: int) -> None:
-        """Begin anew: random streams from `seed`, start positions and clocks from the first episode."""
+        """Start over: random streams from `seed`, start positions and clocks from the first episode."""
         self.randomization.seed(seed)
-        self.referee.restart()
+        self.rules.restart()
 
     def reset(
         self,
@@ -119,39 +118,39 @@ class Race:
         course: np.ndarray | None = None,
         start_ndist: np.ndarray | None = None,
     ) -> None:
-        """Put cars at the start of a new episode: on the centre line, standing, each start further along.
+        """Start a new episode: cars stand on the centre line, each start further along than the last.
 
         Args:
             ids: indices of the cars, None: all of them.
-            course: places in `setup.courses` of other courses to go to, (n,); None: each stays on its own.
-            start_ndist: where they start as shares of the lap, (n,); None: as `episode` says.
+            course: indices in `setup.courses` of the courses to move to, (n,); None: each car stays on its own.
+            start_ndist: where they start as shares of the lap, (n,); None: as `episode` configures.
         """
         ids = self._everyone if ids is None else ids
-        pose = self.referee.reset(ids, start_ndist, course)
+        pose = self.rules.reset(ids, start_ndist, course)
         if course is not None:
             self._batch.set_floor_friction(ids, self._floors[course])
         for kept in (self._return, self._steering_deg, self._commanded_mps):
             kept[ids] = 0
-        self.randomization.begin(ids, self.referee.episode[ids])
+        self.randomization.begin(ids, self.rules.episode[ids])
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
-        """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn anew.
+        """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn again.
 
         Args:
             ids: indices of the cars.
-            percent: progress at which they go on, (n,); as `Referee.put_back`.
+            percent: progress at which they continue, (n,); see `RaceRules.put_back`.
         """
-        pose = self.referee.put_back(ids, percent)
+        pose = self.rules.put_back(ids, percent)
         for commanded in (self._steering_deg, self._commanded_mps):
             commanded[ids] = 0
-        self.randomization.forget_commands(ids, self.referee.steps[ids])
+        self.randomization.forget_commands(ids, self.rules.steps[ids])
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
 
     def step(self, action: np.ndarray) -> None:
-        """Judge the poses, pay the rewards and move the cars on by one control period.
+        """Apply the rules, compute the rewards and move the cars by one control period.
 
         Cars whose episode ended keep driving until `reset`; their observation is the terminal one.
 
@@ -159,79 +158,81 @@ class Race:
             action: int64 (N,) for a discrete space; float (N, 2) in -1..1, steering and speed, for a continuous.
 
         Raises:
-            RewardFailed: the reward function raised, hung or returned no usable number.
+            RewardFailed: the reward function raised, timed out or returned no usable number.
             NonFinite: an action, a car's state or an observation is NaN or infinite.
         """
         steering_deg, speed_mps = self.setup.actions.commands(action)
-        verdict = self.referee.judge()
+        result = self.rules.apply()
         self._require_finite(
             "action", np.stack([steering_deg, speed_mps], axis=1), ("steering", "speed"), action
         )
-        self.terminated, self.truncated = verdict.terminated, verdict.truncated
-        params = self.referee.params(verdict, steering_deg, speed_mps)
-        self.reward = self._reward_function(params, self.referee.roads, verdict.running, self.referee.which)
+        self.terminated, self.truncated = result.terminated, result.truncated
+        params = self.rules.params(result, steering_deg, speed_mps)
+        self.reward = self._reward_function(
+            params, self.rules.track_params, result.running, self.rules.track_index
+        )
         self._return += self.reward
-        self._write_trace(verdict, action, steering_deg, speed_mps)
+        self._write_trace(result, action, steering_deg, speed_mps)
         try:
-            self._drive(steering_deg, speed_mps, verdict.running)
+            self._drive(steering_deg, speed_mps, result.running)
         except RunFailed as error:
             raise self._lost_car(error, action) from error
         self._observe()
         self._require_finite("observation", self.observation, self.feature_names, action)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of all that the cars' future depends on, once they were reset: arrays and plain values.
+        """Return copies of everything the next steps depend on, arrays and plain values; `reset` must have been called.
 
-        What a reward function's module remembers is no part of it.
+        Global variables of a reward function's module are not part of it.
         """
         return {
             "physics": self._batch.state,
             "cars": self.cars.copy(),
-            "referee": self.referee.state_dict(),
+            "referee": self.rules.state_dict(),
             "randomization": self.randomization.state_dict(),
             **{name.lstrip("_"): getattr(self, name).copy() for name in _KEPT},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state_dict`: what follows is what followed there, bit for bit.
+        """Restore a `state_dict`: the cars continue as those it was taken from, bit for bit.
 
         Args:
             state: of a race with the same setup and the same cars.
 
         Raises:
-            BadInput: it is of another number of cars, of other cars, tracks or features; these cars are lost then.
+            BadInput: it is of another number of cars, of other cars, tracks or features; the race is unusable then.
         """
-        physics = fitting(state, "physics", self._batch.state.shape)
-        if not np.array_equal(fitting(state, "cars", self.cars.shape), self.cars):
+        physics = checked_array(state, "physics", self._batch.state.shape)
+        if not np.array_equal(checked_array(state, "cars", self.cars.shape), self.cars):
             raise BadInput(
-                f"the checkpoint does not fit: its cars begin with number {state['cars'][0]}; accepted here: "
+                f"the checkpoint does not fit: its first car has number {state['cars'][0]}; accepted here: "
                 f"{self.cars[0]}"
             )
         for name in _KEPT:
-            setattr(self, name, fitting(state, name.lstrip("_"), getattr(self, name).shape))
-        self.referee.load_state_dict(state["referee"])
+            setattr(self, name, checked_array(state, name.lstrip("_"), getattr(self, name).shape))
+        self.rules.load_state_dict(state["referee"])
         self.randomization.load_state_dict(state["randomization"])
-        self._batch.set_floor_friction(self._everyone, self._floors[self.referee.course])
-        # Last: giving a car its mass computes with the physics.
+        self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
+        # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics
 
     def state_arrays(self) -> dict[str, np.ndarray]:
-        """Return copies of the cars' full physics state and counters, for looking into a fault."""
+        """Return copies of the cars' full physics state and counters, for a crash dump."""
         return {
             "physics_state": self._batch.state.copy(),
             "observation": self.observation.copy(),
-            "steps": self.referee.steps.copy(),
-            "episode": self.referee.episode.copy(),
+            "steps": self.rules.steps.copy(),
+            "episode": self.rules.episode.copy(),
             "trace": self.trace.copy(),
         }
 
     def _write_trace(
-        self, verdict: Verdict, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray
+        self, result: StepResult, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray
     ) -> None:
-        referee, now, row = self.referee, verdict.now, self.trace
+        rules, now, row = self.rules, result.now, self.trace
         for name, values in (
-            ("episode", referee.episode),
-            ("steps", referee.steps),
+            ("episode", rules.episode),
+            ("steps", rules.steps),
             ("X", now.front[:, 0]),
             ("Y", now.front[:, 1]),
             ("yaw", np.degrees(now.yaw_rad)),
@@ -240,13 +241,13 @@ class Race:
             ("action", action if action.ndim == 1 else np.nan),
             ("reward", self.reward),
             ("done", self.terminated | self.truncated),
-            ("all_wheels_on_track", verdict.all_wheels_on_track),
-            ("progress", verdict.progress),
-            ("closest_waypoint", referee.nearer_waypoint()),
-            ("track_len", referee.length_m),
-            ("track", referee.course),
-            ("tstamp", referee.clock_steps * self._period_s),
-            ("episode_status", verdict.status),
+            ("all_wheels_on_track", result.all_wheels_on_track),
+            ("progress", result.progress),
+            ("closest_waypoint", rules.nearer_waypoint()),
+            ("track_len", rules.length_m),
+            ("track", rules.course),
+            ("tstamp", rules.clock_steps * self._period_s),
+            ("episode_status", result.status),
             ("speed_mps", now.speed_mps),
             ("yaw_rate_radps", now.yaw_rate_radps),
             ("offset_m", now.offset_m),
@@ -259,35 +260,39 @@ class Race:
     def _drive(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
         self._steering_deg = np.where(running, steering_deg, 0.0)
         self._commanded_mps = np.where(running, speed_mps, 0.0)
-        sent_deg, sent_mps, moving = self.randomization.sent(steering_deg, speed_mps, self.referee.steps)
+        sent_deg, sent_mps, moving = self.randomization.disturb_commands(
+            steering_deg, speed_mps, self.rules.steps
+        )
         self._batch.drive(sent_mps, np.radians(sent_deg), moving=moving)
 
     def _observe(self) -> None:
-        """Measure all cars, and compute what the policy sees of them."""
-        features = self._features_of(self.referee.see(self._batch.read()), self._everyone)
-        self.observation = self.randomization.seen(features, self.observation)
+        """Measure all cars and compute the policy's observations."""
+        features = self._features_of(self.rules.measure(self._batch.read()), self._everyone)
+        self.observation = self.randomization.disturb_observation(features, self.observation)
 
     def _observe_started(self, ids: np.ndarray) -> None:
-        """The same for the cars `ids` alone: at nearly every step some car of many starts an episode."""
+        """Do the same for the cars `ids` alone: of many cars some start an episode at nearly every step."""
         if len(ids) == self.n_cars:
-            started = self.referee.see(self._batch.read())
+            started = self.rules.measure(self._batch.read())
         else:
-            started = self.referee.see_some(ids, CarState(*(values[ids] for values in self._batch.read())))
+            started = self.rules.measure_some(ids, CarState(*(values[ids] for values in self._batch.read())))
         # The terminal observation has been handed out; it must stay as it was.
         self.observation = self.observation.copy()
-        self.observation[ids] = self.randomization.first_seen(ids, self._features_of(started, ids))
+        self.observation[ids] = self.randomization.disturb_first_observation(
+            ids, self._features_of(started, ids)
+        )
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
-        which = self.referee.which[ids]
+        track_index = self.rules.track_index[ids]
         return self._features.compute(
             measures,
             self._steering_deg[ids],
             self._commanded_mps[ids],
-            self.referee.tracks.points_at(self._features.ahead(measures.ndist, which), which),
+            self.rules.tracks.points_at(self._features.ahead(measures.ndist, track_index), track_index),
         )
 
     def _lost_car(self, error: RunFailed, action: np.ndarray) -> RunFailed:
-        """Say which car and step the physics complains of; it knows only the car's place in this batch."""
+        """Name the car and step of a physics error, which knows only the car's index in this batch."""
         rows = np.flatnonzero(~np.isfinite(self._batch.state).all(axis=1))
         if not len(rows):
             return error
@@ -303,7 +308,7 @@ class Race:
             raise self._non_finite(f"{what} '{names[column]}' of {self._place(row)} {value}", action)
 
     def _place(self, row: int) -> str:
-        step, episode = self.referee.steps[row], self.referee.episode[row]
+        step, episode = self.rules.steps[row], self.rules.episode[row]
         return f"car {self.cars[row]} at step {step} of its episode {episode}"
 
     def _non_finite(self, message: str, action: np.ndarray) -> NonFinite:

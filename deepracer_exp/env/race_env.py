@@ -1,4 +1,4 @@
-"""The one TorchRL environment: N cars stepped together."""
+"""The TorchRL environment: N cars stepped together."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from deepracer_exp.formats.trace import PACKED
+from deepracer_exp.deepracer.trace import PACKED
 
 from .race import Race
 
@@ -19,7 +19,7 @@ class RaceEnv(EnvBase):
 
     Keys: `observation` (float32 features), `action` (int64 index, or float32 steering and speed in -1..1), and
     under `next` also `reward`, `done`, `terminated`, `truncated` and `trace` (float64, columns
-    `formats.trace.PACKED_COLUMNS`). `trace` stands with the reward because it exists after a step only.
+    `deepracer.trace.PACKED_COLUMNS`). `trace` is part of the reward spec because it exists after a step only.
     """
 
     def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
@@ -27,12 +27,12 @@ class RaceEnv(EnvBase):
 
         Args:
             race: the cars.
-            on_step: called after every step, as a sign of life.
+            on_step: called after every step, as a heartbeat.
         """
         super().__init__(device="cpu", batch_size=[race.n_cars])
         self.race = race
         self._on_step = on_step
-        self._goes_on = False
+        self._resumed = False
         n_cars, size = race.observation.shape
         n_actions = race.setup.actions.n
         self.observation_spec = Composite(
@@ -56,9 +56,9 @@ class RaceEnv(EnvBase):
         self._no = torch.zeros(n_cars, 1, dtype=torch.bool)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """Step, and start new episodes where one ended; what the base class does, without its generic passes.
+        """Step, and start new episodes where one ended, as the base class does but faster.
 
-        The base class looks at specs and copies keys for about 0.6 ms a step, which 64 cars feel.
+        The base class takes about 0.6 ms a step to check specs and copy keys.
         """
         following = self._step(tensordict)
         tensordict.set("next", following)
@@ -79,21 +79,21 @@ class RaceEnv(EnvBase):
         )
         return tensordict, root
 
-    def go_on(self, state: Mapping[str, Any]) -> None:
-        """Put the cars where a `Race.state_dict` has them; the next reset of all cars leaves them there.
+    def resume_from(self, state: Mapping[str, Any]) -> None:
+        """Restore a `Race.state_dict`; the next reset of all cars keeps that state.
 
         Raises:
             BadInput: the state does not fit.
         """
         self.race.load_state_dict(state)
-        self._goes_on = True
+        self._resumed = True
 
     def _reset(self, tensordict: TensorDictBase | None, **_: object) -> TensorDictBase:
         ids = None
         if tensordict is not None and "_reset" in tensordict:
             ids = np.flatnonzero(tensordict.get("_reset").numpy())
-        if ids is None and self._goes_on:
-            self._goes_on = False
+        if ids is None and self._resumed:
+            self._resumed = False
         else:
             self.race.reset(ids)
         return TensorDict(

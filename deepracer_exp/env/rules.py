@@ -1,14 +1,23 @@
-"""What ends an episode, as the service's simulator decides it."""
+"""The rules of a race as the service's simulator applies them: progress, wheels on the road, the end of an episode."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepracer_exp.config.driving import EpisodeConfig
-from deepracer_exp.formats.trace import STATUS_CODE
+from deepracer_exp.deepracer.trace import STATUS_CODE
+from deepracer_exp.rewards.params import TrackParams
+from deepracer_exp.sim.batch import CarState
+from deepracer_exp.tracks.track import Pose, Tracks
 
-from .state import fitting
+from .setup import RaceSetup, courses_of_cars
+from .state import Floats, Measures, checked_array
+
+Ids = NDArray[np.intp]
+Bools = NDArray[np.bool_]
 
 PENALTY_S = {"off_track": 2.0, "crashed": 5.0, "reversed": 2.0, "immobilized": 0.0}
 """Seconds a car waits where an evaluation resets it; in training each of these ends the episode instead.
@@ -16,10 +25,40 @@ PENALTY_S = {"off_track": 2.0, "crashed": 5.0, "reversed": 2.0, "immobilized": 0
 The service's own figures (deepracer-simapp, rollout_agent_ctrl.py): OFF_TRACK_PENALTY 2 s and COLLISION_PENALTY 5 s;
 REVERSE_PENALTY is that of leaving the track and IMMOBILIZED_PENALTY nothing where a job does not set them.
 """
+_KEPT = {
+    **{name: name for name in ("episode", "steps", "clock_steps", "start_ndist", "course")},
+    **{f"_{name}": name for name in ("driven", "previous", "last_progress", "last_front")},
+    "track_index": "which",
+}
+"""The arrays that later steps depend on, and their keys in a checkpoint."""
+
+
+def lap_progress(
+    ndist: np.ndarray, start_ndist: np.ndarray, previous: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return progress in per cent and the value to pass as `previous` at the next step.
+
+    The rule is that of deepracer-simapp (agent_ctrl/utils.py): a fall by more than half a lap means that
+    the start line was passed forwards, a rise by more than half a lap that the car rolled back over it.
+
+    Args:
+        ndist: Normalised projections on the centre line, 0 to 1, of any shape.
+        start_ndist: Where each episode began, 0 to 1.
+        previous: Second result of the step before; 0 at an episode's first step.
+
+    Returns:
+        Progress (at most 100; below 0 behind the start), and the next `previous` (0 after a full lap).
+    """
+    p = 100.0 * (ndist - start_ndist)
+    p = np.where(p <= 0.0, p + 100.0, p)
+    p = np.where(previous > p + 50.0, p + 100.0, p)
+    p = np.where(p > previous + 50.0, p - 100.0, p)
+    p = np.minimum(p, 100.0)
+    return p, np.where(p == 100.0, 0.0, p)
 
 
 class EpisodeRules:
-    """Counters and verdicts of N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).
+    """What ends an episode, for N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).
 
     A car's first step is the prepare step: it stands at its start pose and no rule is applied.
     """
@@ -30,7 +69,7 @@ class EpisodeRules:
         self._falling = np.zeros(n_cars, np.int64)
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget what the cars `ids` did before."""
+        """Set the counters of the cars `ids` to zero."""
         self._still[ids] = 0
         self._falling[ids] = 0
 
@@ -39,15 +78,15 @@ class EpisodeRules:
         return {"still": self._still.copy(), "falling": self._falling.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on counting from a `state_dict`.
+        """Restore the counters of a `state_dict`.
 
         Raises:
             BadInput: it is of another number of cars.
         """
-        self._still = fitting(state, "still", self._still.shape)
-        self._falling = fitting(state, "falling", self._falling.shape)
+        self._still = checked_array(state, "still", self._still.shape)
+        self._falling = checked_array(state, "falling", self._falling.shape)
 
-    def judge(
+    def apply(
         self,
         steps: np.ndarray,
         progress: np.ndarray,
@@ -83,3 +122,240 @@ class EpisodeRules:
             status[steps >= config.max_steps] = STATUS_CODE["time_up"]
         status[~running] = STATUS_CODE["prepare"]
         return status
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """The result of one control step; arrays with one row per car."""
+
+    now: Measures
+    """The poses the rules were applied to."""
+    running: Bools
+    """Not in the prepare step, so that rewards are paid."""
+    progress: Floats
+    """Per cent of the lap."""
+    all_wheels_on_track: Bools
+    off_track: Bools
+    """No wheel on the road."""
+    status: NDArray[np.int64]
+    """Codes of `deepracer.trace.STATUS_CODE`."""
+    terminated: Bools
+    truncated: Bools
+    """`episode.max_steps` was reached."""
+
+
+class RaceRules:
+    """Applies the rules to the poses of N cars step by step, whether physics, a recording or a caller gives them.
+
+    A step is one call of `measure` and one of `apply`. The first step of an episode is the prepare step.
+
+    Attributes:
+        now: the poses last measured.
+        episode: number of the episode each car is in, from 0, (N,), int64.
+        steps: control steps of the episode so far, the prepare step being 1, (N,), int64.
+        clock_steps: control steps since `restart`, (N,), int64.
+        start_ndist: where the episodes began, as shares of the lap, (N,).
+        tracks: the courses in their directions, side by side.
+        track_params: the params of a reward function that are constant on each of these.
+        course: index of each car's course in `setup.courses`, (N,).
+        track_index: index of its track in `tracks` and `track_params`, (N,).
+    """
+
+    def __init__(self, setup: RaceSetup, n_cars: int, first_car: int = 0):
+        """Set up the cars; `reset` begins their episodes.
+
+        Args:
+            setup: track, dimensions of the car and rules.
+            n_cars: number of cars.
+            first_car: number of the first car over all processes; starts depend on it.
+        """
+        self.n_cars = n_cars
+        self.cars = np.arange(first_car, first_car + n_cars)
+        tracks = [track for course in setup.courses for track in course.tracks]
+        self.tracks = Tracks(tracks)
+        self.track_params = tuple(map(TrackParams.of, tracks))
+        self._turns = np.array([len(course.tracks) for course in setup.courses])
+        self._first_track = np.cumsum(self._turns) - self._turns
+        weights = [course.weight for course in setup.courses]
+        self.course = courses_of_cars(weights, first_car + n_cars)[first_car:]
+        self.track_index = self._first_track[self.course]
+        self._driven = np.zeros((n_cars, len(self._turns)), np.int64)
+        self._period_s = setup.car.control_period_s
+        self._front_point_m = setup.car.front_point_m
+        self._wheels = np.array(setup.car.wheel_points_m)
+        self._episodes = setup.episode
+        self._episode_rules = EpisodeRules(setup.episode, n_cars)
+        self._everyone = np.arange(n_cars)
+        self.now: Measures
+        self.episode = np.full(n_cars, -1)
+        self.steps = np.zeros(n_cars, np.int64)
+        self.clock_steps = np.zeros(n_cars, np.int64)
+        self.start_ndist = np.zeros(n_cars)
+        self._previous = np.zeros(n_cars)
+        self._last_progress = np.zeros(n_cars)
+        self._last_front = np.zeros((n_cars, 2))
+
+    def restart(self) -> None:
+        """Start over: clocks at 0, and the next episode is the first."""
+        self.episode[:] = -1
+        self.clock_steps[:] = 0
+        self._driven[:] = 0
+
+    @property
+    def length_m(self) -> Floats:
+        """Return the length of each car's track, (N,)."""
+        length_m: Floats = self.tracks.length_m[self.track_index]
+        return length_m
+
+    def reset(
+        self, ids: Ids | None = None, start_ndist: np.ndarray | None = None, course: np.ndarray | None = None
+    ) -> Pose:
+        """Begin an episode with each of the cars and return where its chassis origin starts.
+
+        Args:
+            ids: indices of the cars, None: all of them.
+            start_ndist: where they start as shares of the lap, (n,); None: the start moves on by
+                `episode.start_advance` with every episode, as on the service, and from car to car.
+            course: indices of the courses to move to, (n,); None: each car stays on its own. Where the direction
+                alternates, it does so with each episode that the car begins there.
+        """
+        ids = self._everyone if ids is None else ids
+        self.episode[ids] += 1
+        episode = self.episode[ids]
+        if course is not None:
+            self.course[ids] = course
+        own = self.course[ids]
+        track_index = self.track_index[ids] = (
+            self._first_track[own] + self._driven[ids, own] % self._turns[own]
+        )
+        self._driven[ids, own] += 1
+        if start_ndist is None:
+            # An open course is driven from its start: from anywhere else it could not be completed.
+            turns = np.where(self.tracks.closed[track_index], self.cars[ids] + episode, 0)
+            start_ndist = np.mod(self._episodes.start_offset + self._episodes.start_advance * turns, 1.0)
+        self.start_ndist[ids] = start_ndist
+        for counter in (self.steps, self._previous, self._last_progress):
+            counter[ids] = 0
+        self._episode_rules.reset(ids)
+        return self.tracks.start_pose(self.start_ndist[ids], track_index)
+
+    def put_back(self, ids: Ids, percent: np.ndarray) -> Pose:
+        """Continue the cars' episodes from another place and return where their chassis origins are put.
+
+        Args:
+            ids: indices of the cars.
+            percent: progress at which they continue, (n,). The front of the car is put there, but no car is put
+                behind the start.
+        """
+        length_m = self.length_m[ids]
+        ahead_m = np.maximum(percent / 100.0 * length_m - self._front_point_m, 0.0)
+        self._previous[ids] = percent
+        self._last_progress[ids] = percent
+        self._episode_rules.reset(ids)
+        return self.tracks.start_pose(self.start_ndist[ids] + ahead_m / length_m, self.track_index[ids])
+
+    def start_midway(self, steps: np.ndarray, progress: np.ndarray) -> None:
+        """Put all cars in the middle of their episodes.
+
+        Args:
+            steps: control steps they have taken, (N,).
+            progress: per cent, at the last of these, (N,).
+        """
+        self.steps[:] = steps
+        self._previous[:] = progress
+        self._last_progress[:] = progress
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of everything the next steps depend on; `measure` must have been called.
+
+        The measurements are part of it: those of some cars are taken without the others, and NumPy does not promise
+        the same last bit for an array of another length.
+        """
+        own = {key: getattr(self, name).copy() for name, key in _KEPT.items()}
+        return {**own, "rules": self._episode_rules.state_dict(), "now": self.now.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a `state_dict`.
+
+        Raises:
+            BadInput: it is of another number of cars or tracks.
+        """
+        for name, key in _KEPT.items():
+            setattr(self, name, checked_array(state, key, getattr(self, name).shape))
+        self._episode_rules.load_state_dict(state["rules"])
+        self.now = Measures.from_state_dict(state["now"], self.n_cars)
+
+    def measure(self, cars: CarState) -> Measures:
+        """Measure the poses of all cars."""
+        self.now = Measures.of(cars, self._front_point_m, self.tracks, self.track_index)
+        return self.now
+
+    def measure_some(self, ids: Ids, cars: CarState) -> Measures:
+        """Measure new poses of the cars `ids` alone and return these; the others keep their last measurements."""
+        measures = Measures.of(cars, self._front_point_m, self.tracks, self.track_index[ids])
+        self.now.replace(ids, measures)
+        return measures
+
+    def apply(self) -> StepResult:
+        """Apply the rules to the measured poses: one control step of every car."""
+        self.steps += 1
+        self.clock_steps += 1
+        now = self.now
+        percent, self._previous = lap_progress(now.ndist, self.start_ndist, self._previous)
+        wheels_on = self._wheels_on_road()
+        off_track: Bools = np.asarray(~wheels_on.any(axis=1))
+        moved_m = np.hypot(*(now.front - self._last_front).T)
+        status = self._episode_rules.apply(self.steps, percent, self._last_progress, moved_m, off_track)
+        # `reset` writes zeros into what is kept here; a StepResult must not change.
+        self._last_progress, self._last_front = percent.copy(), now.front
+        truncated = status == STATUS_CODE["time_up"]
+        return StepResult(
+            now=now,
+            running=self.steps > 1,
+            progress=percent,
+            all_wheels_on_track=np.asarray(wheels_on.all(axis=1)),
+            off_track=off_track,
+            status=status,
+            terminated=(status > STATUS_CODE["in_progress"]) & ~truncated,
+            truncated=truncated,
+        )
+
+    def params(
+        self, result: StepResult, steering_deg: np.ndarray, speed_mps: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Return the columns of `params.COLUMNS` for the last step and the commands chosen at its poses, (N,)."""
+        now = result.now
+        return {
+            "all_wheels_on_track": result.all_wheels_on_track,
+            "x": now.front[:, 0],
+            "y": now.front[:, 1],
+            "heading": np.degrees(now.yaw_rad),
+            "distance_from_center": now.distance_m,
+            "projection_distance": now.ndist * self.length_m,
+            "progress": result.progress,
+            "steps": self.steps.astype(np.float64),
+            "speed": speed_mps,
+            "steering_angle": steering_deg,
+            "track_width": now.track_width_m,
+            "closest_waypoints": now.closest_waypoints,
+            "is_left_of_center": now.is_left,
+            "is_offtrack": result.off_track,
+            "sim_time": self.clock_steps * self._period_s,
+        }
+
+    def nearer_waypoint(self) -> np.ndarray:
+        """Return the nearer of the two closest waypoints, the one behind where they are equally far, (N,)."""
+        closest = self.now.closest_waypoints
+        away = self.tracks.waypoints(closest, self.track_index) - self.now.front[:, None]
+        behind_m, ahead_m = np.hypot(away[..., 0], away[..., 1]).T
+        return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
+
+    def _wheels_on_road(self) -> Bools:
+        """Return which wheel centres are on the road, (N, 4); flat, from x, y and yaw, as the service's log has."""
+        now = self.now
+        cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
+        wheel_x, wheel_y = self._wheels.T
+        points = np.empty((self.n_cars, len(self._wheels), 2))
+        points[:, :, 0] = now.x_m[:, None] + cos * wheel_x - sin * wheel_y
+        points[:, :, 1] = now.y_m[:, None] + sin * wheel_x + cos * wheel_y
+        return self.tracks.on_road(points.reshape(-1, 2), self.track_index).reshape(self.n_cars, -1)

@@ -1,16 +1,75 @@
-"""Everything a car needs to know about its race, built once and sent to every process."""
+"""Everything a race needs, built once from an experiment and sent to every process: courses, car, actions, reward."""
 
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig
+from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.randomization import RandomizationConfig
+from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.errors import BadInput
+from deepracer_exp.rewards.source import RewardSource, load_reward_source
 from deepracer_exp.tracks.track import Track
 
 from .action_space import ActionSpace, build_action_space
-from .courses import Course, build_courses
-from .reward_source import RewardSource, load_reward_source
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """A track in the directions in which it is driven."""
+
+    name: str
+    weight: float
+    """Share of the cars that drive here, relative to the other courses."""
+    tracks: tuple[Track, ...]
+    """One per direction; two directions alternate from episode to episode."""
+
+
+def build_courses(experiment: Experiment) -> tuple[Course, ...]:
+    """Build the courses of an experiment.
+
+    Raises:
+        BadInput: a route is missing or malformed, or an open course is not started at its start.
+    """
+    courses = tuple(_build(name, config) for name, config in experiment.tracks.items())
+    for course in courses:
+        if experiment.episode.start_offset and not course.tracks[0].closed:
+            raise BadInput(
+                f"episode.start_offset={experiment.episode.start_offset:g}: the open course {course.name} can only "
+                "be completed from its start; accepted: 0"
+            )
+    return courses
+
+
+def _build(name: str, config: TrackConfig) -> Course:
+    directions = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}[config.direction]
+    tracks = tuple(Track.from_config(config, backwards) for backwards in directions)
+    return Course(name=name, weight=config.weight, tracks=tracks)
+
+
+def deal(weights: Sequence[float]) -> Iterator[int]:
+    """Yield the index of the course of car 0, 1, 2, ... without end.
+
+    Each of the first cars takes another course; every further car takes the course that lacks most of its share by
+    weight. So any long enough range of cars covers all courses by their weights, and a car's course does not depend
+    on the number of cars.
+    """
+    total = sum(weights)
+    count = [0] * len(weights)
+    for car in itertools.count():
+        missing = [weight / total * (car + 1) - has for weight, has in zip(weights, count, strict=True)]
+        place = car if car < len(weights) else missing.index(max(missing))
+        count[place] += 1
+        yield place
+
+
+def courses_of_cars(weights: Sequence[float], cars: int) -> NDArray[np.intp]:
+    """Return the course of each of the first `cars` cars as in `deal`, shape (cars,)."""
+    return np.fromiter(itertools.islice(deal(weights), cars), np.intp, cars)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,16 +88,16 @@ class RaceSetup:
 
     @property
     def track(self) -> Track:
-        """Return the first course's track, as its first episode drives it."""
+        """Return the first course's track in the direction of its first episode."""
         return self.courses[0].tracks[0]
 
     def on(self, track: Track) -> "RaceSetup":
-        """Return the same race on this track alone."""
+        """Return the same race on this track only."""
         return replace(self, courses=(Course(name=track.name, weight=1.0, tracks=(track,)),))
 
 
 def build_setup(experiment: Experiment) -> RaceSetup:
-    """Read the files an experiment names and build what its environments need.
+    """Read the files that an experiment names and build its race.
 
     Raises:
         BadInput: a route, model_metadata or reward file is missing or malformed, or values contradict.

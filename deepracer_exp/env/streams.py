@@ -1,4 +1,4 @@
-"""Random numbers that belong to a car, whatever drives beside it."""
+"""Random streams per car that do not depend on the other cars."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -6,12 +6,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-# Draws taken from a generator at once: 256 generators asked one number each would cost 0.5 ms a step.
+# Numbers drawn from a generator at once: one number from each of 256 generators would cost 0.5 ms a step.
 _BLOCK = 128
 
 
 class Purpose(IntEnum):
-    """What random numbers are for: each purpose has streams of its own, so that none shifts another."""
+    """The purpose of random numbers: each has its own streams, so that none shifts another."""
 
     ACTION = 0
     OBSERVATION = 1
@@ -19,15 +19,15 @@ class Purpose(IntEnum):
 
 
 class CarStreams:
-    """Endlessly many independent streams per car, each with a number.
+    """Independent random streams per car, numbered from 0 without limit.
 
-    What a stream holds depends on the seed, the purpose, the car's own number and the stream's number alone, not on how
-    many cars, processes or threads there are, nor on what was drawn before.
+    A stream depends only on the seed, the purpose, the car's number and the stream's number: not on how many cars,
+    processes or threads there are, nor on earlier draws.
     """
 
     def __init__(self, seed: int, cars: Sequence[int], purpose: Purpose):
-        """Know the cars by their numbers over all processes."""
-        # Lists of entropy would not do: SeedSequence([seed, car]) and SeedSequence([seed, car, 0]) are the same.
+        """Set up streams for cars, given their numbers over all processes."""
+        # Not lists of entropy: SeedSequence([seed, car]) and SeedSequence([seed, car, 0]) are the same.
         self._keys: list[NDArray[np.uint64]] = [
             np.random.SeedSequence(seed, spawn_key=(purpose, car))
             .generate_state(2, np.uint64)
@@ -39,13 +39,13 @@ class CarStreams:
         self._state = self._philox.state
 
     def at(self, place: int, number: int) -> np.random.Generator:
-        """Return a generator at the beginning of a car's stream; it is the same object in every call.
+        """Return a generator at the start of a car's stream; every call returns the same object.
 
         Args:
-            place: of the car among `cars`.
-            number: of the stream, from 0.
+            place: index of the car in `cars`.
+            number: number of the stream, from 0.
         """
-        # Philox is made for this: a key and a counter say where it is. Ten times faster than a new generator.
+        # A key and a counter are the whole state of Philox. Ten times faster than a new generator.
         self._state["state"] = {
             "key": self._keys[place],
             "counter": np.array([0, 0, 0, number], np.uint64),
@@ -58,11 +58,11 @@ class StepNoise:
     """Standard normal numbers for each car and control step.
 
     Attributes:
-        steps: how many steps were drawn; noise set to another's `steps` goes on like it.
+        steps: number of steps drawn; setting it continues from there.
     """
 
     def __init__(self, streams: CarStreams, n_cars: int, width: int):
-        """Begin at step 0, with `width` numbers per car and step."""
+        """Start at step 0, with `width` numbers per car and step."""
         self.steps = 0
         self._streams = streams
         self._block = np.empty((n_cars, _BLOCK, width))

@@ -1,4 +1,4 @@
-"""Checkpoints read back: tensors and JSON only, and nothing of one that is not whole."""
+"""Read checkpoints safely: tensors and JSON only, never a pickle, never an incomplete one."""
 
 import logging
 import re
@@ -15,7 +15,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, verify
+from deepracer_exp.runs.checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, verify
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -37,10 +37,10 @@ class StoredPolicy:
 
 
 def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
-    """Read the networks of a checkpoint, or of the newest intact one in place of a torn `best` or `last`.
+    """Read the networks of a checkpoint, or of the newest intact one if `best` or `last` is corrupt.
 
     Args:
-        experiment: what was trained.
+        experiment: of the run.
         folder: `checkpoints/` of its run.
         name: `best`, `last` or the number of an iteration.
 
@@ -51,19 +51,18 @@ def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPo
 
 
 def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Path:
-    """Return the folder of a checkpoint all of whose files are as they were written.
+    """Return the folder of a checkpoint whose files all match their hashes.
 
-    Where `best` or `last` is torn, or `last` is missing, the newest intact checkpoint takes its place, and a warning
-    says so.
+    If `best` or `last` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning.
 
     Args:
         folder: `checkpoints/` of a run.
         name: `best`, `last` or the number of an iteration.
-        resumable: only one that a training can go on from will do.
+        resumable: require one that a training can resume from.
 
     Raises:
-        BadInput: there is no such checkpoint, it lies elsewhere, or it is torn and none can take its place. Whatever
-            could hold a pickle is refused unread.
+        BadInput: there is no such checkpoint, it lies elsewhere, or it is corrupt and so are all others. Files that
+            could contain a pickle are rejected unread.
     """
     path, kept = find_checkpoint(folder, name), kept_checkpoints(folder)
     try:
@@ -81,62 +80,74 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
             reasons.append(str(error))
             continue
         logger.warning(
-            "checkpoint=%s: %s; %s, the newest intact one, takes its place",
+            "checkpoint=%s: %s; using %s, the newest intact one",
             name,
             "; ".join(reasons),
             other.name,
         )
         return found
-    raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; none in {folder} is intact")
+    raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
 
 
 def check(path: Path, *, resumable: bool = False) -> Path:
-    """Return the resolved folder of a checkpoint of ours that is whole, and can be resumed where that is asked for.
+    """Return the resolved folder of an intact checkpoint; with `resumable`, one that a training can resume from.
 
     Raises:
         BadInput: any other.
     """
     if not path.is_dir():
-        what = "leads nowhere" if path.is_symlink() else "is no folder" if path.exists() else "is not there"
+        what = (
+            "is a broken link"
+            if path.is_symlink()
+            else "is not a folder"
+            if path.exists()
+            else "does not exist"
+        )
         raise BadInput(f"{path}: {what}; a pickle is never loaded")
     path = path.resolve()
     entries = list(path.rglob("*"))
     links = [entry for entry in entries if entry.is_symlink()]
     if links:
-        raise BadInput(f"{links[0]}: is a link; the files of a checkpoint lie in its own folder")
+        raise BadInput(f"{links[0]}: is a link; the files of a checkpoint must be in its own folder")
     files = {file.name: file for file in entries if not file.is_dir()}
     foreign = sorted(files.keys() - _STATE - {_MANIFEST, HASHES})
     if foreign:
         raise BadInput(
-            f"{path}: holds {foreign[0]}, which no checkpoint of ours does: wanted are tensors and JSON; a pickle is "
+            f"{path}: contains {foreign[0]}; accepted: the tensors and JSON files of a checkpoint; a pickle is "
             "never loaded"
         )
     if _MANIFEST not in files:
-        raise BadInput(f"{path}: torn: has no {_MANIFEST}")
+        raise BadInput(f"{path}: incomplete: has no {_MANIFEST}")
     if HASHES not in files:
         raise BadInput(
-            f"{path}: has no {HASHES}: torn, or made by an older version, whose checkpoints cannot be used"
+            f"{path}: has no {HASHES}: incomplete, or written by an older version, whose checkpoints cannot be used"
         )
     verify(path)
     try:
         components = Checkpoint.manifest(path)["components"]
     except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
-        raise BadInput(f"{path}: no checkpoint of ours: {' '.join(str(error).split())}") from error
+        raise BadInput(
+            f"{path}: not a checkpoint of deepracer-exp: {' '.join(str(error).split())}"
+        ) from error
     if _AGENT not in components or not components.keys() <= {_AGENT, _TRAINING}:
-        raise BadInput(f"{path}: no checkpoint of ours: holds {', '.join(components) or 'nothing'}")
+        raise BadInput(
+            f"{path}: not a checkpoint of deepracer-exp: holds {', '.join(components) or 'nothing'}"
+        )
     for name, record in components.items():
         folder = path / record["path"]  # torchrl lets no absolute path and no `..` pass
         there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
         if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
-            raise BadInput(f"{path}: no checkpoint of ours: {name} is not {' and '.join(sorted(_STATE))}")
+            raise BadInput(
+                f"{path}: not a checkpoint of deepracer-exp: {name} is not {' and '.join(sorted(_STATE))}"
+            )
         _check_archive(folder / "state.tdz")
     if resumable and _TRAINING not in components:
-        raise BadInput(f"{path}: holds the policy only, no training can go on from it")
+        raise BadInput(f"{path}: contains only the policy, so a training cannot resume from it")
     return path
 
 
 def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
-    """Read the networks of a checkpoint that `check` has let pass.
+    """Read the networks of a checkpoint that `check` has accepted.
 
     Raises:
         BadInput: it does not fit the experiment, or a weight is not finite.
@@ -162,7 +173,7 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
 
 
 class _NetworksOf:
-    """Takes the networks out of an agent's state and leaves the optimizer behind."""
+    """Loads the networks of an agent's state and skips the optimizer."""
 
     def __init__(self, networks: ActorCritic):
         self._networks = networks
@@ -180,6 +191,6 @@ def _check_archive(file: Path) -> None:
         with zipfile.ZipFile(file) as archive:
             foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
     except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise BadInput(f"{file}: torn: {error}") from error
+        raise BadInput(f"{file}: corrupt: {error}") from error
     if foreign:
-        raise BadInput(f"{file}: holds {foreign[0]}, which is no tensor; a pickle is never loaded")
+        raise BadInput(f"{file}: contains {foreign[0]}, which is not a tensor; a pickle is never loaded")

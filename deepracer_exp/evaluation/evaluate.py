@@ -1,63 +1,170 @@
-"""The command that puts a stored policy to the test."""
+"""The command `evaluate`: race a stored policy, print the results and record them."""
 
-from collections.abc import Sequence
+import datetime
+import json
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.console import Console
+from rich.table import Table
 
-from deepracer_exp.config.evaluation import EvaluateConfig
-from deepracer_exp.config.running import TrackingOff
+from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
+from deepracer_exp.config.running import MLflowTracking
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.files import atomic_write
+from deepracer_exp.runs.files import EVALUATIONS
+from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.delivery import deliver_evaluation
-from deepracer_exp.tracking.names import evaluate_metric, track_labels
+from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
-from .checkpoint import read_checkpoint
+from .checkpoint import StoredPolicy, read_checkpoint
 from .evaluator import Evaluator
-from .report import table, write_json
-from .result import USUAL, Evaluation
-from .run import read_run
+from .result import CONFIDENCE, USUAL, Evaluation
 
 if TYPE_CHECKING:
-    from .film import Film
-    from .scene import View
+    from .video import LapVideo, View
+
+
+NOTHING = "\N{EN DASH}"
+_TIMES = ("lap s", "median", "best", "std", "score s")
+_MINOR = ("median", "std", "score s")
+_Row = tuple[str, str, dict[str, str]]
+
+
+def results_table(
+    evaluation: Evaluation, config: EvaluationConfig, trained_on: Container[str], console: Console
+) -> Table:
+    """Return the results as a table, one row per track and condition, with as many columns as the console fits.
+
+    Args:
+        evaluation: the results.
+        config: the protocol.
+        trained_on: names of the run's own tracks.
+        console: on which it will be printed.
+    """
+    unseen = [track for track in evaluation.tracks if track not in trained_on]
+    groups = [(f"{group.track}{' *' * (group.track in unseen)}", group) for group in evaluation.groups]
+    if len(evaluation.tracks) > 1:
+        groups += [("all", evaluation.on(condition)) for condition in evaluation.conditions]
+    found = [(label, group.condition.replace("_", " "), group.statistics()) for label, group in groups]
+    penalties = any(vars(config.penalty_s).values())
+    hidden = (() if config.resets_per_lap else ("resets",)) + (() if penalties else ("penalty s",))
+    endless = console.options.update(max_width=10_000)
+    for intervals, left_out in ((True, hidden), (True, hidden + _MINOR), (False, hidden + _MINOR)):
+        rows = [(label, condition, _cells(numbers, intervals)) for label, condition, numbers in found]
+        shown = _lay_out(rows, left_out)
+        if console.measure(shown, options=endless).maximum <= console.width:
+            break
+    notes = [f"in brackets: {CONFIDENCE:.0%} interval of the mean, by bootstrap over the trials"] * intervals
+    notes += ["*: not trained on"] * bool(unseen)
+    shown.caption, shown.caption_justify = "; ".join(notes), "left"
+    return shown
+
+
+def _lay_out(rows: Sequence[_Row], left_out: Sequence[str]) -> Table:
+    names = [name for name in rows[0][2] if name not in left_out]
+    shown = Table(box=None, pad_edge=False)
+    for name in ("track", "on", *names):
+        shown.add_column(name, no_wrap=True, justify="right" if name in names else "left")
+    for label, condition, cells in rows:
+        whole = label == "all"
+        # Lap times of tracks of different lengths have no mean.
+        texts = [NOTHING if whole and name in _TIMES else cells[name] for name in names]
+        shown.add_row(label, condition, *texts, style="bold" * whole)
+    return shown
+
+
+def write_evaluation(
+    folder: Path, evaluation: Evaluation, config: EvaluationConfig, stored: StoredPolicy
+) -> Path:
+    """Write `evaluations/<time>.json` into a run's folder and return it.
+
+    Raises:
+        RunFailed: the file cannot be written.
+    """
+    now = datetime.datetime.now()
+    content: dict[str, Any] = {
+        "time": now.isoformat(timespec="seconds"),
+        "checkpoint": {"name": stored.path.name, **stored.counters},
+        "evaluation": asdict(config),
+        **evaluation.as_dict(),
+    }
+    target = folder / EVALUATIONS
+    try:
+        target.mkdir(exist_ok=True)
+        # Microseconds, so that two within a second do not overwrite each other.
+        name = now.strftime("%Y%m%d-%H%M%S-%f")
+        return atomic_write(target / f"{name}.json", json.dumps(content, indent=2) + "\n")
+    except OSError as error:
+        raise RunFailed(f"{target}: the evaluation cannot be written: {error.strerror or error}") from error
+
+
+def _cells(found: Mapping[str, Any], intervals: bool) -> dict[str, str]:
+    """Return a group's cells by column."""
+    times = found["lap_time_s"]
+    return {
+        "laps": f"{found['laps']} of {found['laps_tried']}",
+        "done %": _mean(found["completion"], 1, intervals),
+        "lap s": _mean(times, 2, intervals),
+        "median": _number(times["median"], 2),
+        "best": _number(times["best"], 2),
+        "std": _number(times["std"], 2),
+        "resets": _mean(found["resets"], 1, intervals),
+        "penalty s": _mean(found["penalty_s"], 1, intervals),
+        "score s": _number(found["race_score_s"], 2),
+    }
+
+
+def _number(value: float | None, digits: int) -> str:
+    return NOTHING if value is None else f"{value:.{digits}f}"
+
+
+def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:
+    mean = _number(found["mean"], digits)
+    if found["interval"] is None or not intervals:
+        return mean
+    low, high = (_number(bound, digits) for bound in found["interval"])
+    return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 
 def evaluate(
-    config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, told: Console
+    config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, err: Console
 ) -> Evaluation:
-    """Drive a run's checkpoint under a protocol, print the table and write the JSON file.
+    """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.
 
     Args:
         config: validated.
-        video: file and view of a film of the best lap; None: no film.
-        out: for the results.
-        told: for what is going on.
+        video: file and view for a video of the best lap; None: no video.
+        out: for results.
+        err: for progress.
 
     Raises:
-        BadInput: the run, the checkpoint, a track or a condition cannot be used, or the machine cannot film.
+        BadInput: the run, the checkpoint, a track or a condition cannot be used, or the machine cannot render.
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
-    run = read_run(config.run, Path(config.runs_dir), config.tracking_uri)
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.meant(config.checkpoint))
+    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, config.evaluation)
     film = _film(evaluator, *video) if video is not None else None
-    told.print(
+    err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {len(evaluator.trials)} trials", highlight=False
     )
     evaluation = evaluator(stored.networks.policy, film.record if film is not None else None)
-    file = write_json(run.path, evaluation, config.evaluation, stored)
-    # A file has the name of the option whose place it took.
+    file = write_evaluation(run.path, evaluation, config.evaluation, stored)
+    # A track file replaces an option and keeps its name, so it is not the track of that name.
     own = [name for name, track in run.experiment.tracks.items() if track.file is None]
     trained_on = evaluation.tracks if config.evaluation.tracks is None else own
-    out.print(table(evaluation, config.evaluation, trained_on, out))
+    out.print(results_table(evaluation, config.evaluation, trained_on, out))
     out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
     if film is not None:
-        film.write(evaluation, told)
+        film.write(evaluation, err)
         out.print(f"  video    {film.file}", soft_wrap=True, highlight=False)
     tracking = run.experiment.tracking
-    uri = config.tracking_uri or (None if isinstance(tracking, TrackingOff) else tracking.uri)
+    uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
     files = {file: "evaluations"} | ({} if film is None else {film.file: "films"})
     metrics = _metrics(evaluation, trained_on)
     runs_dir = run.path.resolve().parents[1]
@@ -66,7 +173,7 @@ def evaluate(
 
 
 def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, float | None]:
-    """Return the results as metrics of the run, each track's under its name unless it is the run's only one."""
+    """Return the results as metrics of the run, suffixed with the track unless it is the run's only one."""
     names = evaluation.tracks
     labels = [None] if names == list(trained_on) and len(names) == 1 else track_labels(names)
     found: dict[str, float | None] = {evaluate_metric("eval_race_score_s", None): evaluation.race_score_s}
@@ -80,8 +187,8 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
     return found
 
 
-def _film(evaluator: Evaluator, file: Path, view: "View") -> "Film":
-    # Only films need a video encoder.
-    from .film import Film
+def _film(evaluator: Evaluator, file: Path, view: "View") -> "LapVideo":
+    # Only videos need an encoder.
+    from .video import LapVideo
 
-    return Film(evaluator, file, view)
+    return LapVideo(evaluator, file, view)

@@ -1,4 +1,4 @@
-"""Drives a policy under a race protocol: all trials, tracks and conditions as one batch of cars."""
+"""Race a policy under a protocol: all trials, tracks and conditions as one batch of cars."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,26 +10,25 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.config.compose import compose_experiment, compose_option
+from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
-from deepracer_exp.config.randomization import RandomizationConfig
 from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.courses import Course
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.reward_source import RewardSource
-from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import PACKED
+from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.tracks.track import Track
 
+from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, Group
-from .stewards import Stewards
 
-OnStep = Callable[[Race, Stewards], None]
+OnStep = Callable[[Race, RaceProtocol], None]
 
-# Nobody learns from an evaluation; the run's own reward function need not even be there any more.
+# An evaluation needs no reward; the run's own reward function may no longer exist.
 _NO_REWARD = RewardSource(
     name="none",
     path="none",
@@ -42,21 +41,21 @@ _NO_REWARD = RewardSource(
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Where and how one car drives."""
+    """Track, conditions and start of one car."""
 
     course: int
-    """Place in the courses of the race."""
+    """Index of the race's course."""
     condition: str
     start_ndist: float
 
 
 class Evaluator:
-    """The race of an experiment's car under a protocol, ready to be driven by one policy after another.
+    """Races one policy after another with an experiment's car under a protocol.
 
-    Every policy meets the same trials: what conditions draw depends on `config.seed` and the trial's place alone.
+    All policies meet the same trials: random conditions depend only on `config.seed` and the trial's index.
 
     Attributes:
-        trials: what each row of the batch is.
+        trials: of the rows of the batch.
         race: the cars.
     """
 
@@ -64,8 +63,8 @@ class Evaluator:
         """Build tracks and cars.
 
         Args:
-            experiment: car, action space, observation and rules, and the tracks and conditions the protocol leaves
-                to the run.
+            experiment: car, action space, observation and rules, and the tracks and conditions that the protocol does
+                not set.
             config: the protocol.
             threads: physics threads; 0 means one per core.
 
@@ -89,7 +88,7 @@ class Evaluator:
             actions=build_action_space(experiment.action_space),
             observation=experiment.observation,
             randomization=conditions[USUAL],
-            # Time is the stewards' business.
+            # Time is the protocol' business.
             episode=replace(experiment.episode, max_steps=0),
             reward=_NO_REWARD,
             reward_time_limit_s=experiment.reward.time_limit_s,
@@ -102,7 +101,7 @@ class Evaluator:
         self._closed = np.array([courses[trial.course].tracks[0].closed for trial in self.trials])
 
     def __call__(self, policy: torch.nn.Module, on_step: OnStep | None = None) -> Evaluation:
-        """Let the policy drive all trials.
+        """Let the policy drive all trials and return the results.
 
         Args:
             policy: reads `observation`, writes `action`.
@@ -112,42 +111,42 @@ class Evaluator:
             RunFailed: an action or a car's state became NaN or infinite.
         """
         race, config = self.race, self.config
-        stewards = Stewards(config, self._closed, race.setup.car.control_period_s)
+        protocol = RaceProtocol(config, self._closed, race.setup.car.control_period_s)
         race.seed(config.seed)
         race.reset(None, self._course, self._start_ndist)
         how = ExplorationType.RANDOM if config.sample else ExplorationType.DETERMINISTIC
-        # A training that evaluates goes on with its random numbers as if it had not.
+        # The training's random numbers must not depend on whether it evaluates.
         with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(how):
             torch.manual_seed(config.seed)
-            while stewards.running.any():
+            while protocol.running.any():
                 seen = TensorDict({"observation": torch.from_numpy(race.observation)}, [race.n_cars])
                 race.step(policy(seen)["action"].numpy())
                 row = race.trace
-                back = stewards.follow(
+                back = protocol.step(
                     row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
                 )
                 if on_step is not None:
-                    on_step(race, stewards)
+                    on_step(race, protocol)
                 if len(back.cars):
                     race.put_back(back.cars, back.progress)
-        return Evaluation(tuple(self._groups(stewards)))
+        return Evaluation(tuple(self._groups(protocol)))
 
-    def _groups(self, stewards: Stewards) -> list[Group]:
+    def _groups(self, protocol: RaceProtocol) -> list[Group]:
         names = [course.name for course in self.race.setup.courses]
         rows: dict[tuple[str, str], list[int]] = {}
         for row, trial in enumerate(self.trials):
             rows.setdefault((names[trial.course], trial.condition), []).append(row)
         return [
-            Group(track, condition, tuple(own), tuple(a for a in stewards.attempts if a.trial in set(own)))
+            Group(track, condition, tuple(own), tuple(a for a in protocol.attempts if a.trial in set(own)))
             for (track, condition), own in rows.items()
         ]
 
 
 def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, TrackConfig]:
-    """Return the tracks that are driven, by name.
+    """Return the tracks of the protocol, by name.
 
     Raises:
-        BadInput: there is no such track.
+        BadInput: a track is unknown.
     """
     if config.tracks is None:
         return experiment.tracks
@@ -159,7 +158,7 @@ def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, Tra
 
 
 def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
-    """Build the tracks; one that is driven both ways counts as two."""
+    """Build the tracks; one driven in both directions counts as two."""
     ways = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}
     courses = []
     for name, config in tracks.items():
@@ -181,7 +180,7 @@ def _conditions(key: str, option: str | None, experiment: Experiment) -> Randomi
 
 
 def _starts(config: EvaluationConfig, closed: bool, condition: str) -> NDArray[np.float64]:
-    """Return where the laps of each trial begin, (trials,)."""
+    """Return the start of each trial as a share of the lap, (trials,)."""
     at = np.arange(config.trials)
     if not closed:
         return np.zeros(config.trials)

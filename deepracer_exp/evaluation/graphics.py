@@ -1,4 +1,4 @@
-"""Chooses how pictures are drawn without a screen; to be called before MuJoCo is imported."""
+"""Choose MuJoCo's offscreen renderer; to be called before MuJoCo is imported."""
 
 import ctypes.util
 import os
@@ -8,10 +8,10 @@ from deepracer_exp.errors import BadInput
 
 
 def choose_graphics() -> None:
-    """Set MUJOCO_GL to what this machine has, unless it is set already.
+    """Set MUJOCO_GL to a library this machine has, unless it is set already.
 
     Raises:
-        BadInput: the machine has no library to draw with.
+        BadInput: the machine has no such library.
     """
     if os.environ.get("MUJOCO_GL") or sys.platform != "linux":
         return

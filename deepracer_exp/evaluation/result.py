@@ -1,4 +1,4 @@
-"""What an evaluation found: the laps tried on each track and each condition, and what they come to."""
+"""Results of an evaluation: the attempted laps by track and condition, with their statistics."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -6,9 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import bootstrap
 
-from .stewards import Attempt
+from .race_protocol import Attempt
 
 Metric = Literal["progress", "lap_time", "race_score"]
 Rank = tuple[float, float]
@@ -23,53 +22,53 @@ _RESAMPLES = 9999
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Trials that belong together: those on one track and condition, or several such groups in one.
+    """Trials on one track under one condition, or several such groups combined.
 
-    A lap that the end of the race cut off says nothing about the driver, so that it is left out, unless a trial has
+    A lap interrupted by the end of the race says nothing about the policy and does not count, unless its trial has
     no other.
     """
 
     track: str
     condition: str
     trials: tuple[int, ...]
-    """Their rows in the batch."""
+    """Rows of the batch."""
     attempts: tuple[Attempt, ...]
 
     @property
     def decided(self) -> list[Attempt]:
-        """Return the laps that count."""
+        """The laps that count."""
         has = {attempt.trial for attempt in self.attempts if not attempt.cut_off}
         return [a for a in self.attempts if not a.cut_off or a.trial not in has]
 
     @property
     def lap_times_s(self) -> NDArray[np.float64]:
-        """Return the times of the complete laps, penalties included."""
+        """Times of the complete laps, including penalties."""
         return np.array([attempt.time_s for attempt in self.attempts if attempt.complete])
 
     @property
     def completion(self) -> float:
-        """Return the share of the lap driven per lap tried, per cent, mean."""
+        """Mean progress of the attempted laps in per cent."""
         return float(np.mean([attempt.progress for attempt in self.decided]))
 
     @property
     def lap_share(self) -> float:
-        """Return the complete laps per lap tried."""
+        """Complete laps per attempted lap."""
         return len(self.lap_times_s) / len(self.decided)
 
     @property
     def mean_lap_time_s(self) -> float | None:
-        """Return the mean time of the complete laps, None without one."""
+        """Mean time of the complete laps, None without one."""
         times = self.lap_times_s
         return float(times.mean()) if len(times) else None
 
     @property
     def race_score_s(self) -> float | None:
-        """Return the seconds per complete lap, penalties and failed laps included; None without a complete lap."""
+        """Seconds per complete lap, including penalties and failed laps; None without a complete lap."""
         laps = len(self.lap_times_s)
         return sum(attempt.time_s for attempt in self.decided) / laps if laps else None
 
     def rank(self, metric: Metric) -> Rank:
-        """Return how good the policy is; without a complete lap times fall back to the progress."""
+        """Return the policy's rank by a metric; without a complete lap, times fall back to progress."""
         if metric == "progress":
             mean = self.mean_lap_time_s
             return self.completion, 0.0 if mean is None else 1 / mean
@@ -77,9 +76,9 @@ class Group:
         return (0.0, self.completion) if score is None else (1.0, -score)
 
     def statistics(self) -> dict[str, Any]:
-        """Return means and what else is reported, each mean with its bootstrap interval; JSON types.
+        """Return the reported statistics, each mean with its bootstrap interval; JSON types.
 
-        Trials are drawn anew, not laps: the laps of a trial are no independent findings.
+        Trials are resampled, not laps: the laps of a trial are not independent.
         """
         times = self.lap_times_s
         decided = self.decided
@@ -113,38 +112,38 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What one policy did."""
+    """Results of one policy."""
 
     groups: tuple[Group, ...]
     """One for each track and condition, track by track."""
 
     @property
     def tracks(self) -> list[str]:
-        """Return the names of the tracks."""
+        """Names of the tracks."""
         return list(dict.fromkeys(group.track for group in self.groups))
 
     @property
     def conditions(self) -> list[str]:
-        """Return the names of the conditions."""
+        """Names of the conditions."""
         return list(dict.fromkeys(group.condition for group in self.groups))
 
     def on(self, condition: str) -> Group:
-        """Return the trials of a condition on all tracks."""
+        """Return a condition's trials on all tracks."""
         groups = [group for group in self.groups if group.condition == condition]
         return _together(groups, "all tracks", condition)
 
     @property
     def race_score_s(self) -> float | None:
-        """Return the race score on all conditions together, mean over tracks; None without a lap on each track."""
+        """Race score on all conditions together, mean over tracks; None without a lap on every track."""
         tracks_with_lap, negative_s = self.rank("race_score")
         return -negative_s if tracks_with_lap == 1.0 else None
 
     def rank(self, metric: Metric) -> Rank:
-        """Return how good the policy is on all conditions together.
+        """Return the policy's rank by a metric on all conditions together.
 
-        A few laps on the usual conditions alone do not tell a policy that completes 19 of 20 from one that completes
-        all; the held-out ones do. On several tracks times are means over tracks, and one more track with a complete
-        lap is worth more than any time: lap times of tracks of different lengths could not be compared otherwise.
+        A few laps on the usual conditions cannot distinguish a policy that completes 19 of 20 laps from one that
+        completes all, so held-out laps count too. On several tracks, times are means over tracks, and one more track
+        with a complete lap outranks any time, because lap times of different tracks do not compare.
         """
         by_track = [[group for group in self.groups if group.track == track] for track in self.tracks]
         ranks = [
@@ -182,11 +181,11 @@ def _together(groups: Sequence[Group], track: str, condition: str) -> Group:
 
 
 def _mean(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the mean over all trials' values, and its interval if there are two trials that have any.
+    """Return the mean over all trials' values, and its interval if at least two trials have values.
 
     Args:
         sums: of each trial's values, (n,).
-        counts: how many values these are, (n,).
+        counts: number of these values, (n,).
     """
     has = counts > 0
     sums, counts = sums[has], counts[has]
@@ -198,6 +197,8 @@ def _mean(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> dict[str, A
 def _interval(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> Interval | None:
     if len(sums) < 2:
         return None
+    from scipy.stats import bootstrap  # takes a second, and a training needs it only when it evaluates
+
     found = bootstrap(
         (sums, counts),
         lambda s, c, axis: s.sum(axis=axis) / c.sum(axis=axis),
@@ -205,7 +206,7 @@ def _interval(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> Interva
         vectorized=True,
         n_resamples=_RESAMPLES,
         confidence_level=CONFIDENCE,
-        # The corrected methods have no answer where all trials are alike.
+        # The bias-corrected methods fail if all trials are alike.
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval

@@ -1,4 +1,4 @@
-"""Another reward function on recorded steps: what it would have paid, and how laps and places would have ranked."""
+"""Apply another reward function to recorded steps and compare the rewards of steps, laps and waypoints."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,50 +10,51 @@ from scipy.stats import spearmanr
 
 from deepracer_exp.analysis.log_course import find_courses
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.compose import compose_experiment, validate
-from deepracer_exp.env.params import rows, scalar_params, select
-from deepracer_exp.env.reward import RewardFailed, RewardFunction
-from deepracer_exp.env.reward_guard import Guard, Misconduct
-from deepracer_exp.env.reward_source import RewardSource, named_reward_source
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import LogProblem, Recording
-from deepracer_exp.formats.run_files import read_config
+from deepracer_exp.rewards.guard import Guard, Misconduct
+from deepracer_exp.rewards.params import rows, scalar_params, select
+from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
+from deepracer_exp.rewards.source import RewardSource, named_reward_source
+from deepracer_exp.runs.files import CONFIG, read_config
 from deepracer_exp.tracks.track import Track
 
 from .recorded_params import Ids, RecordedParams
 
 TIME_LIMIT_S = 5.0
-"""Seconds of CPU of one call; the trainings' own default."""
+"""CPU seconds of one call; the default of trainings."""
 UNPAID = ("prepare", "pause", "park")
-"""Statuses at which the service pays nothing and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
+"""Statuses at which the service gives no reward and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
 _AT_ONCE = 4096
-"""Rows whose params are rebuilt together, and which one call of `reward_batch` gets: a training's step has hundreds."""
+"""Rows whose params are rebuilt together and passed to one call of `reward_batch`; a training's step has hundreds."""
 _SPREAD = (0.02, 0.98)
-"""Quantiles of the waypoints' means that become 0 and 1: one bonus at the finish is not to flatten all else."""
+"""Quantiles of the waypoints' means that map to 0 and 1, so that a bonus at the finish does not flatten the rest."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReplayedRewards:
-    """What a recording would have been paid by another reward function."""
+    """Rewards of a recording under another reward function."""
 
     reward: str
     """Its name."""
     steps: pd.DataFrame
-    """The recording's steps and `new_reward`; NaN where its params could not be told."""
+    """The recording's steps and `new_reward`; NaN where the params could not be rebuilt."""
     episodes: pd.DataFrame
-    """One row an episode: stream, worker, iteration (of its last row), episode, track, time_s, progress, complete
-    (a whole lap, recorded from its start), and the sums reward and new_reward (NaN where a row's is)."""
+    """One row per episode: stream, worker, iteration (of its last row), episode, track, time_s, progress, complete
+    (a whole lap, recorded from its start), and the sums reward and new_reward (NaN if a row's is)."""
     laps: pd.DataFrame
-    """The complete ones of these, the new reward's favourites first, with rank, new_rank (1: the highest reward of
-    the track's laps) and time_rank (1: the fastest); equals share the better rank."""
+    """The complete episodes, highest new reward first, with rank, new_rank (1: the highest reward of the track's laps)
+    and time_rank (1: the fastest); ties share the better rank."""
     correlations: pd.DataFrame
-    """One row a track with three laps or more: track, laps, and Spearman's rank correlations old_new, old_time and
-    new_time, NaN where all values are equal. A reward that prefers fast laps has -1 with time."""
+    """One row per track with at least three laps: track, laps, and Spearman's rank correlations old_new, old_time and
+    new_time, NaN if all values are equal. A reward that prefers fast laps correlates with time at -1."""
     waypoints: pd.DataFrame
-    """One row a track, direction (`reversed`) and closest waypoint: visits, means reward and new_reward, and these as
-    share and new_share: 0 and 1 are the 2nd and 98th percentile of the waypoints, what lies beyond is cut off."""
+    """One row per track, direction (`reversed`) and closest waypoint: visits, means reward and new_reward, and both as
+    share and new_share: 0 and 1 are the 2nd and 98th percentile of the waypoints, values beyond are clipped."""
     problems: tuple[LogProblem, ...]
-    """Rows without a new reward."""
+    """Why rows have no new reward."""
 
 
 def replay_reward(
@@ -62,21 +63,21 @@ def replay_reward(
     courses: Mapping[str, Track] | None = None,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> ReplayedRewards:
-    """Pay all steps of a recording by another reward function.
+    """Compute the reward of all steps of a recording by another reward function.
 
-    The params are those of the recorded poses (see `RecordedParams`). A module with `reward_batch` is called with many
-    steps at once; any other one step by step, episode after episode in the order of time, with one set of module
+    The params are rebuilt from the recorded poses (see `RecordedParams`). A module with `reward_batch` is called with
+    many steps at once; any other one step by step, episode by episode in the order of time, with one set of module
     globals for each stream and worker, as in a process of the service.
 
     Args:
-        recording: what was driven.
+        recording: of a training.
         reward: a name of the reward zoo or a Python file.
-        courses: of the names in `recording.steps.track`; None: found as for figures.
-        time_limit_s: seconds of CPU a call may take.
+        courses: by name in `recording.steps.track`; None: looked up as for figures.
+        time_limit_s: CPU seconds per call.
 
     Raises:
-        BadInput: there is no such function or it cannot be loaded; it raised, hung or paid no finite number: one line
-            with the episode and step; no course of the recording is known.
+        BadInput: the function is unknown or cannot be loaded; it raised, hung or returned no finite number, with the
+            episode and step; no course of the recording is known.
     """
     source = named_reward_source(reward)
     found = find_courses(recording) if courses is None else None
@@ -105,18 +106,18 @@ def replay_reward(
 
 
 def _car(recording: Recording) -> CarConfig:
-    """Return the car of a run of ours; the service's has the dimensions of the default one."""
+    """Return the car of our own run; the service's has the dimensions of the default one."""
     for file in recording.files:
-        if file.name == "config.yaml":
+        if file.name == CONFIG:
             try:
-                return validate(read_config(file.parent)).car
-            except BadInput:  # of another version; its cars had these dimensions, too
+                return parse_experiment(read_config(file.parent)).car
+            except BadInput:  # another version, whose cars had the same dimensions
                 break
     return compose_experiment([])[0].car
 
 
 def _order(steps: pd.DataFrame) -> Ids:
-    """Return the rows episode by episode, as they began in each stream and worker, each in the order of time."""
+    """Return the row indices sorted by stream, worker and episode, keeping the order of time."""
     stream = steps["stream"].astype("category").cat.codes.to_numpy()
     return np.lexsort((steps["episode"].to_numpy(), steps["worker"].to_numpy(), stream))
 
@@ -133,7 +134,7 @@ def _episode_numbers(ordered: pd.DataFrame) -> NDArray[np.int64]:
 def _pay(
     source: RewardSource, params: RecordedParams, ordered: pd.DataFrame, time_limit_s: float
 ) -> NDArray[np.float64]:
-    """Return what each row is paid; 0 where nothing is, NaN where its params are not known."""
+    """Return the reward of each row; 0 where the service gives none, NaN where its params are unknown."""
     paid = np.where(params.known, 0.0, np.nan)
     called = params.known & ~ordered["episode_status"].isin(UNPAID).to_numpy()
     stream = ordered["stream"].astype("category").cat.codes.to_numpy().astype(np.int64)
@@ -159,8 +160,8 @@ def _at_once(
     some: Ids,
 ) -> NDArray[np.float64]:
     try:
-        # A car a row: `reward_batch` does not tell cars from steps.
-        return function(columns, params.roads, which=params.which[some])
+        # One car per row: `reward_batch` does not distinguish cars from steps.
+        return function(columns, params.track_params, track_index=params.track_index[some])
     except RewardFailed as error:
         at = f"{len(some):,} steps at once" if error.car is None else _place(ordered, some[error.car])
         raise BadInput(f"{function.source.path}: reward_batch {error.what} ({at})") from error
@@ -174,12 +175,12 @@ def _one_by_one(
     some: Ids,
 ) -> NDArray[np.float64]:
     paid = np.empty(len(some))
-    roads = [params.roads[which] for which in params.which[some].tolist()]
+    track_params = [params.track_params[track_index] for track_index in params.track_index[some].tolist()]
     at = 0
     try:
         with Guard(function.time_limit_s) as guard:
             for at, row in enumerate(rows(select(columns, None))):
-                paid[at] = function.pay(scalar_params(row, *roads[at]))
+                paid[at] = function.pay(scalar_params(row, *track_params[at]))
                 guard.restart()
     except (RewardFailed, Misconduct) as error:
         what = error.what if isinstance(error, RewardFailed) else str(error)
@@ -231,8 +232,8 @@ def _correlations(laps: pd.DataFrame) -> pd.DataFrame:
         if len(own) >= 3:
             old, new, time_s = (own[name].to_numpy() for name in ("reward", "new_reward", "time_s"))
             pairs = {"old_new": (old, new), "old_time": (old, time_s), "new_time": (new, time_s)}
-            told = {name: _spearman(*pair) for name, pair in pairs.items()}
-            found.append({"track": track, "laps": len(own), **told})
+            correlations = {name: _spearman(*pair) for name, pair in pairs.items()}
+            found.append({"track": track, "laps": len(own), **correlations})
     return pd.DataFrame(found, columns=["track", "laps", "old_new", "old_time", "new_time"])
 
 
@@ -272,6 +273,6 @@ def _problems(
     if not left_out:
         return of_courses
     reason = (
-        f"{left_out:,} of {len(params.known):,} steps have no new reward: their course or place is not known"
+        f"{left_out:,} of {len(params.known):,} steps have no new reward: their course or position is unknown"
     )
     return (*of_courses, LogProblem(recording.name, None, reason))

@@ -1,8 +1,9 @@
-"""What each term of a reward function contributed at recorded steps."""
+"""The contribution of each term of a reward function at recorded steps."""
 
 import hashlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -12,23 +13,23 @@ import pandas as pd
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.params import rows, scalar_params, select
-from deepracer_exp.env.reward import RewardFunction, Unusable
-from deepracer_exp.env.reward_guard import CtrlC, Guard
-from deepracer_exp.env.reward_source import RewardSource
+from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import Recording
+from deepracer_exp.rewards.guard import CtrlC, Guard
+from deepracer_exp.rewards.params import rows, scalar_params, select
+from deepracer_exp.rewards.reward import RewardFunction, Unusable
+from deepracer_exp.rewards.source import RewardSource, is_of_zoo
 
 from .recorded_params import RecordedParams
 from .reward_replay import TIME_LIMIT_S, UNPAID
 
 MOST_STEPS = 20_000
-"""Steps beyond which only some episodes are asked about, at even distances over the training."""
+"""Number of steps above which only some episodes, evenly spaced over the training, are evaluated."""
 Terms = Callable[[dict[str, Any]], object]
 
 
 def recorded_source(recording: Recording) -> RewardSource | None:
-    """Return the reward function that a recording brings along; None: it brings none."""
+    """Return the reward function stored with a recording, or None."""
     text = recording.reward_source
     if text is None:
         return None
@@ -39,27 +40,27 @@ def recorded_source(recording: Recording) -> RewardSource | None:
 def reward_terms(
     view: LogView, source: RewardSource, most: int = MOST_STEPS, time_limit_s: float = TIME_LIMIT_S
 ) -> pd.DataFrame | None:
-    """Ask a reward module for the terms of its reward at the steps of a training.
+    """Compute the terms of a module's reward at the steps of a training.
 
-    A module names them in a function `terms(params)` that returns a dict of numbers, whose sum `reward_function` pays.
-    Whole episodes are asked about, in the order of time, with one set of module globals.
+    The module provides a function `terms(params)` that returns a dict of numbers whose sum is the reward.
+    Whole episodes are evaluated, in the order of time, with one set of module globals.
 
     Args:
         view: the training, on a known course.
         source: the module.
-        most: steps that are asked about; more by the rest of an episode.
-        time_limit_s: seconds of CPU a call may take.
+        most: approximate number of steps to evaluate.
+        time_limit_s: CPU seconds per call.
 
     Returns:
-        A row a step, labelled as in `view.steps`, a column a term, reward units; 0 where a step has no such term. None:
-        the module names no terms, or the course is not known.
+        One row per step, indexed as in `view.steps`, one column per term in reward units, 0 where a step lacks the
+        term. None: the module has no `terms`, or the course is unknown.
 
     Raises:
-        BadInput: the module cannot be run; `terms` raised, hung or returned something else, with episode and step.
+        BadInput: the module cannot be loaded; `terms` raised, hung or returned something else, with episode and step.
     """
     if view.course is None or not len(view.steps):
         return None
-    # Loading runs the module: one that defines no such function need not be run.
+    # Loading runs the module, which is unnecessary if it does not define `terms`.
     if "terms" not in compile(source.text, source.path, "exec", dont_inherit=True).co_names:
         return None
     function = RewardFunction(source, 1, time_limit_s, None, scalar=True)
@@ -70,36 +71,36 @@ def reward_terms(
     number = np.cumsum(np.diff(steps["episode"].to_numpy(np.int64), prepend=-1) != 0) - 1
     courses = {str(steps["track"].iloc[0]): view.course}
     params = RecordedParams(steps, number, courses, _car())
-    asked = np.flatnonzero(params.known & ~steps["episode_status"].isin(UNPAID).to_numpy())
-    if not len(asked):
+    evaluated = np.flatnonzero(params.known & ~steps["episode_status"].isin(UNPAID).to_numpy())
+    if not len(evaluated):
         return None
-    roads = [params.roads[which] for which in params.which[asked].tolist()]
+    track_params = [params.track_params[index] for index in params.track_index[evaluated].tolist()]
     found: list[dict[str, float]] = []
     try:
         with Guard(time_limit_s) as guard:
-            for row, road in zip(rows(select(params.columns(asked), None)), roads, strict=True):
+            for row, road in zip(rows(select(params.columns(evaluated), None)), track_params, strict=True):
                 found.append(_checked(terms, scalar_params(row, *road)))
                 guard.restart()
     except CtrlC:
         raise
-    except BaseException as error:  # noqa: BLE001 - raised again as what it means
+    except BaseException as error:  # noqa: BLE001 - raised again as BadInput
         what, cause = function.what_happened(error)
-        at = steps.iloc[asked[min(len(found), len(asked) - 1)]]
+        at = steps.iloc[evaluated[min(len(found), len(evaluated) - 1)]]
         place = f"episode {at['episode']}, step {at['steps']}"
         raise BadInput(f"{source.path}: terms {what} ({place})") from cause
-    return pd.DataFrame(found, index=steps.index[asked]).fillna(0.0)
+    return pd.DataFrame(found, index=steps.index[evaluated]).fillna(0.0)
 
 
 @cache
 def _car() -> CarConfig:
-    """Return the default car, whose wheels stand where the service's do."""
+    """Return the default car, whose wheel positions are the service's."""
     return compose_experiment([])[0].car
 
 
 def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
     answer = terms(params)
     if not isinstance(answer, dict) or not answer:
-        raise Unusable(f"returned {str(answer)[:40]!r}, no dict of numbers")
+        raise Unusable(f"returned {str(answer)[:40]!r}, not a dict of numbers")
     for name, value in answer.items():
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
             raise Unusable(f"returned {str(value)[:40]!r} for {name!r}; accepted are finite numbers")
@@ -107,9 +108,30 @@ def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
 
 
 def _some_episodes(steps: pd.DataFrame, most: int) -> pd.DataFrame:
-    """Return whole episodes with together about `most` steps, at even distances."""
+    """Return evenly spaced whole episodes with about `most` steps in total."""
     begin = np.flatnonzero(np.diff(steps["episode"].to_numpy(np.int64), prepend=-1) != 0)
     every = -(-len(steps) // most)
     chosen = np.arange(len(begin)) % every == every - 1 if len(begin) >= every else np.ones(len(begin), bool)
     lengths = np.diff(np.r_[begin, len(steps)])
     return steps[np.repeat(chosen, lengths)]
+
+
+def run_terms(view: LogView, just_trained: bool = False) -> tuple[LogView, pd.DataFrame | None]:
+    """Return a recorded training's view and its reward terms, if its function may be run.
+
+    A reward function is a program and a recording may come from anywhere, so only those of the reward zoo are run.
+
+    Args:
+        view: the training.
+        just_trained: the training in this process has run the function already.
+
+    Returns:
+        The view, with another problem if the terms could not be computed; the terms as from `reward_terms`.
+    """
+    source = recorded_source(view.recording)
+    if source is None or not (just_trained or is_of_zoo(source.text)):
+        return view, None
+    try:
+        return view, reward_terms(view, source)
+    except BadInput as error:
+        return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), None

@@ -1,20 +1,20 @@
-"""What AWS's console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
+"""The files that the AWS console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deepracer_exp.config.custom_files import TAKEN
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
-from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
-from deepracer_exp.formats.model_metadata import (
+from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
+from deepracer_exp.deepracer.model_metadata import (
     NEURAL_NETWORKS,
     Action,
     LidarConfig,
     ModelMetadata,
     model_metadata_text,
 )
+from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
+from deepracer_exp.errors import BadInput
 
 CONSOLE_ACTIONS = (2, 30)
 CONSOLE_STEERING_DEG = (-30.0, 30.0)
@@ -24,23 +24,22 @@ _VERSION = 5  # what deepracer-for-cloud writes: the newest physics
 
 @dataclass(frozen=True)
 class AwsFiles:
-    """The files by their names, and what a racer should know of them."""
+    """The files by name, and notes on them."""
 
     texts: dict[str, str]
     notes: tuple[str, ...]
-    """What had to be changed, and what the console would refuse; a line each."""
+    """Changed values and values the console would reject, one line each."""
 
 
 def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> AwsFiles:
-    """Put the files together.
+    """Return the files of an experiment.
 
-    Values that the console takes no higher or lower are brought into its range. The action space stays as it is, since
-    another one makes another car.
+    Values are clipped to the console's ranges. The action space is kept, because another one makes another car.
 
     Args:
-        experiment: what was trained.
+        experiment: of the run.
         actions: its action space.
-        reward: text of the reward function, its constants in place.
+        reward: text of the reward function, with its constants filled in.
     """
     metadata = metadata_of(actions)
     learning, changed = _hyperparameters(experiment)
@@ -55,10 +54,10 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> AwsF
 
 
 def write_aws_files(files: AwsFiles, folder: Path) -> None:
-    """Write the files into a folder, over those of the same names.
+    """Write the files into a folder, replacing those of the same names.
 
     Raises:
-        BadInput: the folder cannot be made or written.
+        BadInput: the folder cannot be created or written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +70,7 @@ def write_aws_files(files: AwsFiles, folder: Path) -> None:
 
 
 def metadata_of(actions: ActionSpace) -> ModelMetadata:
-    """Return an action space as a model's metadata; our policies have no camera, the service's default stands in."""
+    """Return an action space as model metadata, with the service's default camera, which our policies lack."""
     discrete = isinstance(actions, DiscreteActions)
     listed: tuple[Action, ...] = ()
     if isinstance(actions, DiscreteActions):
@@ -98,7 +97,7 @@ def _action_notes(metadata: ModelMetadata) -> list[str]:
     fewest, most = CONSOLE_ACTIONS
     if metadata.actions and not fewest <= len(metadata.actions) <= most:
         notes.append(
-            f"model_metadata.json: {len(metadata.actions)} actions; the AWS console takes {fewest} to {most}"
+            f"model_metadata.json: {len(metadata.actions)} actions; the AWS console accepts {fewest} to {most}"
         )
     for name, values, (low, high) in (
         ("steering_angle", [end.steering_deg for end in ends], CONSOLE_STEERING_DEG),
@@ -106,14 +105,14 @@ def _action_notes(metadata: ModelMetadata) -> list[str]:
     ):
         if min(values) < low or max(values) > high:
             notes.append(
-                f"model_metadata.json: {name} from {min(values):g} to {max(values):g}; the AWS console takes "
+                f"model_metadata.json: {name} from {min(values):g} to {max(values):g}; the AWS console accepts "
                 f"{low:g} to {high:g}"
             )
     return notes
 
 
 def hyperparameters_of(experiment: Experiment) -> Hyperparameters:
-    """Return the values an experiment has of the service's; the service's own where it has none."""
+    """Return an experiment's hyperparameters in the service's terms, with its defaults where ours has none."""
     own = {}
     for key, target in TAKEN.items():
         group, name = target.split(".")
@@ -127,7 +126,7 @@ def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]
     if experiment.algorithm.episodes_per_iteration is None:
         notes.append(
             f"hyperparameters.json: num_episodes_between_training={learning.num_episodes_between_training}, the "
-            f"service's own; {experiment.algorithm.frames_per_iteration} control steps decide here"
+            f"service's default; this run used {experiment.algorithm.frames_per_iteration} control steps per iteration"
         )
     for key in learning.beyond_console():
         value = getattr(learning, key)
@@ -136,5 +135,7 @@ def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]
         if key == "batch_size":
             nearest = 1 << (nearest.bit_length() - 1)  # a power of two
         learning = replace(learning, **{key: nearest})
-        notes.append(f"hyperparameters.json: {key}={nearest}, as near to {value:g} as the AWS console takes")
+        notes.append(
+            f"hyperparameters.json: {key}={nearest}, the nearest to {value:g} that the AWS console accepts"
+        )
     return learning, notes

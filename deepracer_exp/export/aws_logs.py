@@ -1,4 +1,4 @@
-"""The logs of a run as the service would have written them, for the tools that racers have."""
+"""Export the logs of a run as the service would have written them, for existing tools."""
 
 import itertools
 import json
@@ -13,11 +13,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
+from deepracer_exp.deepracer.model_metadata import model_metadata_text
+from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.hyperparameters import hyperparameters_text
-from deepracer_exp.formats.model_metadata import model_metadata_text
-from deepracer_exp.formats.recording import Recording
 
 from .aws_files import hyperparameters_of, metadata_of
 
@@ -46,32 +46,32 @@ _PLACES = {
 
 @dataclass(frozen=True)
 class AwsLogs:
-    """What was written."""
+    """Summary of the export."""
 
     rows: int
     episodes: int
     iterations: int
     notes: tuple[str, ...]
-    """What is not as in the run; a line each."""
+    """Differences from the run, one line each."""
 
 
 def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, layout: str) -> AwsLogs:
-    """Write the training of a run of ours in the folders of the console or of deepracer-for-cloud.
+    """Write the training of our own run in the layout of the console or of deepracer-for-cloud.
 
-    An iteration of the service has whole episodes, and always as many: tools tell the iteration from the episode's
-    number. So an episode belongs to the iteration of its last row, and the numbers leave gaps: iteration k has those
-    from k * n on, where n is the largest count of episodes in an iteration, which hyperparameters.json names as
-    num_episodes_between_training; the last episode of the first iteration has number n - 1. Of the evaluations, whose
-    means are all a run keeps, the metrics file has one item each.
+    The service's iterations consist of whole episodes, always equally many: tools derive the iteration from the
+    episode's number. So an episode belongs to the iteration of its last row, and the numbers have gaps: iteration k
+    starts at k * n, where n is the largest number of episodes in an iteration, num_episodes_between_training in
+    hyperparameters.json; the last episode of the first iteration has number n - 1. A run keeps only the means of its
+    evaluations, so the metrics file has one item for each.
 
     Args:
-        recording: the run, read by `read_own_recording`.
+        recording: of the run, from `read_own_recording`.
         experiment: its configuration.
         folder: new or empty.
         layout: `console` or `deepracer-for-cloud`.
 
     Raises:
-        BadInput: no episode was finished, or the folder is not empty or cannot be written.
+        BadInput: no episode is finished, or the folder is not empty or cannot be written.
     """
     numbered = _number(recording.steps)
     job = _job(recording.name)
@@ -84,7 +84,7 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     texts = {
         "model/model_metadata.json": head.metadata,
         "ip/hyperparameters.json": head.hyperparameters,
-        _PLACES[layout]["metrics"].format(job=job): _metrics_text(numbered, recording.evaluated),
+        _PLACES[layout]["metrics"].format(job=job): _metrics_text(numbered, recording.evaluations),
         f"logs/training/training-{job}-sagemaker.log": _trainer_log(head, numbered, recording.updates),
     }
     if recording.reward_source is not None:
@@ -116,18 +116,18 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
 
 @dataclass(frozen=True, kw_only=True)
 class _Numbered:
-    """The finished episodes in the service's order."""
+    """The finished episodes in the service's numbering."""
 
     rows: pd.DataFrame
-    """Their rows, episode by episode; `number` and `trace_iteration` are the service's."""
+    """Their rows by episode; `number` and `trace_iteration` are in the service's numbering."""
     episodes: pd.DataFrame
-    """One row each, in the same order: number, trial, iteration and what the metrics file tells."""
+    """One row each, in the same order: number, trial, iteration and the values of the metrics file."""
     per_iteration: int
     iterations: int
     first_iteration: int
-    """The run's iteration that is the first here: the first one in which an episode ended."""
+    """The run's iteration that becomes the first one: the first in which an episode ended."""
     left_out: int
-    """Rows of episodes that the end of the training cut off."""
+    """Rows of episodes interrupted by the end of the training."""
 
 
 def _number(steps: pd.DataFrame) -> _Numbered:
@@ -146,7 +146,7 @@ def _number(steps: pd.DataFrame) -> _Numbered:
     chosen = by_iteration[finished[by_iteration]]
     trial = pd.Series(iteration[chosen]).groupby(iteration[chosen]).cumcount().to_numpy() + 1
     per_iteration = int(trial.max())
-    # The tools take the largest number of iteration 0 for the length of all.
+    # Tools take the largest number in iteration 0 for the length of all iterations.
     trial[np.flatnonzero(iteration[chosen] == 0)[-1]] = per_iteration
     number = iteration[chosen].astype(np.int64) * per_iteration + trial - 1
     at = _spans(begin[chosen], counts[chosen])
@@ -208,17 +208,17 @@ class _Head:
 
 
 def _trainer_log(head: _Head, numbered: _Numbered, updates: pd.DataFrame) -> str:
-    """Return what the trainer would have told: the end of each episode, and of each update the mean of its epochs."""
+    """Return the trainer's log: the end of each episode, and the mean over the epochs of each update."""
     lines = [head.text().rstrip("\n"), _saved(0, 0)]
     driven = 0
     by_iteration = dict(iter(numbered.episodes.groupby("iteration", sort=False)))
-    told = {int(row["iteration"]) - numbered.first_iteration: row for row in updates.to_dict("records")}
-    for iteration in range(max([*by_iteration, *told]) + 1):
+    losses = {int(row["iteration"]) - numbered.first_iteration: row for row in updates.to_dict("records")}
+    for iteration in range(max([*by_iteration, *losses]) + 1):
         if iteration in by_iteration:
             for episode in by_iteration[iteration].itertuples():
                 driven += int(episode.steps)
                 lines.append(_episode_line(episode, driven, 0))
-        row = told.get(iteration)
+        row = losses.get(iteration)
         if row is not None:
             lines.append(
                 f"Policy training> Surrogate loss={row['policy_loss']}, KL divergence={row['kl']}, "
@@ -291,7 +291,7 @@ def _item(reward: float, begin_s: float, end_s: float, **more: Any) -> dict[str,
 
 
 def _write_trace(numbered: _Numbered, folder: Path, log: Path, head: str) -> None:
-    """Write one CSV an iteration, in full precision, and the same rows into the log, rounded as there."""
+    """Write one CSV per iteration, in full precision, and the same rows into the log, rounded as the service does."""
     folder.mkdir(parents=True, exist_ok=True)
     iteration_of = numbered.rows["trace_iteration"].to_numpy()
     bounds = np.searchsorted(iteration_of, np.arange(numbered.iterations + 1))
@@ -300,7 +300,7 @@ def _write_trace(numbered: _Numbered, folder: Path, log: Path, head: str) -> Non
         out.write(head)
         for iteration, (begin, end) in enumerate(itertools.pairwise(bounds)):
             if begin == end:
-                continue  # no episode ended in it; a file without rows is nothing tools expect
+                continue  # no episode ended in it, and tools do not expect a file without rows
             with (folder / f"{iteration}-iteration.csv").open("w", encoding="utf-8") as trace:
                 driven = _write_rows(numbered.rows.iloc[begin:end], trace, out, episodes, driven)
 
@@ -337,7 +337,7 @@ def _values(rows: pd.DataFrame) -> Iterator[tuple[Any, ...]]:
 
 
 def _actions(rows: pd.DataFrame) -> list[Any]:
-    """Return the number of each action, or what the service writes of a policy without numbers."""
+    """Return the number of each action, or [steering speed] for a continuous action space, as the service does."""
     action = rows["action"].to_numpy()
     if np.isnan(action).any():
         both = zip(rows["steer"].tolist(), rows["throttle"].tolist(), strict=True)
@@ -347,16 +347,18 @@ def _actions(rows: pd.DataFrame) -> list[Any]:
 
 def _notes(numbered: _Numbered, experiment: Experiment) -> tuple[str, ...]:
     notes = [
-        f"hyperparameters.json: num_episodes_between_training={numbered.per_iteration}, the most that ended in an "
-        "iteration; episode numbers leave gaps in the others"
+        f"hyperparameters.json: num_episodes_between_training={numbered.per_iteration}, the most that ended in one "
+        "iteration; episode numbers have gaps in the others"
     ]
     if numbered.left_out:
-        notes.append(f"{numbered.left_out:,} rows of episodes that had not ended are left out")
+        notes.append(f"{numbered.left_out:,} rows of unfinished episodes are left out")
     notes.append(
-        f"iterations count from 0, as the service's: its iteration 0 is the run's {numbered.first_iteration}"
+        f"iterations are counted from 0, as in the service: iteration 0 is the run's {numbered.first_iteration}"
         + ", the first in which an episode ended" * (numbered.first_iteration > 1)
     )
     if len(experiment.tracks) > 1:
         names = ", ".join(experiment.tracks)
-        notes.append(f"{names}: the service's trace has no column for the track; track_len tells them apart")
+        notes.append(
+            f"{names}: the service's trace has no column for the track; use track_len to distinguish them"
+        )
     return tuple(notes)

@@ -1,17 +1,18 @@
-"""The command that takes a trained policy, or what it was trained with, to other programs."""
+"""The command `export`: write a policy as ONNX, or a run's files or logs in the layouts of AWS."""
 
 from pathlib import Path
 
 import torch
 from rich.console import Console
 
-from deepracer_exp.config.export import ExportConfig
+from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
-from deepracer_exp.evaluation.run import StoredRun, read_run
-from deepracer_exp.formats.own_recording import read_own_recording
+from deepracer_exp.runs.files import REWARD
+from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.validation.console import console_findings
 
 from .aws_files import aws_files, write_aws_files
@@ -20,20 +21,20 @@ from .onnx_file import DeployedPolicy, write_onnx
 
 
 def export(config: ExportConfig, output: str | None, out: Console) -> Path:
-    """Write what is asked for and tell what was written.
+    """Export a run in the chosen format and print what was written.
 
     Args:
         config: validated.
-        output: file or folder to write; None: in the run's folder, under `export/`.
+        output: file or folder to write; None: `export/` in the run's folder.
         out: for the report.
 
     Raises:
         BadInput: the run, the checkpoint or the output cannot be used, or a package is missing.
-        RunFailed: the ONNX file computes something else than the network.
+        RunFailed: the ONNX file differs from the network.
     """
-    run = read_run(config.run, Path(config.runs_dir), config.tracking_uri)
+    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     if config.format == "onnx":
-        checkpoint = run.meant(config.checkpoint)
+        checkpoint = run.choose_checkpoint(config.checkpoint)
         return _onnx(run, checkpoint, Path(output or run.path / "export" / "policy.onnx"), out)
     if config.format == "aws-logs":
         return _aws_logs(run, Path(output or run.path / "export" / "aws-logs"), config.layout, out)
@@ -42,7 +43,7 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
 
 def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
     if path.is_dir():
-        raise BadInput(f"--output {path}: is a folder; a file is wanted, e.g. {path / 'policy.onnx'}")
+        raise BadInput(f"--output {path}: is a folder; give a file, e.g. {path / 'policy.onnx'}")
     stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
     actions = build_action_space(run.experiment.action_space)
     torch.set_num_threads(1)
@@ -79,7 +80,7 @@ def _aws_logs(run: StoredRun, folder: Path, layout: str, out: Console) -> Path:
 
 
 def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
-    source = run.path / "reward_function.py"
+    source = run.path / REWARD
     try:
         reward = source.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -93,5 +94,5 @@ def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
     for note in files.notes:
         out.print(f"  {note}", soft_wrap=True)
     for finding in console_findings(reward):
-        out.print(f"  reward_function.py: the AWS console would refuse it: {finding}", soft_wrap=True)
+        out.print(f"  reward_function.py: the AWS console would reject it: {finding}", soft_wrap=True)
     return folder

@@ -1,4 +1,4 @@
-"""A policy as an ONNX file: features of the observation in, what to drive out."""
+"""Export a policy as ONNX: observation features in, action probabilities and command out."""
 
 import contextlib
 import json
@@ -19,13 +19,13 @@ from deepracer_exp.errors import BadInput, RunFailed
 
 OBSERVATION, POLICY, COMMAND = "observation", "policy", "command"
 CHECKED = 1000
-"""Observations on which the file is compared with the network."""
+"""Number of observations on which the file is compared with the network."""
 TOLERANCE = 1e-4
-"""Largest difference that single precision in another order of sums explains, with room."""
+"""Largest accepted difference, with a margin over single-precision rounding."""
 
 
 class DeployedPolicy(nn.Module):
-    """What a car needs of an actor-critic: no value, no sampling.
+    """The deterministic policy of an actor-critic, without value network and sampling.
 
     `observation` (N, features) -> `policy`, the probabilities of the actions (N, n), of a continuous policy the mean
     of [steering, speed] clipped to -1..1 (N, 2); and `command` (N, 2), degrees (positive to the left) and metres per
@@ -33,7 +33,7 @@ class DeployedPolicy(nn.Module):
     """
 
     def __init__(self, networks: ActorCritic, actions: ActionSpace):
-        """Take the policy's layers over; `networks` must not learn on."""
+        """Share the layers of `networks`, which must not be trained further."""
         super().__init__()
         trunk = networks.trunk
         self.trunk = nn.Identity() if trunk is None else trunk.module
@@ -60,11 +60,11 @@ class DeployedPolicy(nn.Module):
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far the file is from the network."""
+    """Difference between the file and the network."""
 
     observations: int
     largest_difference: float
-    """Of any number of `policy`."""
+    """Of any element of `policy`."""
 
 
 def write_onnx(
@@ -74,17 +74,17 @@ def write_onnx(
 
     Args:
         model: the policy.
-        features: names of the numbers of an observation.
-        facts: what the file should tell of itself, JSON types; written as its metadata.
-        path: the file; written whole or not at all.
+        features: names of the observation's elements.
+        facts: metadata of the file, JSON types.
+        path: the file, written atomically.
 
     Raises:
-        BadInput: the packages for it are not installed, or the file cannot be written.
-        RunFailed: the file computes something else than the network.
+        BadInput: the required packages are not installed, or the file cannot be written.
+        RunFailed: the file differs from the network.
     """
     try:
         import onnx
-        import onnxruntime  # noqa: F401 - looked for before the work
+        import onnxruntime  # noqa: F401 - checked before the work
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise BadInput(
@@ -116,7 +116,7 @@ def write_onnx(
 
 
 def compare(model: DeployedPolicy, content: bytes, n_features: int) -> Comparison:
-    """Run file and network on the same observations, standard normal ones: the features are of that size."""
+    """Compare file and network on standard normal observations, the typical scale of the features."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -130,14 +130,14 @@ def compare(model: DeployedPolicy, content: bytes, n_features: int) -> Compariso
 
 
 def _program(model: DeployedPolicy, n_features: int) -> Any:
-    """Return the ONNX model; the exporter's own talk is left out."""
+    """Return the ONNX model, with the exporter's own messages silenced."""
     quiet = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     before = [logger.level for logger in quiet]
     for logger in quiet:
         logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the libraries among themselves
+            warnings.simplefilter("ignore")  # between the libraries
             program = torch.onnx.export(
                 model,
                 (torch.zeros(2, n_features),),

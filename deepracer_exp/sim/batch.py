@@ -21,7 +21,7 @@ _SETTLE_PERIODS = 60
 
 
 class CarState(NamedTuple):
-    """Where the cars are and how they move: float64 arrays of shape (N,), copies of the physics' state."""
+    """Pose and motion of the cars: float64 arrays of shape (N,), copies of the physics state."""
 
     x_m: Floats
     """Chassis origin, world frame."""
@@ -36,7 +36,7 @@ class CarState(NamedTuple):
 
 
 class CarBatch:
-    """N cars, each alone on its own endless floor, advanced by one control period at a time.
+    """N cars, each on its own infinite floor, advanced by one control period at a time.
 
     The result is bit-identical whatever the number of threads and however the cars are split into batches.
 
@@ -60,14 +60,14 @@ class CarBatch:
         self._rest_row, self._rest_qpos = self._settle()
         self._tyre_friction = np.full(n_cars, car.tyre_friction)
         self._floor_friction = np.broadcast_to(np.asarray(floor_friction, np.float64), n_cars).copy()
-        # Along and across the wheel; the rest would be spinning and rolling friction. One floor for all cars is the
-        # model's own.
+        # Along and across the wheel; the other entries are spinning and rolling friction. With one floor for all cars,
+        # it is set in the model.
         self.model.pair_friction[self._contacts, :2] = car.tyre_friction * self._floor_friction[0]
         self._batch = mujoco.batch.Batch(self.model, n_cars, threads or len(os.sched_getaffinity(0)))
         self._rows: Floats = self._batch.state
         self._qpos: Floats = self._batch.bind("qpos")
         self._qvel: Floats = self._batch.bind("qvel")
-        # Position and velocity lie side by side in a row, after the time.
+        # Position and velocity are adjacent in a row, after the time.
         self._moving: Floats = self._rows[:, 1 : 1 + self.model.nq + self.model.nv]
         self._ctrl: Floats = self._batch.bind("ctrl")
         self._max_steering_rad = np.deg2rad(car.max_steering_deg)
@@ -76,11 +76,11 @@ class CarBatch:
             self._apply_friction(np.arange(n_cars))
 
     def place(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
-        """Put cars at rest on their wheels, steering straight, with no memory of what they did before.
+        """Put cars at rest on their wheels, steering straight, with a fresh physics state.
 
         Args:
-            ids: distinct car numbers, (n,).
-            x_m: where the chassis origin goes, (n,) or one for all.
+            ids: distinct indices of cars, (n,).
+            x_m: position of the chassis origin, (n,) or one for all.
             y_m: likewise.
             yaw_rad: heading, likewise.
         """
@@ -91,7 +91,7 @@ class CarBatch:
         self._rows[rows] = self._rest_row
         self._qpos[rows, 0] = x_m
         self._qpos[rows, 1] = y_m
-        # The heading's turn about the vertical, after the slight pitch in which the car came to rest.
+        # The turn about the vertical, applied to the slight pitch in which the car came to rest.
         self._qpos[rows, 3] = cos * w - sin * z
         self._qpos[rows, 4] = cos * x - sin * y
         self._qpos[rows, 5] = cos * y + sin * x
@@ -101,7 +101,7 @@ class CarBatch:
         """Put cars elsewhere in motion; height, pitch, wheel turns and steering angles stay as they are.
 
         Args:
-            ids: distinct car numbers, (n,).
+            ids: distinct indices of cars, (n,).
             pose: x_m, y_m, yaw_rad of the chassis origin, (n, 3).
             motion: speed_mps, lateral_mps, yaw_rate_radps as in `CarState`, (n, 3).
         """
@@ -119,19 +119,19 @@ class CarBatch:
 
     @property
     def steering_rad(self) -> Floats:
-        """The angle at which the front wheels stand, (N,): a copy, left positive."""
+        """Steering angle of the front wheels, (N,): a copy, positive to the left."""
         angle: Floats = self._qpos[:, self._steer_qpos].mean(axis=1)
         return angle
 
     def lift(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
-        """Put cars at rest as `place` does, but with their front wheels and servos as they are."""
+        """Put cars at rest as `place` does, but keep the state of their front wheels and servos."""
         rows = np.asarray(ids, np.intp)[:, None]
         angles, targets = self._qpos[rows, self._steer_qpos], self._ctrl[rows, self._servos]
         self.place(ids, x_m, y_m, yaw_rad)
         self._qpos[rows, self._steer_qpos], self._ctrl[rows, self._servos] = angles, targets
 
     def steer(self, ids: ArrayLike, angle_rad: ArrayLike) -> None:
-        """Turn cars' front wheels to an angle at once, (n,); the servos go on from there."""
+        """Turn cars' front wheels to an angle at once, (n,); the servos continue from there."""
         rows = np.asarray(ids, np.intp)
         angle = np.broadcast_to(np.asarray(angle_rad, np.float64), rows.shape)
         self._qpos[rows[:, None], self._steer_qpos] = angle[:, None]
@@ -144,14 +144,14 @@ class CarBatch:
         Args:
             speed_mps: wanted speeds, (N,).
             steering_rad: wanted steering angles, positive to the left, (N,).
-            moving: False for cars that are held at their place, wheels straight, whatever the command, (N,).
+            moving: False for cars whose command is ignored: speed zero, wheels straight, (N,).
 
         Raises:
-            RunFailed: a command or a car's state is not finite, or MuJoCo gave up on a car; the message
-                names the first such car. `state` still holds what it was then.
+            RunFailed: a command or a car's state is not finite, or MuJoCo reports an error; the message
+                names the first such car. `state` keeps the state of that moment.
         """
         speed, steering = np.asarray(speed_mps, np.float64), np.asarray(steering_rad, np.float64)
-        # MuJoCo would replace such a control by zero, and with it all controls of that car.
+        # MuJoCo would replace all controls of that car by zero.
         _require_finite("command", np.isfinite(np.stack([speed, steering], axis=-1)))
         speed = np.clip(speed, self.car.min_speed_mps, self.car.max_speed_mps)
         steering = np.clip(steering, -self._max_steering_rad, self._max_steering_rad)
@@ -172,7 +172,7 @@ class CarBatch:
         if not self.car.ackermann:
             return steering[:, None]
         tangent = np.tan(steering)[:, None]
-        # The centre of the turn lies on the rear axle, wheelbase / tangent to the left of the middle.
+        # The centre of the turn is on the line of the rear axle, wheelbase / tangent to the left of its middle.
         length, left = self.car.wheelbase_m, self.car.front_wheel_y_m * np.array([1.0, -1.0])
         angles: Floats = np.arctan(length * tangent / (length - left * tangent))
         return angles
@@ -197,7 +197,7 @@ class CarBatch:
     def state(self) -> Floats:
         """A copy of the full integration state, (N, nstate); parameters set per car are not part of it.
 
-        Assigning a copy makes the cars go on exactly as from where it was taken.
+        After assigning a copy, the cars continue exactly as from the moment it was taken.
         """
         return self._rows.copy()
 
@@ -208,13 +208,13 @@ class CarBatch:
         self._rows[:] = rows
 
     def set_tyre_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
-        """Give cars their own tyre friction coefficient, (n,), before the floor's factor."""
+        """Set the tyre friction coefficient of cars, (n,), without the floor's factor."""
         rows = np.asarray(ids, np.intp)
         self._tyre_friction[rows] = values
         self._apply_friction(rows)
 
     def set_floor_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
-        """Put cars on floors with these factors on the tyre friction, (n,)."""
+        """Set the floor's factor on the tyre friction of cars, (n,)."""
         rows = np.asarray(ids, np.intp)
         if (self._floor_friction[rows] != values).any():
             self._floor_friction[rows] = values
@@ -243,7 +243,7 @@ class CarBatch:
         The damping stays, so that the steering's time constant is divided by scale.
         """
         self._scale("actuator_gainprm", ids, self._servos, scale)
-        # An affine bias is (constant, per angle, per speed): the gain stands a second time in the middle.
+        # An affine bias is (constant, per angle, per speed): the gain appears again as its second entry.
         self._scale("actuator_biasprm", ids, self._servos, scale, column=1)
 
     def _scale(
@@ -263,12 +263,12 @@ class CarBatch:
         pose = data.qpos.copy()
         if not np.isfinite(pose).all():
             raise ValueError("its physics state is not finite at rest")
-        # Height and pitch are what settling finds; the rest is zero up to rounding.
+        # Settling determines height and pitch; the rest is zero up to rounding.
         pose[:2] = 0.0
         pose[4] = pose[6] = 0.0
         pose[3:7] /= np.linalg.norm(pose[3:7])
         pose[7:] = 0.0
-        # A car that was told straight for long stands at its trim.
+        # A car that steers straight for long has its wheels at the trim.
         pose[self._steer_qpos] = self._trim_rad
         mujoco.mj_resetData(self.model, data)
         data.qpos[:] = pose

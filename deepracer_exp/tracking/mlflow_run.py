@@ -6,30 +6,11 @@ timestamp and value, and parameters, tags, files and the end status are the same
 request of a killed process that a slow server handles late does no harm either.
 """
 
-import logging
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
-
-from .names import BEST, END_TAG, EXPERIMENT_TAGS, PARENT, best_metrics
-from .notes import NOTE, OURS, experiment_note, result_note
-from .points import Point, points_at
-from .registry import pages
-from .store import Store
-from .tracking_file import Told
-
-# MLflow reads these at each call and offers no parameter. Its own 7 retries would hold the queue for
-# minutes after a server is back, and a request may hang for its whole 120 s: the recorder retries itself.
-os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
-# It would print the address of each run that ends, with its password.
-os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
-# Nobody else's business, and a machine without network would try for the whole run.
-os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag, ViewType
@@ -39,58 +20,17 @@ from mlflow.utils.validation import (
     MAX_PARAMS_TAGS_PER_BATCH,
     MAX_TAG_VAL_LENGTH,
 )
-from sqlalchemy.exc import SQLAlchemyError
 
-# Creating the tables is told in INFO lines, and a busy store in a traceback a try, both into the middle
-# of the live view. Each failure is raised as well, and the recorder reports it, once and redacted.
-for _name in ("mlflow", "alembic"):
-    logging.getLogger(_name).setLevel(logging.CRITICAL)
+from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, OURS, PARENT, experiment_note, result_note
+from .metrics import BEST, Point, best_metrics, points_at
+from .store import Store, StoreRefusedError, client_of, pages, silence_mlflow, store_errors
+from .tracking_file import TrackedRun
 
-_USER, _PASSWORD = "MLFLOW_TRACKING_USERNAME", "MLFLOW_TRACKING_PASSWORD"
-_GIVEN = {name: os.environ.get(name) for name in (_USER, _PASSWORD)}
-
-_WORTH_RETRYING = (408, 425, 429)
-
-
-class StoreUnavailableError(Exception):
-    """The store did not answer, or not as it should: try again."""
-
-
-class StoreRefusedError(Exception):
-    """The store understood and refused, or the file is gone: trying again changes nothing."""
-
-
-@contextmanager
-def _told_apart() -> Iterator[None]:
-    try:
-        yield
-    except MlflowException as error:
-        status = error.get_http_status_code()
-        if 400 <= status < 500 and status not in _WORTH_RETRYING:
-            raise StoreRefusedError(str(error)) from error
-        raise StoreUnavailableError(str(error)) from error
-    except FileNotFoundError as error:
-        raise StoreRefusedError(str(error)) from error
-    except (OSError, SQLAlchemyError) as error:
-        raise StoreUnavailableError(str(error)) from error
-
-
-def client_of(store: Store) -> MlflowClient:
-    """Return a client of a store; user and password are those of the store that a client was made for last.
-
-    MLflow reads both from the environment at each request. In the address they would stand in all its messages.
-    """
-    for name, own in ((_USER, store.user), (_PASSWORD, store.password)):
-        if (value := own or _GIVEN[name]) is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
-    # The registry of models could be elsewhere (MLFLOW_REGISTRY_URI), its runs could not.
-    return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
+silence_mlflow()
 
 
 class MLflowRun:
-    """A run and the calls that fill it.
+    """A run in a store and the calls that record it.
 
     Every method raises StoreUnavailableError or StoreRefusedError.
     """
@@ -106,80 +46,80 @@ class MLflowRun:
 
     @property
     def contradicted(self) -> int:
-        """Number of points that the store had with another value, which stays."""
+        """Number of points that the store already had with another value, which is kept."""
         return len(self._contradicted)
 
     def connect(self) -> None:
-        """Open the store, and make it if it does not exist."""
-        with _told_apart(), self._store.creation_lock():
+        """Open the store, creating it if necessary."""
+        with store_errors(), self._store.creation_lock():
             if (file := self._store.sqlite_file) is not None and not file.exists():
                 _create_whole(file)
             self._client = client_of(self._store)
 
-    def create(self, told: Told, *, again: bool) -> None:
-        """Create the run; with `again`, look first whether an earlier try created it unheard."""
-        tags = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in told.tags.items()}
-        with _told_apart():
-            experiment_id = self._experiment_id(told.experiment)
+    def create(self, tracked: TrackedRun, *, again: bool) -> None:
+        """Create the run; with `again`, first look whether an earlier attempt created it without an answer."""
+        tags = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tracked.tags.items()}
+        with store_errors():
+            experiment_id = self._experiment_id(tracked.experiment)
             if again:
-                self.run_id = self._find(experiment_id, told)
+                self.run_id = self._find(experiment_id, tracked)
             if self.run_id is None:
-                run = self._client.create_run(experiment_id, told.start_ms, tags, told.run_name)
+                run = self._client.create_run(experiment_id, tracked.start_ms, tags, tracked.run_name)
                 self.run_id = run.info.run_id
 
-    def create_once(self, told: Told, mark: Sequence[str]) -> None:
-        """Create a run, or go on with the oldest one in its experiment that has the same values of some tags.
+    def create_once(self, tracked: TrackedRun, mark: Sequence[str]) -> None:
+        """Create a run, or reopen the oldest one in its experiment that has the same values of some tags.
 
-        Of two processes that create it at once one sees the other's, goes on with that and deletes its own; MLflow has
+        Of two processes that create it at once, one sees the other's, continues that and deletes its own; MLflow has
         no way to be sure of it, so that rarely there may be two.
 
         Args:
-            told: of the run.
-            mark: the tags by which it is known.
+            tracked: of the run.
+            mark: tags that identify it.
         """
-        sought = {key: told.tags[key] for key in mark}
-        with _told_apart():
-            oldest = self._oldest(self._experiment_id(told.experiment), sought)
+        sought = {key: tracked.tags[key] for key in mark}
+        with store_errors():
+            oldest = self._oldest(self._experiment_id(tracked.experiment), sought)
         if oldest is None:
-            self.create(told, again=False)
-            with _told_apart():
-                oldest = self._oldest(self._experiment_id(told.experiment), sought)
+            self.create(tracked, again=False)
+            with store_errors():
+                oldest = self._oldest(self._experiment_id(tracked.experiment), sought)
                 if oldest in (None, self.run_id):
                     return
                 self._client.delete_run(self.run_id)
-        self.reopen(replace(told, run_id=oldest))
+        self.reopen(replace(tracked, run_id=oldest))
 
-    def reopen(self, told: Told) -> None:
-        """Go on with a run that another process recorded, whether or not MLflow has it already.
+    def reopen(self, tracked: TrackedRun) -> None:
+        """Continue a run that another process recorded, whether or not MLflow has it already.
 
-        From here on parameters and points that the store has are not written again.
+        Parameters and points that the store already has are not written again.
         """
-        self.run_id = told.run_id
+        self.run_id = tracked.run_id
         if self.run_id is None:
-            self.create(told, again=True)
-        with _told_apart():
+            self.create(tracked, again=True)
+        with store_errors():
             run = self._client.get_run(self.run_id)
             if run.info.lifecycle_stage != "active":
                 raise StoreRefusedError(f"run {self.run_id} was deleted in MLflow; restore it there")
             self._client.update_run(self.run_id, status="RUNNING")
-            if END_TAG in run.data.tags and END_TAG not in told.tags:
+            if END_TAG in run.data.tags and END_TAG not in tracked.tags:
                 self._client.delete_tag(self.run_id, END_TAG)
         self._params = run.data.params
         self._goes_on = True
         self._there = {}
-        # Those of MLflow's own, such as the description, may have been edited in the UI.
-        self.set_tags({key: value for key, value in told.tags.items() if not key.startswith("mlflow.")})
+        # MLflow's own tags, such as the description, may have been edited in the UI.
+        self.set_tags({key: value for key, value in tracked.tags.items() if not key.startswith("mlflow.")})
 
     def log_params(self, params: Mapping[str, str]) -> None:
         """Write the parameters."""
         rest = iter((key, value) for key, value in params.items() if key not in self._params)
-        with _told_apart():
+        with store_errors():
             while chunk := [Param(key, value) for key, value in islice(rest, MAX_PARAMS_TAGS_PER_BATCH)]:
                 self._client.log_batch(self.run_id, params=chunk)
 
     def log_metrics(self, points: Sequence[Point]) -> int:
-        """Write points, of a reopened run those that are missing; return how many."""
-        with _told_apart():
+        """Write points, for a reopened run only the missing ones, and return their number."""
+        with store_errors():
             missing = [point for point in points if not self._has(point)] if self._goes_on else points
             for start in range(0, len(missing), MAX_METRICS_PER_BATCH):
                 chunk = [Metric(*point) for point in missing[start : start + MAX_METRICS_PER_BATCH]]
@@ -189,21 +129,21 @@ class MLflowRun:
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Write tags."""
         rest = iter(tags.items())
-        with _told_apart():
+        with store_errors():
             while some := list(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
                 chunk = [RunTag(key, value[:MAX_TAG_VAL_LENGTH]) for key, value in some]
                 self._client.log_batch(self.run_id, tags=chunk)
 
     def set_experiment_tags(self, tags: Mapping[str, str]) -> None:
-        """Write tags of the experiment that the run is in."""
-        with _told_apart():
+        """Write tags of the run's experiment."""
+        with store_errors():
             experiment_id = self._client.get_run(self.run_id).info.experiment_id
             for key, value in tags.items():
                 self._client.set_experiment_tag(experiment_id, key, value)
 
     def adopt(self, tags: Mapping[str, str], but: str) -> None:
-        """Put the runs of its experiment that have these tags, and not the tag `but`, below this one."""
-        with _told_apart():
+        """Nest the runs of its experiment that have these tags, and not the tag `but`, under this one."""
+        with store_errors():
             experiment_id = self._client.get_run(self.run_id).info.experiment_id
             for run in pages(
                 self._client.search_runs, experiment_ids=[experiment_id], filter_string=_with(tags)
@@ -211,20 +151,20 @@ class MLflowRun:
                 if but not in run.data.tags and PARENT not in run.data.tags:
                     self._client.set_tag(run.info.run_id, PARENT, self.run_id)
 
-    def conclude(self, told: Told, summary: Mapping[str, Any]) -> None:
-        """Record what came of the run: its best checkpoint, in its description and in that of its experiment.
+    def conclude(self, tracked: TrackedRun, summary: Mapping[str, Any]) -> None:
+        """Record the best checkpoint, in the metrics and the descriptions of the run and of its experiment.
 
-        A description that somebody has edited stays as it is.
+        An edited description is kept.
         """
         if best := summary.get("best"):
             self.log_metrics(
-                points_at(best_metrics(summary), best["env_steps"], told.end_ms or told.start_ms)
+                points_at(best_metrics(summary), best["env_steps"], tracked.end_ms or tracked.start_ms)
             )
-        with _told_apart():
+        with store_errors():
             run = self._client.get_run(self.run_id)
-            begun, now = told.tags.get(NOTE, ""), run.data.tags.get(NOTE, "")
+            begun, now = tracked.tags.get(NOTE, ""), run.data.tags.get(NOTE, "")
             if now.endswith(begun):
-                note = result_note(summary, run.info.run_id, told.files)
+                note = result_note(summary, run.info.run_id, tracked.files)
                 self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
             self._describe_experiment(run.info.experiment_id)
 
@@ -241,16 +181,16 @@ class MLflowRun:
             self._client.set_experiment_tag(experiment_id, NOTE, note)
 
     def log_artifact(self, path: Path, folder: str | None) -> None:
-        """Copy a file, or all that lies in a folder, to the run's files under `folder`."""
-        with _told_apart():
+        """Copy a file, or all files of a folder, to the run's artifacts under `folder`."""
+        with store_errors():
             if not path.exists():
                 raise FileNotFoundError(f"{path} is gone")
             copy = self._client.log_artifacts if path.is_dir() else self._client.log_artifact
             copy(self.run_id, str(path), folder)
 
     def end(self, status: str, end_ms: int) -> None:
-        """Write how and when the run ended."""
-        with _told_apart():
+        """Write the status and the end of the run."""
+        with store_errors():
             self._client.set_terminated(self.run_id, status, end_ms)
 
     def _experiment_id(self, name: str) -> str:
@@ -263,19 +203,19 @@ class MLflowRun:
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
-                found = self._client.get_experiment_by_name(name)  # another process was faster
+                found = self._client.get_experiment_by_name(name)  # another process created it
         if found.lifecycle_stage != "active":
             raise StoreRefusedError(
                 f"experiment {name!r} was deleted in MLflow; restore it there or choose another name="
             )
         return found.experiment_id
 
-    def _find(self, experiment_id: str, told: Told) -> str | None:
+    def _find(self, experiment_id: str, tracked: TrackedRun) -> str | None:
         runs = self._client.search_runs(
-            [experiment_id], f"attributes.start_time = {told.start_ms}", ViewType.ALL
+            [experiment_id], f"attributes.start_time = {tracked.start_ms}", ViewType.ALL
         )
         for run in runs:
-            if run.info.run_name == told.run_name and run.data.tags.get("run_dir") == told.tags.get(
+            if run.info.run_name == tracked.run_name and run.data.tags.get("run_dir") == tracked.tags.get(
                 "run_dir"
             ):
                 return run.info.run_id
@@ -286,7 +226,7 @@ class MLflowRun:
         return min(((run.info.start_time, run.info.run_id) for run in runs), default=(0, None))[1]
 
     def _has(self, point: Point) -> bool:
-        """Return whether the store has a point of this key and step; the first call of a key asks it."""
+        """Return whether the store has a point of this key and step; each key is looked up once."""
         key, value, _, step = point
         if key not in self._there:
             history = self._client.get_metric_history(self.run_id, key)
@@ -302,9 +242,9 @@ def _with(tags: Mapping[str, str]) -> str:
 
 
 def _create_whole(file: Path) -> None:
-    """Create an SQLite store beside its place and move it there: a process killed meanwhile leaves none.
+    """Create an SQLite store under another name and move it into place, so that a killed process leaves none.
 
-    MLflow makes its tables in dozens of steps and cannot go on with a half-made store.
+    MLflow creates its tables in dozens of steps and cannot open an incomplete store.
     """
     aside = file.with_name(f".{file.name}.new")
     for left in file.parent.glob(f"{aside.name}*"):

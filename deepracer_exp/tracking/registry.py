@@ -1,22 +1,22 @@
-"""Checkpoints in MLflow's registry of models: put there under an alias, and found again by it."""
+"""Checkpoints in MLflow's model registry: register them under an alias and look them up."""
 
 import json
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pin, verify
-from deepracer_exp.formats.run_files import read_metrics, read_run_id
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
+from deepracer_exp.runs.files import CHECKPOINTS, METRICS, read_metrics, read_run_id
 
-from .lookup import asked
-from .names import metric_names
-from .notes import PICTURE, REPORT, in_words, picture
+from .metadata import PICTURE, REPORT, picture, race_result
+from .metrics import metric_names
+from .store import open_client, pages
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -28,7 +28,7 @@ _RUN_DIR, _CHECKPOINT, _SHA256 = "run_dir", "checkpoint", "sha256"
 
 @dataclass(frozen=True, kw_only=True)
 class Registered:
-    """A version of a model: a checkpoint of a run."""
+    """A version of a registered model: a checkpoint of a run."""
 
     model: str
     alias: str
@@ -45,41 +45,41 @@ class Registered:
 
 
 def is_alias(text: str) -> bool:
-    """Return whether an alias may be called so.
+    """Return whether this is a valid alias.
 
-    It begins with a letter, as no run's folder does, and MLflow keeps `latest` and `v1` for itself.
+    It starts with a letter, unlike a run's folder, and MLflow reserves `latest` and `v1`.
     """
     is_name = re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]{0,79}", text) is not None
     return is_name and text.lower() != "latest" and not re.fullmatch(r"[vV]\d+", text)
 
 
 def check_alias(what: str, alias: str) -> None:
-    """Refuse an alias that cannot be; `what` is the beginning of the complaint.
+    """Refuse an invalid alias; `what` begins the message.
 
     Raises:
-        BadInput: it cannot.
+        BadInput: it is invalid.
     """
     if not is_alias(alias):
         raise BadInput(
-            f"{what}: {alias!r} is no alias; accepted: a letter, then letters, digits, '_' and '-', at most 80; "
-            "not latest and not v1, v2, ..., which MLflow keeps for itself"
+            f"{what}: {alias!r} is not an alias; accepted: a letter, then letters, digits, '_' and '-', at most 80; "
+            "not latest and not v1, v2, ..., which MLflow reserves"
         )
 
 
 def check_model(what: str, model: str) -> None:
-    """Refuse the name of a model that cannot be; `what` is the beginning of the complaint.
+    """Refuse an invalid model name; `what` begins the message.
 
     Raises:
-        BadInput: it cannot.
+        BadInput: it is invalid.
     """
     try:
         safe_name(model)
     except ValueError as error:
-        raise BadInput(f"{what}: {model!r} is no model: {error}") from None
+        raise BadInput(f"{what}: {model!r} is not a model name: {error}") from None
 
 
 def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
-    """Return what `MODEL@ALIAS` stands for, or `ALIAS` where exactly one model has it.
+    """Look up `MODEL@ALIAS`, or `ALIAS` if exactly one model has it.
 
     Args:
         reference: either.
@@ -87,50 +87,50 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
         runs_dir: where runs are.
 
     Raises:
-        BadInput: none or several stand for it, it is none of ours, or the store does not answer.
+        BadInput: no model or several have it, it was not registered by us, or the store does not answer.
     """
-    what = f"run={reference}"
+    what = reference
     model, at, alias = reference.rpartition("@")
     check_alias(what, alias)
     if at:
         check_model(what, model)
-    with asked(what, uri, runs_dir) as client:
+    with open_client(what, uri, runs_dir) as client:
         known = [(found.name, name) for found in _models(client) for name in found.aliases]
-        meant = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
-        if len(meant) == 1:
-            version = client.get_model_version_by_alias(*meant[0])
+        matches = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
+        if len(matches) == 1:
+            version = client.get_model_version_by_alias(*matches[0])
             return _registered(what, version, alias)
     names = [f"{name}@{given}" for name, given in known]
-    if meant:
+    if matches:
         raise BadInput(
-            f"{what}: {len(meant)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS"
+            f"{what}: ambiguous: {len(matches)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS"
         )
     raise BadInput(
         f"{what}: no registered model has this alias{nearest(reference, names)}; "
-        f"known: {', '.join(names[:10]) or 'none'}; deepracer-exp promote registers one"
+        f"known: {', '.join(names[:10]) or 'none'}; deepracer-exp runs promote registers one"
     )
 
 
 def promote(
     run: Path, name: str, model: str, alias: str, features: Sequence[str], uri: str | None, runs_dir: Path
 ) -> Registered:
-    """Register a checkpoint as a version of a model, and give that version the alias.
+    """Register a checkpoint as a version of a model and give it the alias.
 
     The version is a logged model of MLflow: the checkpoint's files, the run's report and picture, a signature, and the
-    evaluation of the checkpoint as metrics. The checkpoint stays in the run's folder from now on. A checkpoint that is
-    a version already becomes none a second time.
+    checkpoint's evaluation as metrics. The checkpoint is pinned in the run's folder. A checkpoint that already is a
+    version is not registered again.
 
     Args:
         run: its folder.
         name: of the checkpoint: `best`, `last` or the number of an iteration.
-        model: made where there is none of this name.
-        alias: taken from the version that has it.
-        features: names of the numbers that the policy observes.
+        model: name, created if it does not exist.
+        alias: moved from the version that has it.
+        features: names of the policy's observations.
         uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
         runs_dir: where runs are.
 
     Raises:
-        BadInput: a name cannot be, the checkpoint is missing or torn, the run is not recorded in this store or was
+        BadInput: a name is invalid, the checkpoint is missing or corrupt, the run is not recorded in this store or was
             deleted there, or the store does not answer.
     """
     check_model("--model", model)
@@ -140,7 +140,7 @@ def promote(
     run_id = read_run_id(run)
     if run_id is None:
         raise BadInput(
-            f"{run}: is not recorded in MLflow (tracking=off, or no store answered), so it cannot be registered there"
+            f"{run}: is not recorded in MLflow (another tracking=, or the store was down), so it cannot be registered"
         )
     tags = {
         _RUN_DIR: str(run.resolve()),
@@ -148,12 +148,12 @@ def promote(
         _SHA256: checkpoint_sha256(folder),
     }
     what = f"promote {run.name}"
-    with asked(what, uri, runs_dir) as client:
+    with open_client(what, uri, runs_dir) as client:
         recorded = client.get_run(run_id)
     if recorded.info.lifecycle_stage != "active":
         raise BadInput(f"{what}: was deleted in MLflow (run {run_id}); restore it there")
-    pin(run / "checkpoints", folder.name, f"registered as {model}")
-    with asked(what, uri, runs_dir) as client:
+    pin(run / CHECKPOINTS, folder.name, f"registered as {model}")
+    with open_client(what, uri, runs_dir) as client:
         if not any(found.name == model for found in _models(client)):
             client.create_registered_model(
                 model, description=f"Policies of `deepracer-exp`, experiment `{model}`."
@@ -166,7 +166,7 @@ def promote(
                 client, recorded.info.experiment_id, run_id, run, folder, tags, features, metrics
             )
             shown = (
-                f"Checkpoint {int(folder.name)} of `{run.name}`: {in_words(metrics)}.\n\n{picture(run_id)}"
+                f"Checkpoint {int(folder.name)} of `{run.name}`: {race_result(metrics)}.\n\n{picture(run_id)}"
             )
             version = _version_of(client, logged.model_id, model, run_id, tags, shown)
         client.set_registered_model_alias(model, alias, version.version)
@@ -174,8 +174,8 @@ def promote(
 
 
 def _evaluated(run: Path, checkpoint: Path) -> dict[str, float]:
-    """Return what a checkpoint came to in the evaluation after its iteration, by MLflow's names of the metrics."""
-    file = run / "metrics.jsonl"
+    """Return the evaluation of a checkpoint after its iteration, by metric name in MLflow."""
+    file = run / METRICS
     rows = read_metrics(file) if file.exists() else []
     (row,) = [row for row in rows if row["iteration"] == int(checkpoint.name)] or [{}]
     named = metric_names(row)
@@ -192,7 +192,7 @@ def _log_model(
     features: Sequence[str],
     metrics: Mapping[str, float],
 ) -> "LoggedModel":
-    """Log a checkpoint as a model of MLflow, tensors and JSON as in the run's folder."""
+    """Log a checkpoint as a model of MLflow, with the tensors and JSON of the run's folder."""
     import numpy as np
     from mlflow.models import Model, ModelSignature
     from mlflow.types import Schema, TensorSpec
@@ -216,7 +216,7 @@ def _log_model(
         client.log_model_artifacts(logged.model_id, aside)
     client.log_model_artifacts(logged.model_id, str(checkpoint), "checkpoint")
     for key, value in metrics.items():
-        # The very point of the run, so that its curve has none twice.
+        # Exactly the run's own point, so that its curve has no duplicate.
         known = [point for point in client.get_metric_history(run_id, key) if point.value == value]
         moment = (known[-1].timestamp, known[-1].step) if known else (None, None)
         client.log_metric(run_id, key, value, *moment, model_id=logged.model_id)
@@ -226,10 +226,10 @@ def _log_model(
 def _version_of(
     client: "MlflowClient", model_id: str, model: str, run_id: str, tags: Mapping[str, str], description: str
 ) -> Any:
-    """Register a logged model as a version, so that MLflow's page of each shows the other."""
+    """Register a logged model as a version, so that MLflow's pages link to each other."""
     import mlflow
 
-    # A database looks the logged model up in the store that MLflow takes for the process's own.
+    # With a database MLflow looks up the logged model in the process's default store.
     mlflow.set_tracking_uri(client.tracking_uri)
     try:
         version = client.create_model_version(
@@ -243,7 +243,7 @@ def _version_of(
 
 
 def registered_checkpoints(client: "MlflowClient") -> set[tuple[str, str]]:
-    """Return every checkpoint that is a version of a model: name of the run's folder, name of the checkpoint's."""
+    """Return the checkpoints that are versions of a model: names of the run's and the checkpoint's folder."""
     return {
         (Path(version.tags[_RUN_DIR]).name, version.tags[_CHECKPOINT])
         for version in pages(client.search_model_versions)
@@ -255,7 +255,7 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
     run_dir, checkpoint, sha256 = (version.tags.get(key) for key in (_RUN_DIR, _CHECKPOINT, _SHA256))
     if not run_dir or not sha256 or not re.fullmatch(r"\d{6,9}", checkpoint or ""):
         raise BadInput(
-            f"{what}: version {version.version} of {version.name} was not registered by deepracer-exp promote"
+            f"{what}: version {version.version} of {version.name} was not registered by deepracer-exp runs promote"
         )
     return Registered(
         model=version.name,
@@ -269,24 +269,13 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
 
 def _folder(run: Path, name: str) -> Path:
     """Return a checkpoint's own folder."""
-    folder = run / "checkpoints" / (f"{int(name):06d}" if name.isdigit() else name)
+    folder = run / CHECKPOINTS / (f"{int(name):06d}" if name.isdigit() else name)
     if not folder.is_dir():
         raise BadInput(
-            f"--checkpoint {name}: {folder} is not there; accepted: best, last or an iteration that is"
+            f"checkpoint={name}: {folder} does not exist; accepted: best, last or the iteration of a checkpoint"
         )
     return folder.resolve()
 
 
 def _models(client: "MlflowClient") -> Iterator[Any]:
     return pages(client.search_registered_models)
-
-
-def pages(search: Callable[..., Any], **what: Any) -> Iterator[Any]:
-    """Return what one of the client's searches finds, on all its pages."""
-    token = None
-    while True:
-        page = search(**what, page_token=token)
-        yield from page
-        token = page.token
-        if not token:
-            return

@@ -1,23 +1,46 @@
-"""Where runs are recorded: a tracking uri checked, resolved and shown without its secrets."""
+"""MLflow stores: where runs are recorded. Addresses without secrets, clients, errors, and how long to wait.
+
+MLflow takes seconds to import, so that only what opens a store imports it.
+"""
 
 import fcntl
+import logging
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from deepracer_exp.addresses import redact, with_password, without_passwords
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.runs.files import MLFLOW_DB
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+# MLflow reads these at each call and offers no parameter. Its own 7 retries would hold the queue for
+# minutes after a server is back, and a request may hang for its whole 120 s: the recorder retries itself.
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
+# It would print the address of each ended run, with its password.
+os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+# A machine without network would retry it during the whole run.
+os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
 _SERVERS = ("http", "https")
 _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SQLITE_PREFIX = "sqlite:///"
+_USER, _PASSWORD = "MLFLOW_TRACKING_USERNAME", "MLFLOW_TRACKING_PASSWORD"
+_GIVEN = {name: os.environ.get(name) for name in (_USER, _PASSWORD)}
+
+_WORTH_RETRYING = (408, 425, 429)
 
 
-def one_line(error: Exception) -> str:
-    """Return what an error of a store says, short and without passwords."""
+def one_line(error: BaseException) -> str:
+    """Return an error of a store on one line, shortened and without passwords."""
     return redact(" ".join(str(error).split()))[:300]
 
 
@@ -26,13 +49,13 @@ class Store:
     """An MLflow tracking store that a run can be recorded in."""
 
     uri: str = field(repr=False)
-    """A database's with its password, if it has one: for MLflow only, never for a log."""
+    """Of a database, including its password: for MLflow only, never for a log."""
     artifact_location: str | None
-    """Where new experiments keep their files; None: the server decides."""
+    """Where new experiments store their files; None: the server decides."""
     user: str | None = None
     """Of a server."""
     password: str | None = field(default=None, repr=False)
-    """Of a server; None: what MLFLOW_TRACKING_PASSWORD says."""
+    """Of a server; None: MLFLOW_TRACKING_PASSWORD."""
 
     @property
     def shown(self) -> str:
@@ -41,7 +64,7 @@ class Store:
 
     @property
     def is_server(self) -> bool:
-        """Whether an MLflow server answers at the uri (otherwise it is a database)."""
+        """Whether the uri is that of an MLflow server, not of a database."""
         return self.uri.startswith(("http://", "https://"))
 
     @property
@@ -55,8 +78,8 @@ class Store:
     def creation_lock(self) -> Iterator[None]:
         """Let one process at a time create the tables of an SQLite store.
 
-        MLflow's client has no lock of its own here: of two processes that begin together, one fails in the
-        middle ("duplicate column name"). Whoever runs a database server creates its tables with it.
+        MLflow's client does not lock: of two processes that start together, one fails halfway ("duplicate column
+        name"). The tables of a database server are created with it.
         """
         if (file := self.sqlite_file) is None:
             yield
@@ -74,7 +97,7 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
     """
     artifacts = (runs_dir.absolute() / "mlflow-artifacts").as_uri()
     if uri is None:
-        file = runs_dir.absolute() / "mlflow.db"
+        file = runs_dir.absolute() / MLFLOW_DB
         _check_sqlite_file(file, f"runs_dir={runs_dir}")
         return Store(f"{_SQLITE_PREFIX}{file}", artifacts)
     uri, shown = with_password(uri), f"tracking.uri={without_passwords(uri)}"
@@ -124,3 +147,125 @@ def _check_sqlite_file(file: Path, shown: str) -> None:
         raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
     if not os.access(file if file.exists() else file.parent, os.W_OK):
         raise BadInput(f"{shown}: {file} cannot be written; choose a writable place or tracking=off")
+
+
+def silence_mlflow() -> None:
+    """Silence MLflow's loggers, which its import sets up.
+
+    Creating tables is logged in INFO lines, and a busy store with a traceback per attempt, both into the middle of the
+    live view. Each failure is raised as well, and reported once and redacted.
+    """
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def client_of(store: Store) -> "MlflowClient":
+    """Return a client of a store; all clients use the user and password of the latest one's store.
+
+    MLflow reads both from the environment at each request. In the address they would appear in its messages.
+    """
+    for name, own in ((_USER, store.user), (_PASSWORD, store.password)):
+        if (value := own or _GIVEN[name]) is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    from mlflow import MlflowClient
+
+    silence_mlflow()
+    # The model registry may be set elsewhere (MLFLOW_REGISTRY_URI), but it refers to these runs.
+    return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
+
+
+def is_run_id(text: str) -> bool:
+    """Return whether this looks like MLflow's id of a run."""
+    return re.fullmatch(r"[0-9a-f]{32}", text) is not None
+
+
+def has_store(uri: str | None, runs_dir: Path) -> bool:
+    """Return whether a store is given or `runs_dir` has one."""
+    return uri is not None or (runs_dir / MLFLOW_DB).is_file()
+
+
+def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
+    """Return the folder of a recorded run.
+
+    Args:
+        run_id: MLflow's.
+        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
+        runs_dir: where runs are.
+
+    Raises:
+        BadInput: the store has no such run, it was deleted there, or the store does not answer.
+    """
+    with open_client(run_id, uri, runs_dir) as client:
+        run = client.get_run(run_id)
+    if run.info.lifecycle_stage != "active":
+        raise BadInput(f"{run_id}: was deleted in MLflow; restore it there")
+    if "run_dir" not in run.data.tags:
+        raise BadInput(f"{run_id}: has no tag run_dir, so it is not a run of deepracer-exp")
+    return Path(run.data.tags["run_dir"])
+
+
+@contextmanager
+def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowClient]":
+    """Open a store and turn its errors into BadInput.
+
+    Args:
+        what: beginning of the error message.
+        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
+        runs_dir: where runs are.
+
+    Raises:
+        BadInput: there is no store, it does not answer, or it refuses.
+    """
+    if not has_store(uri, runs_dir):
+        raise BadInput(
+            f"{what}: {runs_dir} has no mlflow.db to look it up in; give tracking.uri=URI or a run's folder"
+        )
+    store = resolve_store(uri, runs_dir)
+    # Three seconds of import that nothing else needs.
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield client_of(store)
+    except (MlflowException, SQLAlchemyError, OSError) as error:
+        raise BadInput(f"{what}: {store.shown}: {one_line(error)}") from error
+
+
+def pages(search: Callable[..., Any], **what: Any) -> Iterator[Any]:
+    """Return the results of one of the client's searches, from all pages."""
+    token = None
+    while True:
+        page = search(**what, page_token=token)
+        yield from page
+        token = page.token
+        if not token:
+            return
+
+
+class StoreUnavailableError(Exception):
+    """The store did not answer, or not as expected: the call may be repeated."""
+
+
+class StoreRefusedError(Exception):
+    """The store refused the call, or a file is gone: repeating the call would change nothing."""
+
+
+@contextmanager
+def store_errors() -> Iterator[None]:
+    """Turn errors of MLflow and its database into StoreUnavailableError and StoreRefusedError."""
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except MlflowException as error:
+        status = error.get_http_status_code()
+        if 400 <= status < 500 and status not in _WORTH_RETRYING:
+            raise StoreRefusedError(str(error)) from error
+        raise StoreUnavailableError(str(error)) from error
+    except FileNotFoundError as error:
+        raise StoreRefusedError(str(error)) from error
+    except (OSError, SQLAlchemyError) as error:
+        raise StoreUnavailableError(str(error)) from error

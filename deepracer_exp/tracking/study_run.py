@@ -1,4 +1,4 @@
-"""The MLflow run that stands for a whole study, above the runs of its trials."""
+"""The MLflow run of a whole study, the parent of its trials' runs."""
 
 import hashlib
 import json
@@ -6,20 +6,25 @@ import logging
 import re
 import shlex
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.config.running import TrackingConfig, TrackingOff
+from deepracer_exp.config.running import MLflowTracking, TrackingConfig
 
-from .flatten import param_text
-from .names import END_TAG, PARENT, study_view, trial_metrics
-from .points import now_ms, points_at
-from .store import Store, one_line, resolve_store
-from .tracking_file import Status, Told
+from .metadata import END_TAG, PARENT, param_text, study_view
+from .metrics import now_ms, points_at, trial_metrics
+from .store import (
+    Store,
+    StoreRefusedError,
+    StoreUnavailableError,
+    one_line,
+    resolve_store,
+)
+from .store_thread import StoreThread
+from .tracking_file import Status, TrackedRun
 
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
@@ -29,29 +34,26 @@ STUDY, SEARCH, KIND, TRIAL = "sweep.study", "sweep.search", "sweep.kind", "sweep
 
 _log = logging.getLogger(__name__)
 
-_FIRST_PAUSE_S = 0.5
-_LONGEST_PAUSE_S = 10.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a study is."""
+    """Progress of a study."""
 
     total: int
-    """Trials it is to have."""
+    """Number of trials it will have."""
     complete: int
     pruned: int
     failed: int
     env_steps: int
     """Control steps of all trials together."""
     best_trial: int | None = None
-    """Its number, as for the five below None as long as no trial is complete."""
+    """Its number; None, like the five below, until a trial is complete."""
     best_values: Mapping[str, float] = field(default_factory=dict)
     """By objective."""
     best_shown: str | None = None
     """The same in words: ``race score 9.84 s``."""
     best_line: str | None = None
-    """The command that makes it."""
+    """The command that trains it."""
     lap_time_s: float | None = None
     """Of the best trial."""
     completion: float | None = None
@@ -59,11 +61,11 @@ class Progress:
 
     @property
     def ended(self) -> int:
-        """Trials that have come to their end."""
+        """Number of ended trials."""
         return self.complete + self.pruned + self.failed
 
     def __str__(self) -> str:
-        """Return it in words: ``34 of 60 trials: 22 complete, 10 pruned, 2 failed``."""
+        """Return a summary: ``34 of 60 trials: 22 complete, 10 pruned, 2 failed``."""
         counts = f"{self.complete} complete, {self.pruned} pruned, {self.failed} failed"
         return f"{self.ended} of {self.total} trials: {counts}"
 
@@ -71,8 +73,8 @@ class Progress:
 class StudyRun:
     """Keeps a study's run in MLflow up to date, from a thread of its own.
 
-    Only the newest progress counts: while the store does not answer, older ones are forgotten. Whoever goes on with
-    the study goes on with its run.
+    Only the newest progress counts: while the store does not answer, older ones are dropped. A process that continues
+    the study continues its run.
     """
 
     def __init__(
@@ -83,131 +85,99 @@ class StudyRun:
         space: Mapping[str, str],
         base: Sequence[str],
     ) -> None:
-        """Begin to create the run, or to find it.
+        """Start creating or finding the run.
 
         Args:
             store: where trials are recorded.
             study: its name, which is also the experiment of its runs.
             objectives: what trials are compared by.
-            space: what is searched, by key.
+            space: search expressions by key.
             base: overrides of all trials.
         """
         self._store = store
-        self._told = _told_of_study(store, study, space, base)
+        self._tracked = _tracked_study(store, study, space, base)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
         self._progress: Progress | None = None
-        self._files: dict[Path, str | None] = {}
         self._last_metrics: Mapping[str, float | None] = {}
-        self._status: Status | None = None
-        self._end_by = float("inf")
-        self._reported = False
-        self._refused: set[str] = set()
-        self._ended = False
         self._is_late = False
-        """Whether trials have begun without the id of this run."""
-        self._run: MLflowRun | None = None
+        """Whether trials have started without the id of this run."""
         self._settled = threading.Event()
-        # Daemon: a store that hangs must not keep a process alive whose sweep is over.
-        self._thread = threading.Thread(target=self._work, name="mlflow-study", daemon=True)
-        self._thread.start()
+        self._thread = StoreThread(store, "the sweep continues", self._settled.set)
+        self._thread.put("the study's run", self._begin, vital=True)
+        self._thread.put("the study's view", self._show_trials)
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
-        """Return MLflow's id of the run; None if the store refuses or has not answered until then."""
+        """Return the run's id in MLflow; None if the store refuses or does not answer in time."""
         self._is_late |= not self._settled.wait(deadline_s)
         return self.run_id
 
     @property
     def run_id(self) -> str | None:
         """MLflow's id of the run, once it exists."""
-        return self._run.run_id if self._run is not None and self._settled.is_set() else None
+        run = self._thread.run
+        return None if run is None or self._thread.is_rejected or not self._settled.is_set() else run.run_id
 
     def update(self, progress: Progress) -> None:
-        """Record how far the study is; returns at once."""
-        with self._changed:
+        """Record the progress of the study; returns at once."""
+        with self._lock:
             self._progress = progress
-            self._changed.notify()
+        self._thread.put("the study's progress", self._write_progress)
 
-    def pictures(self, files: Sequence[Path], folder: str | None = None) -> None:
-        """Keep files, such as the report, with the run; they are read later, and one of that name is replaced."""
-        with self._changed:
-            self._files |= dict.fromkeys(files, folder)
-            self._changed.notify()
+    def log_files(self, files: Sequence[Path], folder: str | None = None) -> None:
+        """Store files, such as the report, with the run; they are read later, and replace files of the same names."""
+        for path in files:
+            self._thread.put(f"file {path}", partial(_log_file, path, folder))
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
-        """Write what is left for at most `deadline_s` and end the run; return whether all was written."""
-        with self._changed:
-            self._status = status
-            self._end_by = time.monotonic() + deadline_s
-            self._changed.notify()
-        self._thread.join(deadline_s)
-        if not self._ended:
+        """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
+        is_ended = self._thread.finish(lambda run, _: self._end(run, status), deadline_s)
+        if not is_ended:
             _log.warning("MLflow (%s): the study's run could not be marked %s", self._store.shown, status)
-        return self._ended
+        return is_ended
 
-    def _work(self) -> None:
-        from .mlflow_run import MLflowRun
-
-        run = MLflowRun(self._store)
-        if not self._attempt(lambda: self._begin(run)):
-            self._settled.set()
-            return
-        self._run = run
+    def _begin(self, run: "MLflowRun", _: bool) -> None:
+        run.create_once(self._tracked, (STUDY, SEARCH, KIND))
+        run.log_params(self._tracked.params)
         self._settled.set()
-        self._attempt(lambda: self._show_trials(run))
-        while not self._ended:
-            with self._changed:
-                self._changed.wait_for(self._has_news)
-            if not self._attempt(lambda: self._write_progress(run)):
-                self._progress = None
-            while self._files:
-                with self._changed:
-                    path, folder = self._files.popitem()
-                self._attempt(partial(run.log_artifact, path, folder))
-            if self._status is not None:
-                self._ended = self._attempt(lambda: self._end(run))
-                return
 
-    def _has_news(self) -> bool:
-        return self._progress is not None or bool(self._files) or self._status is not None
-
-    def _begin(self, run: "MLflowRun") -> None:
-        run.connect()
-        run.create_once(self._told, (STUDY, SEARCH, KIND))
-        run.log_params(self._told.params)
-
-    def _show_trials(self, run: "MLflowRun") -> None:
+    def _show_trials(self, run: "MLflowRun", _: bool) -> None:
         self._adopt(run)
         run.set_experiment_tags(study_view(self._objectives, self._searched))
 
     def _adopt(self, run: "MLflowRun") -> None:
-        run.adopt({STUDY: self._told.tags[STUDY]}, but=KIND)
+        run.adopt({STUDY: self._tracked.tags[STUDY]}, but=KIND)
 
-    def _write_progress(self, run: "MLflowRun") -> None:
-        progress = self._progress
+    def _write_progress(self, run: "MLflowRun", _: bool) -> None:
+        """Write the newest progress, unless an earlier call has written it."""
+        with self._lock:
+            progress, self._progress = self._progress, None
         if progress is None:
             return
+        try:
+            self._write(run, progress)
+        except StoreUnavailableError:
+            with self._lock:
+                self._progress = self._progress or progress
+            raise
+
+    def _write(self, run: "MLflowRun", progress: Progress) -> None:
         tags = {"sweep.progress": str(progress), "mlflow.note.content": self._note(progress)}
         if progress.best_trial is not None:
             tags["sweep.best_trial"] = str(progress.best_trial)
-        metrics: dict[str, float | None] = {
-            "lap_time": progress.lap_time_s,
-            "completion": progress.completion,
-        }
-        metrics = trial_metrics({**metrics, **progress.best_values})
+        metrics = trial_metrics(
+            {"lap_time": progress.lap_time_s, "completion": progress.completion, **progress.best_values}
+        )
         metrics |= {"study/complete": progress.complete, "study/pruned": progress.pruned}
         metrics |= {"study/failed": progress.failed, "study/env_steps": progress.env_steps}
         run.set_tags(tags)
         if self._is_late:
             self._adopt(run)
-        # Not once a trial: at the end the best one may be another than before.
+        # Also when no trial has ended since: in the end another one may be the best.
         if metrics != self._last_metrics:
             run.log_metrics(points_at(metrics, progress.ended, now_ms()))
             self._last_metrics = metrics
-        with self._changed:
-            if self._progress is progress:
-                self._progress = None
 
     def _note(self, progress: Progress) -> str:
         """Return the description above the run, Markdown."""
@@ -219,50 +189,23 @@ class StudyRun:
             command, what, *words = map(shlex.quote, shlex.split(progress.best_line))
             line = " \\\n    ".join([f"{command} {what}", *words])
             lines.append(f"```\n{line}\n```")
-        params = self._told.params
+        params = self._tracked.params
         for title, keys in (
             ("Searched", self._searched),
             ("All trials", params.keys() - set(self._searched)),
         ):
-            if told := [f"- `{key}`: `{value}`" for key, value in params.items() if key in keys]:
-                lines.append("\n".join([f"{title}:", "", *told]))
+            if listed := [f"- `{key}`: `{value}`" for key, value in params.items() if key in keys]:
+                lines.append("\n".join([f"{title}:", "", *listed]))
         lines.append("Pictures: `sweep.html` among the artifacts.")
         return "\n\n".join(lines)
 
-    def _end(self, run: "MLflowRun") -> None:
-        assert self._status is not None
-        run.set_tags({END_TAG: {"FINISHED": "finished", "FAILED": "failed"}.get(self._status, "interrupted")})
-        run.end(self._status, now_ms())
+    def _end(self, run: "MLflowRun", status: Status) -> None:
+        run.set_tags({END_TAG: {"FINISHED": "finished", "FAILED": "failed"}.get(status, "interrupted")})
+        run.end(status, now_ms())
 
-    def _attempt(self, call: Callable[[], None]) -> bool:
-        """Repeat `call` until it works, the store refuses it, or the time is up; return whether it worked."""
-        from .mlflow_run import StoreRefusedError, StoreUnavailableError
 
-        pause_s = _FIRST_PAUSE_S
-        while time.monotonic() < self._end_by:
-            try:
-                call()
-            except StoreRefusedError as error:
-                reason = one_line(error)
-                if reason not in self._refused:  # a run deleted in the UI refuses every update
-                    self._refused.add(reason)
-                    _log.warning("MLflow (%s) refused the study's run: %s", self._store.shown, reason)
-                return False
-            except StoreUnavailableError as error:
-                if not self._reported:
-                    self._reported = True
-                    _log.warning(
-                        "MLflow (%s) does not answer; the sweep goes on and it is tried again: %s",
-                        self._store.shown, one_line(error),
-                    )  # fmt: skip
-            else:
-                return True
-            with self._changed:
-                self._changed.wait_for(lambda: self._status is not None, pause_s)
-            if self._status is not None:
-                time.sleep(_FIRST_PAUSE_S)
-            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-        return False
+def _log_file(path: Path, folder: str | None, run: "MLflowRun", _: bool) -> None:
+    run.log_artifact(path, folder)
 
 
 def open_study_run(
@@ -273,12 +216,12 @@ def open_study_run(
     space: Mapping[str, str],
     base: Sequence[str],
 ) -> StudyRun | None:
-    """Begin the run of a study; None with `tracking=off`.
+    """Start the run of a study; None unless `tracking=mlflow`.
 
     Raises:
         BadInput: `tracking.uri` can never work.
     """
-    if isinstance(config, TrackingOff):
+    if not isinstance(config, MLflowTracking):
         return None
     return StudyRun(resolve_store(config.uri, runs_dir), study, objectives, space, base)
 
@@ -291,26 +234,26 @@ def open_trial_run(
     base: Sequence[str],
     deadline_s: float = 30.0,
 ) -> str | None:
-    """Return MLflow's id of the run that the seeds of one trial stand under; whoever asks again gets the same.
+    """Return the id in MLflow of the run that groups the seeds of a trial, created on the first call.
 
     Args:
         store: where trials are recorded.
         study: its name.
-        trial: the number that trials are told by.
+        trial: number of the trial.
         parent_run_id: of the study's run.
         base: overrides of the trial.
-        deadline_s: the longest that is waited.
+        deadline_s: longest time to wait.
 
     Returns:
-        None if the store refuses or does not answer: then the seeds stand under the study itself.
+        None if the store refuses or does not answer; the seeds are then nested under the study itself.
     """
     tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE}
-    told = Told(None, f"trial {trial}", study, now_ms(), store.shown, _params({}, base), tags)
+    tracked = TrackedRun(None, f"trial {trial}", study, now_ms(), store.shown, _params({}, base), tags)
 
     def open_run(run: "MLflowRun") -> None:
         run.connect()
-        run.create_once(told, (STUDY, KIND, TRIAL, PARENT))
-        run.log_params(told.params)
+        run.create_once(tracked, (STUDY, KIND, TRIAL, PARENT))
+        run.log_params(tracked.params)
 
     return _within(deadline_s, store, f"trial {trial} has no run there", open_run)
 
@@ -324,21 +267,21 @@ def end_trial_run(
     values: Mapping[str, float | None],
     deadline_s: float = 30.0,
 ) -> None:
-    """End the run that the seeds of a trial stand under.
+    """End the run that groups the seeds of a trial.
 
     Args:
         store: where trials are recorded.
         study: its name.
         run_id: of the run.
-        status: how it ended.
-        reason: the same in words.
+        status: in MLflow.
+        reason: of the end.
         values: metrics of the trial, means over its seeds.
-        deadline_s: the longest that is waited.
+        deadline_s: longest time to wait.
     """
 
     def end_run(run: "MLflowRun") -> None:
         run.connect()
-        run.reopen(Told(run_id, "", study, 0, store.shown))
+        run.reopen(TrackedRun(run_id, "", study, 0, store.shown))
         run.log_metrics(points_at(values, 0, now_ms()))
         run.set_tags({END_TAG: reason})
         run.end(status, now_ms())
@@ -350,46 +293,46 @@ _SOURCE = {"mlflow.source.name": "deepracer-exp sweep", "mlflow.source.type": "L
 
 
 def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLflowRun], None]") -> str | None:
-    """Return the id of the run that `call` was done with; None, and a line in the log, if it was not in time.
+    """Return the id of the run after `call`; None, with a warning, if it failed or did not finish in time.
 
-    In a thread: of a database that cannot be opened MLflow tries again by itself, for more than a minute.
+    In a thread, because MLflow itself retries for more than a minute to open a database.
     """
     done: list[str | None] = []
-    told: list[str] = []
+    reasons: list[str] = []
 
     def work() -> None:
-        from .mlflow_run import MLflowRun, StoreRefusedError, StoreUnavailableError
+        from .mlflow_run import MLflowRun
 
         run = MLflowRun(store)
         try:
             call(run)
             done.append(run.run_id)
         except (StoreRefusedError, StoreUnavailableError) as error:
-            told.append(one_line(error))
+            reasons.append(one_line(error))
 
     thread = threading.Thread(target=work, name="mlflow-trial", daemon=True)
     thread.start()
     thread.join(deadline_s)
     if done:
         return done[0]
-    reason = told[0] if told else f"no answer within {deadline_s:g} s"
+    reason = reasons[0] if reasons else f"no answer within {deadline_s:g} s"
     _log.warning("MLflow (%s): %s: %s", store.shown, failure, reason)
     return None
 
 
-def _told_of_study(store: Store, study: str, space: Mapping[str, str], base: Sequence[str]) -> Told:
+def _tracked_study(store: Store, study: str, space: Mapping[str, str], base: Sequence[str]) -> TrackedRun:
     params = _params(space, base)
     search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode()).hexdigest()[:12]
     tags = {STUDY: study, SEARCH: search, KIND: "study", **_SOURCE}
-    return Told(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
+    return TrackedRun(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
 
 
 def _params(space: Mapping[str, str], base: Sequence[str]) -> dict[str, str]:
-    """Return the overrides and the expressions that are searched as parameters, by key."""
+    """Return overrides and search expressions as parameters."""
     plain = {key: value for key, _, value in (override.partition("=") for override in base)}
     return {_param_name(key): param_text(value) for key, value in (plain | dict(space)).items()}
 
 
 def _param_name(key: str) -> str:
-    """Return what a run calls a key, as MLflow takes it for a name."""
+    """Return a key as a parameter name that MLflow accepts."""
     return re.sub(r"[^A-Za-z0-9_.:/ -]", "_", key.lstrip("+~"))

@@ -1,24 +1,24 @@
-"""What the training loop tells of its run."""
+"""Trackers: what a training reports about its run, and who records it."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
-from .flatten import Scalar
+from .metadata import Scalar
 from .tracking_file import Status
 
 
-class Tracker(Protocol):
-    """Records one run. No method waits for the store, save `finish`.
+class Tracker:
+    """Records one run. This base class records nothing (`tracking=off`).
 
-    Of each metric a store gets one point a step, whatever is killed and resumed: points wait until a checkpoint
-    covers them (`safe_until`), so none is written that a resumed run would contradict, and a run that goes on
-    (`reopen`) tells all rows of its metrics.jsonl again, of which those that are missing are written.
+    No method waits for a store, except `finish`. Each metric is recorded once per step, even if processes are killed
+    and resumed: points wait until a checkpoint covers them (`safe_until`), so that no resumed run contradicts them,
+    and a resumed run (`reopen`) logs all rows of its metrics.jsonl again, of which only the missing ones are written.
     """
 
     @property
     def run_id(self) -> str | None:
-        """MLflow's id of the run, once it exists."""
+        """Id of the run in MLflow, once it exists."""
+        return None
 
     def start(
         self,
@@ -28,67 +28,44 @@ class Tracker(Protocol):
         tags: Mapping[str, str],
         identity: Path,
     ) -> None:
-        """Begin the run, and `identity`, its `tracking.json`; this or `reopen` is called before the others."""
+        """Start a new run; either this or `reopen` is called first, once.
 
-    def reopen(self, identity: Path) -> None:
-        """Go on with the run that `identity`, its `tracking.json`, tells of.
+        Args:
+            run_name: shown for the run.
+            experiment: that the run belongs to.
+            params: by which runs are compared.
+            tags: of the run.
+            identity: its `tracking.json`, which is written.
 
         Raises:
-            BadInput: the file is missing or not what a tracker writes.
+            BadInput: the run cannot be recorded.
+        """
+
+    def reopen(self, identity: Path) -> None:
+        """Continue the run of `identity`, its `tracking.json`.
+
+        Raises:
+            BadInput: the file is missing or invalid, or the run cannot be recorded.
         """
 
     def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        """Record a row of metrics.jsonl at `step` (env steps); None, NaN and infinite values are left out."""
+        """Record a row of metrics.jsonl at `step` (env steps), without None, NaN and infinite values."""
 
     def safe_until(self, step: int) -> None:
-        """Say that a checkpoint covers all steps until `step`: no resumed run will go back behind it."""
+        """Report that a checkpoint covers all steps until `step`: no resumed run will start before it."""
 
     def log_artifact(self, path: Path, folder: str | None = None) -> None:
-        """Keep a file, or all that lies in a folder, with the run.
+        """Store a file, or all files of a folder, with the run.
 
-        It is read later: `path` must stay as it is until `finish` has returned.
+        It is read later: `path` must not change until `finish` has returned.
         """
 
     def set_tag(self, key: str, value: str) -> None:
         """Set a tag of the run."""
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> int:
-        """Write what is left for at most `deadline_s`, end the run, return the number of points lost.
+        """Write what is left for at most `deadline_s`, end the run and return the number of lost points.
 
-        A run that failed or was killed may be resumed from its last checkpoint: points after that are not written.
+        A failed or killed run may be resumed from its last checkpoint: later points are not written.
         """
-
-
-class NullTracker:
-    """Records nothing (`tracking=off`)."""
-
-    run_id = None
-
-    def start(
-        self,
-        run_name: str,
-        experiment: str,
-        params: Mapping[str, Scalar],
-        tags: Mapping[str, str],
-        identity: Path,
-    ) -> None:
-        """Do nothing."""
-
-    def reopen(self, identity: Path) -> None:
-        """Do nothing."""
-
-    def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        """Do nothing."""
-
-    def safe_until(self, step: int) -> None:
-        """Do nothing."""
-
-    def log_artifact(self, path: Path, folder: str | None = None) -> None:
-        """Do nothing."""
-
-    def set_tag(self, key: str, value: str) -> None:
-        """Do nothing."""
-
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
-        """Do nothing; nothing is lost."""
         return 0

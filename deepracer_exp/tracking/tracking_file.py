@@ -1,4 +1,4 @@
-"""`tracking.json`: which MLflow run belongs to a run folder, and what was told to it besides metrics."""
+"""`tracking.json`: the MLflow run of a run folder, and everything logged to it besides metrics."""
 
 import json
 import logging
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.whole_file import write_whole
+from deepracer_exp.files import atomic_write
 
 NAME = "tracking.json"
 Status = Literal["FINISHED", "FAILED", "KILLED"]
@@ -18,84 +18,84 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a training has told of its run, whether or not MLflow has it yet; metrics.jsonl has the points."""
+class TrackedRun:
+    """What a training has logged, whether or not MLflow has it yet; metrics.jsonl has the points."""
 
     run_id: str | None
-    """MLflow's; None until it has created the run."""
+    """In MLflow; None until the run is created there."""
     run_name: str
     experiment: str
     start_ms: int
-    """Since 1970. With name and experiment it finds a run of which MLflow's id was never heard."""
+    """Since 1970. With name and experiment it identifies a run whose id was never received."""
     store: str
-    """Where it is recorded, without password."""
+    """Where the run is recorded, without password."""
     params: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
     files: dict[str, str | None] = field(default_factory=dict)
-    """Path, from the run folder where it lies in there, and the folder it gets in MLflow."""
+    """Paths, relative to the run folder if inside, and their folders in MLflow."""
     status: Status | None = None
-    """How the run ended; None: it goes on, or was killed."""
+    """Of the ended run; None while it is running, or if it was killed."""
     end_ms: int | None = None
 
 
 class TrackingFile:
-    """`tracking.json` of a run folder, written whole or not at all, by the training's thread and the recorder's."""
+    """`tracking.json` of a run folder, written atomically by the threads of the training and the tracker."""
 
-    def __init__(self, path: Path, told: Told) -> None:
+    def __init__(self, path: Path, run: TrackedRun) -> None:
         """Write the file."""
         self._path = path
         self._lock = threading.Lock()
-        self.told = told
-        self._write(told)
+        self.run = run
+        self._write(run)
 
     @classmethod
     def read(cls, path: Path, store: str) -> "TrackingFile":
-        """Return the file that a run has left, to be recorded in `store` (without password).
+        """Read an earlier run's file, to continue recording in `store` (without password).
 
-        In another store the run may have another id, or may not be yet: the old one is forgotten.
+        For another store the id is dropped, because the run may have another one there, or none yet.
 
         Raises:
-            BadInput: it is missing, cannot be read or does not hold what a tracker writes.
+            BadInput: it is missing or invalid.
         """
-        told = read_told(path)
-        return cls(path, told if told.store == store else replace(told, run_id=None, store=store))
+        run = read_tracked_run(path)
+        return cls(path, run if run.store == store else replace(run, run_id=None, store=store))
 
     @property
     def folder(self) -> Path:
-        """The run's."""
+        """The run folder."""
         return self._path.parent
 
     def change(self, **changes: Any) -> None:
-        """Set fields of Told."""
+        """Set fields of the run."""
         with self._lock:
-            self._write(replace(self.told, **changes))
+            self._write(replace(self.run, **changes))
 
     def add_tag(self, key: str, value: str) -> None:
-        """Note a tag."""
+        """Add a tag."""
         with self._lock:
-            self._write(replace(self.told, tags={**self.told.tags, key: value}))
+            self._write(replace(self.run, tags={**self.run.tags, key: value}))
 
     def add_file(self, path: Path, folder: str | None) -> None:
-        """Note a file, or folder, that is kept with the run."""
+        """Add a file or folder that is stored with the run."""
         path, base = path.resolve(), self._path.parent.resolve()
         shown = path.relative_to(base) if path.is_relative_to(base) else path
         with self._lock:
-            self._write(replace(self.told, files={**self.told.files, shown.as_posix(): folder}))
+            self._write(replace(self.run, files={**self.run.files, shown.as_posix(): folder}))
 
-    def _write(self, told: Told) -> None:
-        self.told = told
+    def _write(self, run: TrackedRun) -> None:
+        self.run = run
         try:
-            write_whole(self._path, json.dumps(asdict(told), indent=1) + "\n")
+            atomic_write(self._path, json.dumps(asdict(run), indent=1) + "\n")
         except OSError as error:
-            # Needed only after a kill; the training goes on, and a full disk ends it elsewhere.
+            # Only needed after a kill; a full disk ends the training elsewhere.
             _log.warning("%s: cannot be written: %s", self._path, error.strerror)
 
 
-def read_told(path: Path) -> Told:
+def read_tracked_run(path: Path) -> TrackedRun:
     """Read a `tracking.json`.
 
     Raises:
-        BadInput: it is missing, cannot be read or does not hold what a tracker writes.
+        BadInput: it is missing or invalid.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -106,29 +106,29 @@ def read_told(path: Path) -> Told:
     except ValueError as error:
         raise BadInput(f"{path}: is not valid JSON: {error}") from error
     try:
-        told = Told(**data)
+        run = TrackedRun(**data)
     except TypeError as error:
-        raise BadInput(f"{path}: holds other keys than a tracker writes: {error}") from error
+        raise BadInput(f"{path}: has unexpected keys: {error}") from error
     kinds: Mapping[str, type | tuple[type, ...]] = {
         "run_id": (str, type(None)), "run_name": str, "experiment": str, "start_ms": int, "store": str,
         "params": dict, "tags": dict, "files": dict,
     }  # fmt: skip
     for key, kind in kinds.items():
-        if not isinstance(getattr(told, key), kind):
-            raise BadInput(f"{path}: {key}: {getattr(told, key)!r} is not what a tracker writes")
-    return told
+        if not isinstance(getattr(run, key), kind):
+            raise BadInput(f"{path}: {key}: {getattr(run, key)!r} is not valid")
+    return run
 
 
 def begin_again(path: Path, run_dir: Path) -> None:
-    """Make a copied `tracking.json` that of a run which MLflow does not have yet.
+    """Turn a copied `tracking.json` into that of a new run.
 
     Args:
         path: the copy.
-        run_dir: where the run will lie.
+        run_dir: the new run's folder.
 
     Raises:
-        BadInput: as for `read_told`.
+        BadInput: as for `read_tracked_run`.
     """
-    told = read_told(path)
-    tags = {**told.tags, "run_dir": str(run_dir.resolve())}
-    write_whole(path, json.dumps(asdict(replace(told, run_id=None, tags=tags)), indent=1) + "\n")
+    run = read_tracked_run(path)
+    tags = {**run.tags, "run_dir": str(run_dir.resolve())}
+    atomic_write(path, json.dumps(asdict(replace(run, run_id=None, tags=tags)), indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""MLflow's web page for the project's runs, on this machine only."""
+"""Serve MLflow's web UI for the project's runs, on this machine only."""
 
 import os
 import signal
@@ -18,27 +18,25 @@ from typing import IO
 from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import running
+from deepracer_exp.runs.files import MLFLOW_DB
 
-from .lookup import asked
-from .names import VIEW
-from .notes import WORKFLOW
-from .registry import pages
-from .store import Store, resolve_store
+from .metadata import VIEW, WORKFLOW
+from .store import Store, open_client, pages, resolve_store
 
 _HOST = "127.0.0.1"
 _START_S = 90.0
 _ANSWER_S = 10.0
-# A proxy named by the environment does not know this machine's loopback.
+# A proxy set in the environment cannot reach this machine's loopback.
 _DIRECTLY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 
 def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str], None]) -> None:
-    """Serve the UI until Ctrl-C, SIGTERM or SIGHUP; `announce` gets its address once it answers.
+    """Serve the UI until Ctrl-C, SIGTERM or SIGHUP; call `announce` with its address once it answers.
 
-    A store that is a server has its own UI: its address is announced and nothing is started.
+    If the store is a server, which has its own UI, only its address is announced.
 
     Raises:
-        BadInput: no run was recorded yet, or the port is taken.
+        BadInput: no run is recorded yet, or the port is in use.
         RunFailed: the server did not start, or ended by itself.
     """
     store = existing_store(runs_dir, uri)
@@ -55,13 +53,13 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
 
 
 def existing_store(runs_dir: Path, uri: str | None) -> Store:
-    """Return the store if runs can be looked at in it.
+    """Return the store if it exists.
 
     Raises:
         BadInput: `uri` is unusable, or names an SQLite file that does not exist.
     """
-    default = runs_dir / "mlflow.db"
-    if uri is None and not default.exists():  # asked first: a look at nothing must not create runs_dir
+    default = runs_dir / MLFLOW_DB
+    if uri is None and not default.exists():  # resolve_store would create runs_dir
         raise BadInput(
             f"{default}: no runs recorded yet; run `deepracer-exp train` first, or give tracking.uri="
         )
@@ -83,7 +81,7 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
         free = next((other for other in range(port + 1, 65536) if _is_free(other)), None)
         raise BadInput(f"port={port}: already in use on {_HOST}" + (f"; {free} is free" if free else ""))
     with store.creation_lock():
-        pass  # a first training may be creating the tables at this moment
+        pass  # wait for a first training that is creating the tables
     command = [
         sys.executable,
         "-m",
@@ -96,7 +94,7 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
         "--workers",
         "1",
     ]
-    # The files of a run are read from where its experiment keeps them, nothing is uploaded through the UI.
+    # Artifacts are read from where the experiment stores them; nothing is uploaded through the UI.
     command += ["--no-serve-artifacts"]
     if store.artifact_location:
         command += ["--default-artifact-root", store.artifact_location]
@@ -107,7 +105,7 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # six more processes, for judging chats
     }
     url = f"http://{_HOST}:{port}"
-    # All that it keeps is in a database, which loses nothing when the server is killed.
+    # Its state is in a database, which loses nothing when the server is killed.
     with (
         tempfile.TemporaryFile() as output,
         running(command, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output) as server,
@@ -117,17 +115,17 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
 
 
 def runs_page(url: str, uri: str | None, runs_dir: Path) -> str:
-    """Return the address of the runs table that holds the newest run, with its racing columns.
+    """Return the address of the runs table with the newest run, with its racing columns.
 
     Args:
-        url: of the pages.
-        uri: the store that they show, as in `tracking.uri`; None: the one in `runs_dir`.
+        url: of the UI.
+        uri: its store, as in `tracking.uri`; None: the one in `runs_dir`.
         runs_dir: where runs are.
 
     Raises:
         BadInput: the store does not answer.
     """
-    with asked(f"ui of {url}", uri, runs_dir) as client:
+    with open_client(f"ui of {url}", uri, runs_dir) as client:
         known = {one.experiment_id: one for one in pages(client.search_experiments)}
         newest = client.search_runs(list(known), max_results=1, order_by=["attributes.start_time DESC"])
     if not newest:
@@ -139,7 +137,7 @@ def runs_page(url: str, uri: str | None, runs_dir: Path) -> str:
 
 def _is_free(port: int) -> bool:
     with socket.socket() as probe:
-        # As the server does: a port whose last connections still linger counts as free.
+        # Like the server: a port whose last connections are in TIME_WAIT counts as free.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((_HOST, port))
@@ -163,7 +161,7 @@ def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO
 
 @contextmanager
 def _ending_by_exception() -> Iterator[None]:
-    """Turn SIGTERM and SIGHUP, which end Python without a clean-up, into SystemExit(128 + signal)."""
+    """Turn SIGTERM and SIGHUP, which end Python without cleaning up, into SystemExit(128 + signal)."""
 
     def leave(signum: int, _: FrameType | None) -> None:
         raise SystemExit(128 + signum)

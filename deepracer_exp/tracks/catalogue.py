@@ -1,26 +1,26 @@
-"""The service's worlds as courses, and which of them a recording was driven on."""
+"""The service's worlds as courses, and how to recognise the world of a recording."""
 
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.formats.routes import world_rows
-from deepracer_exp.formats.worlds import find_world, worlds
+from deepracer_exp.deepracer.routes import world_rows
+from deepracer_exp.deepracer.worlds import find_world, worlds
 
 from .track import PLAIN_FLOOR, Track
 
 NEAR_M = 1.0
-"""How far a car is from its closest waypoint at most, as the mean over a recording: roads are up to 2 m wide."""
+"""Largest mean distance of a recording's poses from their closest waypoints: roads are up to 2 m wide."""
 
 
 class Recognised(NamedTuple):
-    """A world that a recording fits."""
+    """A world that matches a recording."""
 
     name: str
     reversed: bool
     distance_m: float
-    """Mean distance between the recorded places and the waypoints recorded as closest."""
+    """Mean distance between the recorded points and the waypoints recorded as closest."""
 
 
 @cache
@@ -40,13 +40,13 @@ def world_track(name: str, reversed: bool = False) -> Track:
 
 
 def recognise(points: np.ndarray, closest_waypoint: np.ndarray) -> list[Recognised]:
-    """Return the worlds that fit a recording, the best first; of equal ones the first of the catalogue.
+    """Return the worlds that match a recording, the best first; equal ones in the catalogue's order.
 
-    Every world numbers its waypoints in its own way: the one driven on has each recorded waypoint beside the place
-    where it was recorded.
+    Every world has its own numbering of waypoints: in the right one, each recorded waypoint is near the point where it
+    was recorded.
 
     Args:
-        points: recorded places (n, 2) in metres; a few hundred from all around the lap tell worlds apart.
+        points: recorded points (n, 2) in metres; a few hundred from all around the lap are enough.
         closest_waypoint: the waypoint recorded with each (n,).
     """
     found = []

@@ -1,4 +1,4 @@
-"""Pictures of a course: braille for the terminal, an image file for people."""
+"""Pictures of a course: braille for the terminal, or an image file."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -19,7 +19,7 @@ MOST_OFF = 0.05
 
 
 class Bands(NamedTuple):
-    """The edges of polygons side by side, sorted by y band.
+    """The edges of one or more polygons, sorted by y band.
 
     Band k of polygon w has the rows `first[b]:first[b + 1]` of `edge` with b = `at[w] + k`.
     """
@@ -92,7 +92,7 @@ def build_bands(road: BaseGeometry) -> Bands:
 
 
 def join_bands(roads: Sequence[Bands]) -> Bands:
-    """Put polygons side by side, in their order."""
+    """Join polygons in their order."""
     if len(roads) == 1:
         return roads[0]
     at, edge_at = (
@@ -107,14 +107,14 @@ def join_bands(roads: Sequence[Bands]) -> Bands:
 
 
 @njit(cache=True, nogil=True)
-def on_road(b, which, points):  # type: ignore[no-untyped-def]
-    """Tell for points (m, 2) whether a ray to the right crosses an odd number of edges of their polygon.
+def on_road(b, track_index, points):  # type: ignore[no-untyped-def]
+    """Return for points (m, 2) whether a ray to the right crosses an odd number of edges of their polygon.
 
-    `which` (n,) holds a polygon for each m / n points that follow one another.
+    `track_index` (n,) has the polygon of each m / n neighbouring points.
     """
     inside = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
-        road = which[i * len(which) // len(points)]
+        road = track_index[i * len(track_index) // len(points)]
         px, py = points[i, 0], points[i, 1]
         band = (py - b.low_y[road]) / b.band_m[road]
         # The top edge can round into the band above the last; nan falls through both comparisons.

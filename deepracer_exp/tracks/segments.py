@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from deepracer_exp.formats.routes import is_first_of_equals
+from deepracer_exp.deepracer.routes import is_first_of_equals
 
 CELL_M = 0.1
 """Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""
@@ -25,10 +25,10 @@ SPLIT = 8
 
 
 class Segments(NamedTuple):
-    """Polylines side by side, each with its grid (arrays that compiled code reads).
+    """One or more polylines, each with its grid (arrays for compiled code).
 
-    Line w has `segments[w]` segments, rows `at[w]` to `at[w] + segments[w] - 1`, and one vertex more. What is said of
-    segments has an unused last row for each line, so that a row means the same everywhere.
+    Line w has `segments[w]` segments, rows `at[w]` to `at[w] + segments[w] - 1`, and one vertex more. Arrays of
+    segments have an unused last row for each line, so that row numbers are the same in all arrays.
     """
 
     x: np.ndarray
@@ -43,9 +43,9 @@ class Segments(NamedTuple):
     heading_rad: np.ndarray
     """Direction of each segment."""
     point: np.ndarray
-    """Which of the line's points each vertex is; of points that repeat each other, the first."""
+    """Index of each vertex among the line's points; of repeated points, the first."""
     points: np.ndarray
-    """How many points each line was given with, repeats included."""
+    """Number of points of each line, repeats included."""
     at: np.ndarray
     segments: np.ndarray
     total_m: np.ndarray
@@ -119,7 +119,7 @@ def build_segments(vertices: np.ndarray) -> Segments:
 
 
 def join_segments(lines: Sequence[Segments]) -> Segments:
-    """Put polylines side by side, in their order."""
+    """Join polylines in their order."""
     if len(lines) == 1:
         return lines[0]
     at, bucket_at, cell_at, member_at = (
@@ -214,3 +214,77 @@ def along(s, index, fraction):  # type: ignore[no-untyped-def]
         return s.x[index + 1], s.y[index + 1]
     x, y = s.x[index], s.y[index]
     return x + fraction * (s.x[index + 1] - x), y + fraction * (s.y[index + 1] - y)
+
+
+@njit(cache=True, nogil=True)
+def project(s, track_index, points):  # type: ignore[no-untyped-def]
+    """Project points (m, 2) on the lines `track_index` (n,), m / n neighbouring points each; see `Tracks.project`."""
+    count = len(points)
+    ndist, distance_m, offset_m = np.empty(count), np.empty(count), np.empty(count)
+    previous, following = np.empty(count, np.int64), np.empty(count, np.int64)
+    center, heading_rad = np.empty((count, 2)), np.empty(count)
+    for i in range(count):
+        line = track_index[i * len(track_index) // count]
+        begin, end = s.at[line], s.at[line] + s.segments[line] + 1
+        px, py = points[i, 0], points[i, 1]
+        index, fraction = nearest_segment(s, line, px, py)
+        x, y = along(s, index, fraction)
+        center[i, 0], center[i, 1] = x, y
+        distance_m[i] = s.start_m[index] + fraction * s.length_m[index]
+        ndist[i] = distance_m[i] / s.total_m[line]
+        heading_rad[i] = s.heading_rad[index]
+        off_m = math.sqrt((px - x) ** 2 + (py - y) ** 2)
+        dx, dy = s.x[index + 1] - s.x[index], s.y[index + 1] - s.y[index]
+        offset_m[i] = off_m if dx * (py - s.y[index]) - dy * (px - s.x[index]) >= 0.0 else -off_m
+        # bisect_right from close by: rounding or a projection on a vertex moves it by one at most.
+        ahead = index
+        while ahead < end and s.share[ahead] <= ndist[i]:
+            ahead += 1
+        while ahead > begin and s.share[ahead - 1] > ndist[i]:
+            ahead -= 1
+        following[i] = s.point[ahead] if ahead < end else 0
+        previous[i] = (following[i] if begin < ahead < end else s.points[line]) - 1
+    return ndist, distance_m, offset_m, previous, following, center, heading_rad
+
+
+@njit(cache=True, nogil=True)
+def border_distances(inner, outer, track_index, points, center, is_clockwise):  # type: ignore[no-untyped-def]
+    """Return the road's width at projected points and whether the points are left of its centre."""
+    count = len(points)
+    width_m, is_left = np.empty(count), np.empty(count, np.bool_)
+    for i in range(count):
+        line = track_index[i * len(track_index) // count]
+        index, fraction = nearest_segment(inner, line, center[i, 0], center[i, 1])
+        inner_x, inner_y = along(inner, index, fraction)
+        index, fraction = nearest_segment(outer, line, center[i, 0], center[i, 1])
+        outer_x, outer_y = along(outer, index, fraction)
+        px, py = points[i, 0], points[i, 1]
+        width_m[i] = math.sqrt((inner_x - outer_x) ** 2 + (inner_y - outer_y) ** 2)
+        to_inner = math.sqrt((px - inner_x) ** 2 + (py - inner_y) ** 2)
+        to_outer = math.sqrt((px - outer_x) ** 2 + (py - outer_y) ** 2)
+        is_left[i] = (to_inner < to_outer) != is_clockwise[line]
+    return width_m, is_left
+
+
+@njit(cache=True, nogil=True)
+def poses_at(s, closed, track_index, ndist):  # type: ignore[no-untyped-def]
+    """Return x, y and heading of the lines at normalised distances."""
+    count = len(ndist)
+    x, y, heading_rad = np.empty(count), np.empty(count), np.empty(count)
+    for i in range(count):
+        line = track_index[i * len(track_index) // count]
+        begin, last = s.at[line], s.at[line] + s.segments[line] - 1
+        share = ndist[i] - math.floor(ndist[i]) if closed[line] else min(max(ndist[i], 0.0), 1.0)
+        if math.isfinite(share):
+            buckets = s.buckets[line]
+            index = s.bucket[s.bucket_at[line] + min(int(share * buckets), buckets - 1)]
+            while index < last and s.share[index + 1] <= share:
+                index += 1
+            while index > begin and s.share[index] > share:
+                index -= 1
+            fraction = (share * s.total_m[line] - s.start_m[index]) / s.length_m[index]
+            x[i], y[i] = along(s, index, fraction)
+            heading_rad[i] = s.heading_rad[index]
+        else:
+            x[i], y[i], heading_rad[i] = np.nan, np.nan, np.nan
+    return x, y, heading_rad

@@ -1,27 +1,67 @@
-"""The course a car drives on: centre line, borders, and where a point lies between them."""
+"""Courses: centre line, borders, and where points are between them; one course, or several as one batch."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.config.track import FloorConfig, TrackConfig
+from deepracer_exp.deepracer.routes import checked_rows, read_knots, read_route, world_rows
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.routes import checked_rows, read_knots, read_route, world_rows
 
-from .road import Bands, build_bands, road_area
+from . import segments
+from .road import Bands, build_bands, join_bands, on_road, road_area
 from .segments import Segments, build_segments
 from .spline import rows_from_knots
-from .tracks import Borders, Pose, Projection, Tracks
 
 PLAIN_FLOOR = FloorConfig(friction=1.0, road_color="#3d4148", ground_color="#54795a", line_color="#f2f2ee")
-"""The floor of a course whose file says nothing about it."""
+"""The default floor."""
 _FIRST = np.zeros(1, np.intp)
+
+TrackIndex = NDArray[np.intp]
+"""Indices of courses, (n,); of (m, ...) points, m / n neighbouring ones belong to each."""
+
+
+class Projection(NamedTuple):
+    """Points projected on the centre line; every array has one entry a point."""
+
+    ndist: np.ndarray
+    """Share of the course from waypoint 0 to the projection, 0 to 1."""
+    distance_m: np.ndarray
+    """The same in metres."""
+    offset_m: np.ndarray
+    """Distance from the centre line, positive on the left of the driving direction."""
+    previous: np.ndarray
+    """Index of the waypoint behind (int64)."""
+    next: np.ndarray
+    """Index of the waypoint ahead (int64)."""
+    center: np.ndarray
+    """The projected points (n, 2)."""
+    heading_rad: np.ndarray
+    """Direction of the centre line's segment there."""
+
+
+class Borders(NamedTuple):
+    """Points relative to the borders."""
+
+    track_width_m: np.ndarray
+    is_left: np.ndarray
+    """Whether the point is left of the centre, as the service decides it (bool)."""
+
+
+class Pose(NamedTuple):
+    """Start poses on the course."""
+
+    x: np.ndarray
+    y: np.ndarray
+    yaw_rad: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,13 +76,13 @@ class Track:
     title: str
     closed: bool
     reversed: bool
-    """The direction setting: the course is driven against the order of its rows."""
+    """Whether the course is driven against the order of its rows."""
     is_clockwise: bool
     """Whether the ring is driven clockwise; an open course counts as counter-clockwise in row order."""
     waypoints: np.ndarray
     """Centre points (n, 2) in driving direction, the closing point repeated on a closed course."""
     inner: np.ndarray
-    """Inner border (n, 2), row by row beside the waypoints."""
+    """Inner border (n, 2), one point for each waypoint."""
     outer: np.ndarray
     length_m: float
     width_m: float
@@ -73,12 +113,12 @@ class Track:
             rows: (n, 6): centre x, y, inner x, y, outer x, y in metres; closed if and only if the first
                 row equals the last.
             name: World name.
-            title: Name for people; the world name when missing.
+            title: Title for display; the world name when missing.
             reversed: Drive against the order of the rows.
             floor: What the road is made of.
 
         Raises:
-            BadInput: The rows make no course.
+            BadInput: The rows do not form a course.
         """
         rows = checked_rows(rows)
         closed = bool((rows[0] == rows[-1]).all())
@@ -125,7 +165,7 @@ class Track:
         """Build a course from spline knots (k, 2) in metres and one width or one per knot.
 
         Raises:
-            BadInput: The knots make no course, or the road is too wide for its bends.
+            BadInput: The knots do not form a course, or the road is too wide for its bends.
         """
         knots, widths_m = np.asarray(knots, np.float64), np.atleast_1d(np.asarray(width_m, np.float64))
         rows = rows_from_knots(knots, widths_m, closed)
@@ -133,23 +173,23 @@ class Track:
 
     @classmethod
     def from_config(cls, config: TrackConfig, reversed: bool | None = None) -> "Track":
-        """Build the course an experiment names: a world of the service, or what its file or knots say.
+        """Build the course of an experiment: a world of the service, a file, or knots.
 
         Args:
-            config: What is driven on.
-            reversed: Drive against the order of the rows; None: as `config.direction` says of the first episode.
+            config: The track's configuration.
+            reversed: Drive against the order of the rows; None: as in the first episode by `config.direction`.
 
         Raises:
-            BadInput: The file or the knots make no course; the message names the file or the track.
+            BadInput: The file or the knots do not form a course; the message names the file or the track.
         """
         backwards = config.direction == "reversed" if reversed is None else reversed
         if config.file is not None:
-            with _blaming("track.file"):
+            with _naming("track.file"):
                 return _from_file(Path(config.file), backwards, config.floor)
         if config.knots is None:
             rows, title = world_rows(config.name), config.title
             return cls.from_route(rows, config.name, title=title, reversed=backwards, floor=config.floor)
-        with _blaming(f"track {config.name}"):
+        with _naming(f"track {config.name}"):
             return cls.from_knots(
                 np.array(config.knots, np.float64).reshape(-1, 2),
                 np.array(config.width_m, np.float64),
@@ -184,7 +224,7 @@ class Track:
         return self._alone.border_distances(points, center, _FIRST)
 
     def on_road(self, points: np.ndarray) -> np.ndarray:
-        """Tell for points (m, 2) whether they are inside the road (bool)."""
+        """Return for points (m, 2) whether they are inside the road (bool)."""
         return self._alone.on_road(points, _FIRST)
 
     def points_at(self, ndist: np.ndarray) -> np.ndarray:
@@ -195,8 +235,71 @@ class Track:
         return self._alone.points_at(ndist, _FIRST)
 
     def start_pose(self, ndist: np.ndarray) -> Pose:
-        """Return poses on the centre line that look at the next waypoint; arrays shaped as `ndist`."""
+        """Return poses on the centre line that face the next waypoint; arrays shaped as `ndist`."""
         return self._alone.start_pose(ndist, _FIRST)
+
+
+class Tracks:
+    """Several courses as one batch; every query names the course of each point.
+
+    Results are those of the course's own `Track`, bit for bit.
+
+    Attributes:
+        length_m: length of each course, (W,).
+        closed: whether each course is closed, (W,), bool.
+    """
+
+    def __init__(self, tracks: Sequence[Track]):
+        """Join courses; the index of a course is its index in `tracks`."""
+        self.length_m = np.array([track.length_m for track in tracks])
+        self.closed = np.array([track.closed for track in tracks])
+        self._clockwise = np.array([track.is_clockwise for track in tracks])
+        self._waypoints = np.concatenate([track.waypoints for track in tracks])
+        self._waypoint_at = np.cumsum([0, *(len(track.waypoints) for track in tracks[:-1])])
+        self._center_line = segments.join_segments([track._center_line for track in tracks])
+        self._inner_line = segments.join_segments([track._inner_line for track in tracks])
+        self._outer_line = segments.join_segments([track._outer_line for track in tracks])
+        self._bands = join_bands([track._bands for track in tracks])
+
+    def project(self, points: np.ndarray, track_index: TrackIndex) -> Projection:
+        """Project points (m, 2) on the centre lines, as `Track.project` does."""
+        return Projection(*segments.project(self._center_line, track_index, _points(points)))
+
+    def border_distances(self, points: np.ndarray, center: np.ndarray, track_index: TrackIndex) -> Borders:
+        """Return width and side as `Track.border_distances` does, all (m, 2)."""
+        borders = self._inner_line, self._outer_line
+        return Borders(
+            *segments.border_distances(
+                *borders, track_index, _points(points), _points(center), self._clockwise
+            )
+        )
+
+    def on_road(self, points: np.ndarray, track_index: TrackIndex) -> np.ndarray:
+        """Return for points (m, 2) whether they are inside the road of their course (bool)."""
+        return on_road(self._bands, track_index, _points(points))
+
+    def points_at(self, ndist: np.ndarray, track_index: TrackIndex) -> np.ndarray:
+        """Return the centre-line points (..., 2) at normalised distances, as `Track.points_at` does."""
+        ndist = np.asarray(ndist, np.float64)
+        x, y, _ = segments.poses_at(self._center_line, self.closed, track_index, ndist.ravel())
+        return np.stack([x, y], axis=-1).reshape(*ndist.shape, 2)
+
+    def start_pose(self, ndist: np.ndarray, track_index: TrackIndex) -> Pose:
+        """Return poses on the centre lines as `Track.start_pose` does; arrays shaped as `ndist`."""
+        ndist = np.asarray(ndist, np.float64)
+        pose = segments.poses_at(self._center_line, self.closed, track_index, ndist.ravel())
+        return Pose(*(part.reshape(ndist.shape) for part in pose))
+
+    def waypoints(self, index: np.ndarray, track_index: TrackIndex) -> np.ndarray:
+        """Return the waypoints (n, k, 2) of the indices (n, k) on the courses (n,)."""
+        return self._waypoints[self._waypoint_at[track_index][:, None] + index]
+
+
+def _points(points: np.ndarray) -> np.ndarray:
+    points = np.ascontiguousarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points have shape {points.shape}, not (n, 2)")
+    return points
 
 
 def _from_file(path: Path, backwards: bool, floor: FloorConfig) -> Track:
@@ -206,23 +309,21 @@ def _from_file(path: Path, backwards: bool, floor: FloorConfig) -> Track:
     elif path.suffix in (".yaml", ".yml"):
         course = read_knots(path)
         title = course.title
-        with _blaming(path):
+        with _naming(path):
             rows = rows_from_knots(course.knots, course.width_m, course.closed)
     else:
-        raise BadInput(
-            f"{path}: its name ends in {path.suffix!r}; accepted are .npy (route) and .yaml (knots)"
-        )
-    with _blaming(path):
+        raise BadInput(f"{path}: ending {path.suffix!r}; accepted: .npy (route) and .yaml (knots)")
+    with _naming(path):
         return Track.from_route(rows, path.stem, title=title, reversed=backwards, floor=floor)
 
 
 @contextmanager
-def _blaming(what: object) -> Iterator[None]:
-    """Put the name of what was wrong before the message."""
+def _naming(source: object) -> Iterator[None]:
+    """Prefix the messages of `BadInput` with their source."""
     try:
         yield
     except BadInput as error:
-        raise BadInput(f"{what}: {error}") from None
+        raise BadInput(f"{source}: {error}") from None
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -1,14 +1,28 @@
-"""How much of its budget a run has used, and all runs of its experiment together."""
+"""The budget: how much of it a run and all runs of its experiment have used, and alerts at shares of it."""
 
 import json
+import logging
+import os
+import shlex
+import subprocess
+import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
-from deepracer_exp.config.budget import BudgetConfig
+from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lifeline import running
+from deepracer_exp.runs.files import METRICS, SUMMARY
 
+_log = logging.getLogger(__name__)
+
+_PATIENCE_S = 20.0
+"""That an alert may take."""
 _REFRESH_S = 10.0  # between two looks at what other runs have used
 _TAIL_BYTES = 16_384  # more than any line of metrics.jsonl
 _UNITS = {
@@ -42,7 +56,7 @@ class Budget:
         self._config = config
         self._folder = folder
         self._others = _OtherRuns(config.price_per_hour or 0.0)
-        self._told: dict[str, int] = {}
+        self._alerted: dict[str, int] = {}
 
     def used(self, env_steps: int, iterations: int, wall_clock_s: float) -> tuple[str, float]:
         """Return the limit that is nearest and the share of it that is used, 1 or more once it is reached.
@@ -56,17 +70,17 @@ class Budget:
 
     def alerts(self, env_steps: int, iterations: int, wall_clock_s: float) -> list[Alert]:
         """Return what was passed since the last call, at most one alert a limit; the first call sets the start."""
-        first, passed = not self._told, []
+        first, passed = not self._alerted, []
         for limit, own, others, most in self._spent(env_steps, iterations, wall_clock_s):
             spent = own + others
             percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
-            if not first and percent > self._told[limit]:
+            if not first and percent > self._alerted[limit]:
                 number = _UNITS[limit.removeprefix("experiment_")]
                 message = (
                     f"{percent} % of budget.{limit} used: {number.format(spent)} of {number.format(most)}"
                 )
                 passed.append(Alert(limit=limit, percent=percent, message=message))
-            self._told[limit] = max(percent, self._told.get(limit, 0))
+            self._alerted[limit] = max(percent, self._alerted.get(limit, 0))
         return passed
 
     def cost(self, wall_clock_s: float) -> float | None:
@@ -124,6 +138,92 @@ def refuse_spent(config: BudgetConfig, experiment_dir: Path) -> None:
             )
 
 
+class Alerts:
+    """Sends alerts to a command and to a webhook, where the budget names them; neither holds the training up."""
+
+    def __init__(self, config: BudgetConfig):
+        """Parse the command and look up the webhook's address.
+
+        Raises:
+            BadInput: the command's quotes do not close, or the environment variable is not set or holds no address.
+        """
+        self._command = _command(config)
+        self._address = _webhook_address(config)
+        self._threads: list[threading.Thread] = []
+
+    def send(self, message: str, run_dir: Path) -> None:
+        """Send a message of a run; what goes wrong is logged."""
+        for wanted, how in ((self._command, self._run), (self._address, self._post)):
+            if wanted is not None:
+                thread = threading.Thread(
+                    target=how, args=(wanted, message, run_dir), name="alert", daemon=True
+                )
+                thread.start()
+                self._threads.append(thread)
+
+    def close(self) -> None:
+        """Wait up to 20 s for alerts still on their way."""
+        for thread in self._threads:
+            thread.join(_PATIENCE_S)
+
+    def _run(self, command: tuple[str, ...], message: str, run_dir: Path) -> None:
+        try:
+            line, pipe = [*command, message, str(run_dir.resolve())], subprocess.PIPE
+            with running(line, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe) as done:
+                _, said = done.communicate(timeout=_PATIENCE_S)
+        except OSError as error:
+            _log.info("budget.alert_command cannot be run: %s", error.strerror or error)
+            return
+        except subprocess.TimeoutExpired:
+            _log.info("budget.alert_command was ended after %.0f s", _PATIENCE_S)
+            return
+        if done.returncode:
+            last = said.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+            _log.info("budget.alert_command ended with exit code %d: %s", done.returncode, last[0])
+
+    def _post(self, address: str, message: str, _: Path) -> None:
+        # Slack and Mattermost read `text`, Discord `content`.
+        body = json.dumps({"text": message, "content": message}).encode()
+        request = urllib.request.Request(address, body, {"Content-Type": "application/json"})
+        try:
+            with urllib.request.urlopen(request, timeout=_PATIENCE_S):
+                pass
+        except urllib.error.HTTPError as error:
+            _log.info("budget.alert_webhook answered %d", error.code)
+        except OSError as error:
+            # Not the error's text: it may hold the address.
+            _log.info("budget.alert_webhook cannot be reached (%s)", type(error).__name__)
+
+
+def _command(config: BudgetConfig) -> tuple[str, ...] | None:
+    if config.alert_command is None:
+        return None
+    try:
+        return tuple(shlex.split(config.alert_command))
+    except ValueError as error:
+        raise BadInput(
+            f"budget.alert_command={config.alert_command}: {error}; accepted: a program and its arguments"
+        ) from error
+
+
+def _webhook_address(config: BudgetConfig) -> str | None:
+    name = config.alert_webhook
+    if name is None:
+        return None
+    address = os.environ.get(name)
+    if address is None:
+        raise BadInput(
+            f"budget.alert_webhook={name}: no such environment variable; accepted: the name of one that holds the "
+            "webhook's address"
+        )
+    parts = urlsplit(address)
+    if parts.scheme not in ("http", "https") or not parts.netloc:
+        raise BadInput(
+            f"budget.alert_webhook={name}: the variable holds no address that begins with http:// or https://"
+        )
+    return address
+
+
 @dataclass(frozen=True)
 class _Spent:
     env_steps: int = 0
@@ -159,16 +259,16 @@ class _OtherRuns:
         if run.name in self._ended:
             return self._ended[run.name]
         try:
-            spent = self._from(json.loads((run / "summary.json").read_text(encoding="utf-8")))
+            spent = self._from(json.loads((run / SUMMARY).read_text(encoding="utf-8")))
             self._ended[run.name] = spent
         except (OSError, ValueError, KeyError, TypeError):
-            # It goes on, was killed, or is no run at all: a sum of what is known must not end a training.
+            # It is running, was killed, or is no run at all: a sum of what is known must not end a training.
             return self._so_far(run)
         return spent
 
     def _so_far(self, run: Path) -> _Spent:
         try:
-            with (run / "metrics.jsonl").open("rb") as file:
+            with (run / METRICS).open("rb") as file:
                 file.seek(max(0, file.seek(0, 2) - _TAIL_BYTES))
                 lines = file.read().split(b"\n")
             return self._from(json.loads(lines[-2]))

@@ -6,18 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.agents.actor_critic import ActorCritic
-from deepracer_exp.config.compose import Composition, validate
-from deepracer_exp.config.evaluation import checkpoint_name
+from deepracer_exp.config.compose import Composition
+from deepracer_exp.config.evaluation import checked_checkpoint_name
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.stored import differences, in_words, with_overrides
+from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.config.stored import config_differences, describe_differences, with_overrides
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
-from deepracer_exp.evaluation.run import StoredRun, read_run
-from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pin
-from deepracer_exp.formats.lineage_file import Lineage, read_lineage
-from deepracer_exp.formats.run_files import read_config, read_object, read_run_id
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
+from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, read_config, read_object, read_run_id
+from deepracer_exp.runs.lineage import Lineage, read_lineage
+from deepracer_exp.runs.resolve import StoredRun, resolve
 
 SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
@@ -54,14 +55,14 @@ def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | 
     """
     given = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
     changes = [override for override in overrides if override.split("=", 1)[0] not in _OWN]
-    parent = read_run(given["run"], runs_dir, tracking_uri)
+    parent = resolve(given["run"], runs_dir, tracking_uri)
     try:
-        name = checkpoint_name(parent.meant(given.get("checkpoint")))
+        name = checked_checkpoint_name(parent.choose_checkpoint(given.get("checkpoint")))
     except ValueError as error:
         raise BadInput(f"checkpoint={given['checkpoint']}: {error}") from None
-    stored = read_checkpoint(parent.experiment, parent.path / "checkpoints", name)
+    stored = read_checkpoint(parent.experiment, parent.path / CHECKPOINTS, name)
     composition = _changed(parent, changes)
-    experiment = validate(composition.mapping)
+    experiment = parse_experiment(composition.mapping)
     _refuse_other_networks(parent.experiment, experiment)
     above = read_lineage(parent.path)
     lineage = Lineage(
@@ -73,7 +74,7 @@ def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | 
         generation=1 + (above.generation if above else 0),
         registered=parent.registered,
     )
-    pin(parent.path / "checkpoints", stored.path.name, f"cloned into {experiment.name}")
+    pin(parent.path / CHECKPOINTS, stored.path.name, f"cloned into {experiment.name}")
     return Clone(
         experiment,
         composition,
@@ -83,7 +84,7 @@ def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | 
 
 
 def _changed(parent: StoredRun, changes: Sequence[str]) -> Composition:
-    names = read_object(parent.path / "provenance.json").get("names", {})
+    names = read_object(parent.path / PROVENANCE).get("names", {})
     composition = with_overrides(read_config(parent.path), names, changes)
     keys = {change.lstrip("+").split("=", 1)[0] for change in changes}
     if not keys & {"algorithm", "algorithm.lr"}:
@@ -97,7 +98,9 @@ def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
     """Refuse what the parent's networks were not made for."""
     why = "the parent's networks were made for it; train a new run for another"
     if clone.network != parent.network:
-        changed = "; ".join(in_words(differences([vars(parent.network), vars(clone.network)])))
+        changed = "; ".join(
+            describe_differences(config_differences([vars(parent.network), vars(clone.network)]))
+        )
         raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
     ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
     if clone.observation != parent.observation:

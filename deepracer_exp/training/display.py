@@ -3,7 +3,7 @@
 import itertools
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -15,7 +15,13 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from .track_table import NOTHING, TrackTable
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.tracking.metadata import joined
+from deepracer_exp.tracking.metrics import track_metric
+
+from .budget import Budget
+from .metrics import RunMetrics
 
 Row = Mapping[str, float | int | None]
 """One line of metrics.jsonl."""
@@ -33,12 +39,16 @@ WIDE = 76
 """Columns from which the limit of the budget stands beside the bar."""
 LABEL, VALUE, GAP, RIGHT = 12, 10, 3, 24
 """Columns of a figure's name, of its value, between the halves, and of the right half."""
+NOTHING = "\N{EN DASH}"
+_TABLE_GAP = 2
+_CELL = 22  # columns of a track's figures, at least: 18 tracks in three columns of a terminal of 80
+_FIGURES = (4, 7)  # columns of per cent and lap time in it
 _FRAME_LINES = 10  # of the panel beside figures and table, and the terminal's last
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunHeader:
-    """What is being trained, in the words of its options."""
+    """What is being trained, by the names of its options."""
 
     name: str
     track: str
@@ -53,6 +63,28 @@ class RunHeader:
     """The limits of the run, such as `3,000,000 steps`."""
     folder: str
     """Where the results go."""
+
+    @classmethod
+    def of(
+        cls,
+        folder: RunFolder,
+        setup: RaceSetup,
+        names: Mapping[str, str],
+        metrics: RunMetrics,
+        budget: Budget,
+    ) -> "RunHeader":
+        """Return the header of a run; `names` are what a racer calls its choices."""
+        return cls(
+            name=folder.name,
+            track=joined([course.tracks[0].title for course in setup.courses], " + "),
+            track_labels=tuple(metrics.labels),
+            remembered=metrics.remembered,
+            reward=names["reward"],
+            network=names["network"],
+            actions=names["action_space"],
+            budget=str(budget),
+            folder=str(folder.path),
+        )
 
 
 class ProgressDisplay:
@@ -101,7 +133,7 @@ class ProgressDisplay:
             row: as in metrics.jsonl: completion is in per cent (0 to 100), lap_share a fraction; values that
                 are None, NaN or missing show as a dash.
             fraction: share of the budget used, 0 to 1.
-            eta_s: seconds left, or None where nobody knows.
+            eta_s: seconds left, or None if unknown.
         """
         now_s = self._clock()
         elapsed_s = now_s - self._started_s
@@ -262,6 +294,74 @@ class _View:
         return [one + " " * GAP + other for one, other in rows]
 
 
+class TrackTable:
+    """Completion and best lap of each track."""
+
+    def __init__(self, labels: Sequence[str]):
+        """Begin empty.
+
+        Args:
+            labels: of the tracks, as in the rows of metrics.jsonl; empty for a run on one track.
+        """
+        self._labels = labels
+        # An iteration need not end an episode on every track: what was known last stays.
+        self._completion: dict[str, float] = {}
+        self._best_s: dict[str, float] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._labels)
+
+    def add(self, row: Mapping[str, float | int | None]) -> None:
+        """Add the figures of an iteration."""
+        for metric, known in (("completion", self._completion), ("best_lap_time_s", self._best_s)):
+            for label in self._labels:
+                value = row.get(track_metric(metric, label))
+                if value is not None and math.isfinite(value):
+                    known[label] = value
+
+    def least(self) -> str:
+        """Name the track on which the car comes least far."""
+        if not self._completion:
+            return f"least {NOTHING}"
+        label = min(self._completion, key=self._completion.__getitem__)
+        return f"least {self._completion[label]:.1f} % on {label}"
+
+    def lines(self, width: int, room: int) -> list[Text]:
+        """Return the table, tracks running down its columns.
+
+        Args:
+            width: columns of the terminal to fill.
+            room: lines that are free; tracks that find none are counted at the end.
+        """
+        columns = max(1, (width + _TABLE_GAP) // (_CELL + _TABLE_GAP))
+        cell = (width + _TABLE_GAP) // columns - _TABLE_GAP
+        places = columns * max(1, room - 1)  # less the head
+        labels = self._labels if len(self._labels) <= places else self._labels[: places - 1]
+        cells = [Text(self._track(label, cell)) for label in labels]
+        if len(labels) < len(self._labels):
+            cells.append(Text(f"and {len(self._labels) - len(labels)} more".ljust(cell), style="dim"))
+        rows = -(-len(cells) // columns)
+        used = -(-len(cells) // rows)
+        cells += [Text(" " * cell)] * (rows * used - len(cells))
+        head = Text(_columns("track", "%", "lap s", cell), style="dim")
+        grid = [[head] * used, *(cells[row::rows] for row in range(rows))]
+        return [Text(" " * _TABLE_GAP).join(row) for row in grid]
+
+    def _track(self, label: str, cell: int) -> str:
+        done, best_s = self._completion.get(label), self._best_s.get(label)
+        done_text = NOTHING if done is None else f"{done:.0f}"
+        return _columns(label, done_text, NOTHING if best_s is None else f"{best_s:.2f}", cell)
+
+
+def _columns(name: str, done: str, best: str, cell: int) -> str:
+    """Set a name to the left and figures to the right; a long name loses its middle, since both ends distinguish it."""
+    done_room, best_room = _FIGURES
+    room = cell - done_room - best_room
+    if len(name) > room:
+        name = f"{name[: room // 2]}…{name[len(name) - (room - 1) // 2 :]}"
+    return f"{name:<{room}}{done:>{done_room}}{best:>{best_room}}"
+
+
 def sparkline(values: list[float], width: int, bounds: tuple[float, float] | None = None) -> str:
     """Draw values as at most `width` bars, each the mean of its share of them.
 
@@ -313,5 +413,5 @@ def _join(header: RunHeader) -> str:
 
 
 def _tail(text: str, width: int) -> str:
-    """Keep the end of a path: it tells runs apart."""
+    """Keep the end of a path: it distinguishes runs."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]

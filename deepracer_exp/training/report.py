@@ -4,8 +4,9 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from deepracer_exp.env.courses import Course
-from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.env.setup import Course
+from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, TRACE
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -17,18 +18,23 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     # Half a second of import that no training waits for.
     import pandas as pd
 
-    from deepracer_exp.analysis.figures import LINE_COLUMNS, driven_line, driven_lines, learning_curves
+    from deepracer_exp.analysis.charts.run_pictures import (
+        LINE_COLUMNS,
+        driven_line,
+        driven_lines,
+        learning_curves,
+    )
 
-    metrics_file = run_dir / "metrics.jsonl"
+    metrics_file = run_dir / METRICS
     if not metrics_file.is_file() or not metrics_file.stat().st_size:
         return
-    trace = read_trace(run_dir / "trace", LINE_COLUMNS)
+    trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
     if len(courses) == 1:
         figure = driven_line(trace, courses[0].tracks[0])
     else:
         figure = driven_lines(trace, {course.name: course.tracks[0] for course in courses})
-    figure.savefig(run_dir / "best_lap.png", dpi=120)
-    learning_curves(pd.read_json(metrics_file, lines=True)).savefig(run_dir / "learning.png", dpi=120)
+    figure.savefig(run_dir / BEST_LAP, dpi=120)
+    learning_curves(pd.read_json(metrics_file, lines=True)).savefig(run_dir / LEARNING, dpi=120)
 
 
 def write_run_page(run_dir: Path) -> str | None:
@@ -41,8 +47,8 @@ def write_run_page(run_dir: Path) -> str | None:
         from deepracer_exp.analysis.findings import findings
         from deepracer_exp.analysis.log_report import LogPage, write_page
         from deepracer_exp.analysis.log_view import prepare
-        from deepracer_exp.evaluation.run_terms import run_terms
-        from deepracer_exp.formats.own_recording import read_own_recording
+        from deepracer_exp.evaluation.reward_terms import run_terms
+        from deepracer_exp.runs.own_recording import read_own_recording
 
         view, terms = run_terms(prepare(read_own_recording(run_dir)), just_trained=True)
         write_page(run_dir / PAGE, LogPage(view, findings(view), terms=terms))

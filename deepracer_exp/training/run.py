@@ -1,101 +1,143 @@
-"""Runs: begun, gone on with after an early end, or begun from another run's checkpoint."""
+"""Start a run, resume one, or continue a copy of one."""
 
 import ast
 import json
 import logging
+import os
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import ActorCritic
-from deepracer_exp.config.compose import Composition, validate
+from deepracer_exp.collectors.ray_cluster import check_collector
+from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of
+from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.env.reward import RewardFunction
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed, reading
 from deepracer_exp.evaluation.checkpoint import intact_checkpoint
-from deepracer_exp.formats.lineage_file import LINEAGE, Lineage, read_lineage
-from deepracer_exp.formats.run_files import read_config, read_object
+from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.runs.checkpoints import read_training
+from deepracer_exp.runs.convergence import UNDECIDED
+from deepracer_exp.runs.files import (
+    CHECKPOINTS,
+    CONFIG,
+    LINEAGE,
+    METRICS,
+    PROVENANCE,
+    SUMMARY,
+    TRACKING,
+    read_config,
+    read_object,
+)
+from deepracer_exp.runs.fingerprint import refuse_changes
+from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking import tracking_file
-from deepracer_exp.tracking.names import joined, lineage_tags, run_params, run_tags
-from deepracer_exp.tracking.recorder import Tracker, open_tracker
+from deepracer_exp.tracking.loggers import open_tracker
+from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
+from deepracer_exp.tracking.tracker import Tracker
 
-from .alerts import Alerts
 from .budget import Budget, refuse_spent
-from .checkpoints import read_training
-from .header import track_names
-from .origin import refuse_changes
-from .outcome import Outcome
-from .ray_cluster import check_collector
-from .run_folder import RunFolder
+from .callbacks import BUDGET_REACHED, standard_callbacks
+from .metrics import track_names
 from .signals import Interruption
-from .stopping import UNDECIDED
-from .training import SPENT, TIMES, Training
-from .watching import TakenOver, Watch
-
-__all__ = ["TIMES", "Outcome", "RunEnded", "read_files", "resume", "train"]
+from .trainer import FAILED, INTERRUPTED, Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
 
 
-_AGAIN = ("interrupted", "failed")
-"""How runs end that can go on."""
-
-
 class RunEnded(BadInput):
-    """A run that is to go on has come to its end."""
+    """The run to resume has come to its end."""
 
 
 def train(
     experiment: Experiment,
     composition: Composition,
-    console: Console,
+    console: Console | None = None,
     start: tuple[ActorCritic, Lineage] | None = None,
-    watch: Watch | None = None,
-) -> Outcome:
-    """Train the experiment.
+    callbacks: Sequence[Callback] = (),
+    run_name: str | None = None,
+    tags: Mapping[str, str] = MappingProxyType({}),
+) -> TrainResult:
+    """Train an experiment.
 
     Args:
         experiment: validated.
-        composition: where it came from.
-        console: for the view of the progress.
+        composition: where it came from; `compose_experiment` returns both.
+        console: shows the progress; None: nothing is shown.
         start: networks to begin with, and whose they were; None: new ones.
-        watch: looks on.
+        callbacks: called beside the standard ones, see `standard_callbacks`.
+        run_name: of the run in MLflow; None: from the reward function and the time.
+        tags: of the run in MLflow, beside its own.
 
     Returns:
-        How it ended; a failed run's line is its `reason`.
+        How it ended; `reason` holds a failed run's error.
 
     Raises:
         BadInput: before anything was started; no folder is left.
-        TakenOver: `watch` said so.
+        TakenOver: a callback raised it.
     """
+    console = console or Console(quiet=True)
     # From here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
-        training = _begin(experiment, composition, console, start, watch)
-        return _run(training, interruption)
+        trainer = _begin(experiment, composition, console, start, callbacks, run_name, tags)
+        return _run(trainer, interruption)
 
 
-def resume(run_dir: Path, overrides: Sequence[str], console: Console, watch: Watch | None = None) -> Outcome:
-    """Go on with a run that ended before its time, from its last checkpoint.
+def resume(
+    run_dir: Path,
+    overrides: Sequence[str],
+    console: Console | None = None,
+    callbacks: Sequence[Callback] = (),
+    run_name: str | None = None,
+    tags: Mapping[str, str] = MappingProxyType({}),
+) -> TrainResult:
+    """Resume a run that was killed, interrupted or failed from its last checkpoint.
 
     Args:
         run_dir: its folder.
         overrides: of values that change nothing of what it learns.
-        console: for the view of the progress.
-        watch: looks on.
+        console: shows the progress; None: nothing is shown.
+        callbacks: called beside the standard ones.
+        run_name: as in `train`, if the run was not recorded yet.
+        tags: likewise.
 
     Raises:
-        BadInput: the run has come to its end, or is being trained, or cannot go on as it was.
-        TakenOver: `watch` said so.
+        BadInput: the run has ended, is being trained, or was started with other values.
+        TakenOver: a callback raised it.
     """
+    console = console or Console(quiet=True)
     with Interruption(_printing(console)) as interruption:
-        return _run(_resumed(run_dir, overrides, console, watch), interruption)
+        return _run(_reopen(run_dir, overrides, console, callbacks, run_name, tags), interruption)
+
+
+def copy_run(run_dir: Path, attempt: int) -> Path:
+    """Copy a run whose process does not release its folder, to resume the copy; return the copy's folder.
+
+    The original keeps its run in MLflow; the copy gets a run of its own there.
+
+    Raises:
+        OSError: it cannot be copied.
+    """
+    base = run_dir.name.partition("-attempt")[0]
+    target = run_dir.with_name(f"{base}-attempt{attempt}")
+    # Files and checkpoints are written under a name with a dot first.
+    left_out = shutil.ignore_patterns(SUMMARY, ".*")
+    aside = target.with_name(f".{target.name}.{os.getpid()}")
+    shutil.copytree(run_dir, aside, symlinks=True, ignore=left_out)
+    if (aside / TRACKING).exists():
+        tracking_file.begin_again(aside / TRACKING, target)
+    aside.replace(target)
+    return target
 
 
 def read_files(experiment: Experiment) -> RaceSetup:
@@ -117,26 +159,28 @@ def _begin(
     composition: Composition,
     console: Console,
     start: tuple[ActorCritic, Lineage] | None,
-    watch: Watch | None,
-) -> Training:
+    callbacks: Sequence[Callback],
+    run_name: str | None,
+    tags: Mapping[str, str],
+) -> Trainer:
+    """Create the folder of a new run and record it."""
     setup = read_files(experiment)
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
-    Alerts(experiment.budget)  # refuses what can never be told
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
-    lineage = None if start is None else start[1]
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
+    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
     label = f"{names['track']}-{names['reward']}-seed{experiment.seed}"
-    if lineage is not None:
-        label += f"-clone{lineage.generation}"
+    if start is not None:
+        label += f"-clone{start[1].generation}"
     folder = RunFolder.create(experiment.runs_dir, experiment.name, label)
     try:
-        training = Training(experiment, setup, folder, composition.mapping, names, tracker, console, watch)
+        trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
-            training.networks.load_state_dict(start[0].state_dict())
+            trainer.networks.load_state_dict(start[0].state_dict())
             folder.write(LINEAGE, json.dumps(asdict(start[1]), indent=2) + "\n")
-        if watch is not None:
-            watch.begins(folder.path)
-        training.save_start()
+        for callback in every:
+            callback.on_run_created(trainer)
+        trainer.save()
         commit = folder.describe(composition, setup.reward, experiment.seed, names)
     except (OSError, RunFailed) as error:
         folder.remove()
@@ -149,85 +193,90 @@ def _begin(
         raise
     for note in composition.notes:
         logger.info(note)
-    _track(tracker, folder, experiment, composition, names, setup, commit, watch)
-    return training
+    _track(tracker, trainer, composition, names, commit, run_name, tags)
+    return trainer
 
 
 def _track(
     tracker: Tracker,
-    folder: RunFolder,
-    experiment: Experiment,
+    trainer: Trainer,
     composition: Composition,
     names: Mapping[str, str],
-    setup: RaceSetup,
     commit: str | None,
-    watch: Watch | None,
+    run_name: str | None,
+    tags: Mapping[str, str],
 ) -> None:
-    """Begin to record a run that no tracker has heard of."""
+    """Start to record a run that the tracker does not know."""
+    folder, experiment = trainer.folder, trainer.experiment
     lineage = read_lineage(folder.path)
-    tags = run_tags(names, commit, setup.reward.sha256, folder.path.resolve())
+    own = run_tags(names, commit, trainer.setup.reward.sha256, folder.path.resolve())
     if lineage is not None:
-        tags |= lineage_tags(lineage)
-    if watch is not None:
-        tags |= watch.tags
+        own |= lineage_tags(lineage)
     # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
     what = names["reward"] if lineage is None else f"clone {lineage.generation}"
-    title = f"{what} s{experiment.seed} {time.strftime('%H:%M:%S')}" if watch is None else watch.title
     tracker.start(
-        title,
+        run_name or f"{what} s{experiment.seed} {time.strftime('%H:%M:%S')}",
         experiment.name,
         run_params(composition.choices, names, composition.mapping, composition.overrides),
-        tags,
-        identity=folder.path / tracking_file.NAME,
+        {**own, **tags},
+        identity=folder.path / TRACKING,
     )
 
 
-def _resumed(run_dir: Path, overrides: Sequence[str], console: Console, watch: Watch | None) -> Training:
+def _reopen(
+    run_dir: Path,
+    overrides: Sequence[str],
+    console: Console,
+    callbacks: Sequence[Callback],
+    run_name: str | None,
+    tags: Mapping[str, str],
+) -> Trainer:
+    """Return a run to its last checkpoint."""
     stored = read_config(run_dir)
-    provenance = read_object(run_dir / "provenance.json")
+    provenance = read_object(run_dir / PROVENANCE)
     names = provenance.get("names", {})
     composition = with_overrides(stored, names, overrides)
     # The folder may have been moved with the one it lies in.
     composition.mapping["runs_dir"] = str(run_dir.parent.parent)
-    experiment = validate(composition.mapping)
+    experiment = parse_experiment(composition.mapping)
     _refuse_ended(run_dir, experiment, "stopping" in map(group_of, overrides))
     setup = read_files(experiment)
-    checkpoint = intact_checkpoint(run_dir / "checkpoints", "last", resumable=True)
+    checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
     state = read_training(checkpoint)
     refuse_changes(run_dir, state, composition.mapping, setup)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
+    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
     folder = RunFolder(run_dir)
     iteration = state["iteration"]
     try:
-        training = Training(experiment, setup, folder, stored, names, tracker, console, watch)
-        rows = training.rows_until(iteration)
+        trainer = Trainer(experiment, setup, folder, stored, every)
+        rows = [row for row in folder.metrics() if row["iteration"] <= iteration]
         if len(rows) != iteration:
             raise BadInput(
-                f"{run_dir / 'metrics.jsonl'}: has {len(rows)} of the {iteration} rows up to the checkpoint; restore "
-                "the file, or train on from the checkpoint with `deepracer-exp clone`"
+                f"{run_dir / METRICS}: has {len(rows)} of the {iteration} rows up to the checkpoint; restore "
+                "the file, or start a new run from the checkpoint with `deepracer-exp clone`"
             )
-        training.resume_from(checkpoint, state, rows)
-        if (folder.path / tracking_file.NAME).exists():
-            tracker.reopen(folder.path / tracking_file.NAME)
+        trainer.load(checkpoint, state)
+        if (folder.path / TRACKING).exists():
+            tracker.reopen(folder.path / TRACKING)
         else:  # killed before it was recorded, or trained with tracking=off
-            commit = provenance.get("git_commit")
-            _track(tracker, folder, experiment, composition, names, setup, commit, watch)
+            _track(tracker, trainer, composition, names, provenance.get("git_commit"), run_name, tags)
     except BadInput:
         folder.release()
         raise
-    training.tell_again(rows)
-    if read_object(run_dir / "summary.json").get("stopping"):
+    rows = trainer.replay(rows)
+    if read_object(run_dir / SUMMARY).get("stopping"):
         for tag, value in UNDECIDED.items():
             tracker.set_tag(tag, value)
     folder.rewind(rows)
-    training.checkpoints.rewind(iteration, (state["best"] or {}).get("iteration"))
-    folder.write("config.yaml", composition.yaml())
+    trainer.checkpoints.rewind(iteration, (state["best"] or {}).get("iteration"))
+    folder.write(CONFIG, composition.yaml())
     where = f"resumes after iteration {iteration}" if iteration else "had no checkpoint yet: begins again"
     logger.info(where)
     _printing(console)(f"{run_dir.name}: {where}")
-    for why in _not_the_same(experiment, setup):
+    for why in _differences_to_uninterrupted(experiment, setup):
         logger.warning("the result will not be that of an uninterrupted run: %s", why)
-    return training
+    return trainer
 
 
 def _printing(console: Console) -> Callable[[str], None]:
@@ -235,52 +284,56 @@ def _printing(console: Console) -> Callable[[str], None]:
     return lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _run(training: Training, interruption: Interruption) -> Outcome:
+def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
+    """Train, and write how it ended, whatever ends it."""
     try:
-        reason = training.drive_and_learn(interruption)
+        reason = trainer.fit(interruption)
         code = interruption.exit_code
-        return training.close(training.verdict if code is None else "interrupted", reason, code or 0)
-    except (RunFailed, BadInput) as error:  # BadInput: what it wrote itself is gone or was changed
-        return training.fail(str(error), error)
+        return trainer.end(trainer.status if code is None else INTERRUPTED, reason, code or 0)
+    except (RunFailed, BadInput) as error:  # BadInput: a file of the run was removed or changed meanwhile
+        return trainer.fail(str(error), error)
     except OSError as error:
-        return training.fail(f"{error.filename or training.folder.path}: {error.strerror or error}", error)
+        return trainer.fail(f"{error.filename or trainer.folder.path}: {error.strerror or error}", error)
     except TakenOver:
-        training.let_go()
+        trainer.release()
         raise
     except KeyboardInterrupt:
-        return training.break_off(interruption.exit_code or 130)
+        # No checkpoint, which might be of a half-made update, and no pictures.
+        return trainer.end(INTERRUPTED, "ended at once by a second signal", interruption.exit_code or 130)
     except Exception as error:
-        # A fault of ours: told with its traceback, but the run must not look as if it went on.
-        training.fail(f"{type(error).__name__}: {error}", error)
+        # A bug: its traceback is shown, but the run must not look as if it were running.
+        trainer.fail(f"{type(error).__name__}: {error}", error)
         raise
 
 
 def _refuse_ended(run_dir: Path, experiment: Experiment, rule_given: bool) -> None:
-    """Refuse to go on with a run that is over.
+    """Refuse to resume a run that has ended.
 
     Args:
         run_dir: its folder.
-        experiment: it is to go on with.
-        rule_given: whether it is to have another stopping rule. What ended it, a rule of its own or a comparison with
-            others, does not count then; a budget that is still spent does.
+        experiment: to resume it with.
+        rule_given: whether it gets another stopping rule. What ended it, a rule of its own or a comparison with
+            others, does not count then; a budget that is still used up does.
     """
-    summary = read_object(run_dir / "summary.json")
+    summary = read_object(run_dir / SUMMARY)
     status, reason = summary.get("status"), str(summary.get("reason"))
-    if status is None or status in _AGAIN:
+    if status is None or status in (INTERRUPTED, FAILED):
         return
-    if not reason.startswith(SPENT):
+    if not reason.startswith(BUDGET_REACHED):
         if rule_given:
             return
         raise RunEnded(
-            f"{run_dir}: has ended ({status}: {reason}); stopping=none lets it go on, `deepracer-exp clone "
-            f"run={run_dir.name}` begins a new run with its best checkpoint"
+            f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it all the same, `deepracer-exp clone "
+            f"{run_dir.name}` starts a new run from its best checkpoint"
         )
     used = Budget(experiment.budget).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
     if used[1] >= 1:
-        raise RunEnded(f"{run_dir}: has ended ({reason}); to go on give it more, such as budget.{used[0]}=")
+        raise RunEnded(
+            f"{run_dir}: has ended ({reason}); to resume it give it more, such as budget.{used[0]}="
+        )
 
 
-def _not_the_same(experiment: Experiment, setup: RaceSetup) -> list[str]:
+def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:
     """Return why a resumed run cannot equal an uninterrupted one bit for bit."""
     why = []
     if experiment.collector.mode == "async":

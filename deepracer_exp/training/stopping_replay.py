@@ -10,9 +10,8 @@ from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.run_files import RunRecord
-
-from .stopping import Decision, Row, Stopping
+from deepracer_exp.runs.convergence import Decision, Row, Stopping
+from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord
 
 NOTHING = "\N{EN DASH}"
 
@@ -62,7 +61,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
     """
     rows = record.rows
     if not rows:
-        raise BadInput(f"{record.path / 'metrics.jsonl'}: has no iteration; nothing to apply a rule to")
+        raise BadInput(f"{record.path / METRICS}: has no iteration; nothing to apply a rule to")
     if isinstance(config, ReliableStopping):
         _check_memory(record, config)
     stopping = Stopping(config, action_count(record))
@@ -128,7 +127,7 @@ def _observed(stopping: Stopping, row: Row, record: RunRecord, number: int) -> D
         return stopping.observe(row)
     except KeyError as error:
         raise BadInput(
-            f"{record.path / 'metrics.jsonl'} line {number}: has no {error.args[0]}; this is no row of a training"
+            f"{record.path / METRICS} line {number}: has no {error.args[0]}; this is no row of a training"
         ) from error
 
 
@@ -152,9 +151,7 @@ def action_count(record: RunRecord) -> int | None:
         adapter: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
         space = adapter.validate_python(record.config.get("action_space"))
     except ValidationError as error:
-        raise BadInput(
-            f"{record.path / 'config.yaml'}: action_space: {error.errors()[0]['msg'].lower()}"
-        ) from error
+        raise BadInput(f"{record.path / CONFIG}: action_space: {error.errors()[0]['msg'].lower()}") from error
     return build_action_space(space).n
 
 

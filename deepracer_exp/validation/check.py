@@ -1,4 +1,4 @@
-"""Everything that is found out about a reward function without training."""
+"""Check a reward function without training: call it in many situations and collect failures and warnings."""
 
 import time
 from contextlib import nullcontext
@@ -9,34 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.reward import RewardFailed
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput
+from deepracer_exp.rewards.reward import RewardFailed
 from deepracer_exp.tracks.track import Track
 
 from . import pitfalls
-from .console import console_findings
-from .coverage import Coverage, never_executed
-from .findings import Finding
-from .laps import action_space_laps
-from .probe import NOT_CALLED, Answer, Probe
-from .scenes import Scene, sample, scenes, seam
-from .situations import Situations, situations
-from .survey import Memory, Survey, Surveyor, memory_of, survey
+from .console import ConsoleFinding, console_findings
+from .pitfalls import action_space_laps
+from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
+from .reward_grid import RewardGrid, RewardSampler, State, sample_reward_grid, state_of
+from .situations import NamedSituation, Situations, named_situations, sample, seam, situations
 
 _WARM = 25
-"""Situations by which the time of a call is judged; the first calls may compute much."""
+"""Situations by which the time of a call is measured; the first calls may fill caches."""
 _SAMPLES = ((0.5e-3, 2000), (2.5e-3, 400), (float("inf"), 80))
-"""How many situations are sampled, by CPU seconds a call: about one second."""
+"""Number of sampled situations by CPU seconds per call, about one second in total."""
 _DETAILS = ((0.3e-3, 1.0), (3e-3, 0.5), (30e-3, 0.25))
-"""How finely the map is drawn, likewise."""
+"""Resolution of the map by CPU seconds per call."""
 _SLOW_S = 1e-3
-"""A step of the default 64 cars a process takes 5 ms without the reward."""
+"""Without the reward, a step of the default 64 cars per process takes 5 ms."""
 
 
 @dataclass(frozen=True)
-class Trying:
-    """One named situation and what the function made of it."""
+class SituationResult:
+    """A named situation and the reward it gets."""
 
     name: str
     answer: Answer
@@ -45,31 +42,31 @@ class Trying:
 
 @dataclass(kw_only=True)
 class Check:
-    """What was found out."""
+    """Findings about one reward function."""
 
     setup: RaceSetup
-    console: list[Finding]
-    tried: list[Trying] = field(default_factory=list)
+    console: list[ConsoleFinding]
+    tried: list[SituationResult] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
-    """Why a training could not use the function."""
+    """Reasons why a training cannot use the function."""
     warnings: list[str] = field(default_factory=list)
     situations: int = 0
-    """How many were looked at."""
+    """Number of situations sampled."""
     lowest: float = float("nan")
     highest: float = float("nan")
-    memory: Memory = "none"
+    state: State = "none"
     detail: float | None = None
-    """Of the map; None: there is none, since a call takes too long."""
-    surveyor: Surveyor | None = None
-    survey: Survey | None = None
+    """Resolution of the map; None: no map, because a call takes too long."""
+    sampler: RewardSampler | None = None
+    grid: RewardGrid | None = None
 
 
 def read(experiment: Experiment) -> Check:
-    """Read the files of an experiment and look at the text of its reward function, without running it.
+    """Read an experiment's files and check the text of its reward function without running it.
 
     Raises:
-        BadInput: a file cannot be used; what is no valid Python, or has no `reward_function` of one argument;
-            several tracks.
+        BadInput: a file cannot be used; the reward is not valid Python or lacks a one-argument `reward_function`;
+            there are several tracks.
     """
     if len(experiment.tracks) > 1:
         names = ", ".join(experiment.tracks)
@@ -77,74 +74,72 @@ def read(experiment: Experiment) -> Check:
             f"track=[{names}]: a reward function is validated on one track; accepted: one of these"
         )
     setup = build_setup(experiment)
-    # Of a track that is driven in both directions the first is looked at.
+    # A track driven in both directions is checked in its first direction.
     return Check(setup=setup.on(setup.track), console=console_findings(setup.reward.text))
 
 
-def try_scenes(check: Check, against: Track) -> None:
-    """Call the function in the named situations; each time in a module of its own, as in a new process.
+def try_named_situations(check: Check, against: Track) -> None:
+    """Call the function in the named situations, each time in a freshly loaded module, and add the results to `check`.
 
     Args:
-        check: what is known; added to.
+        check: from `read`.
         against: the track in the other direction.
 
     Raises:
-        BadInput: the module cannot be run.
+        BadInput: the module cannot be loaded.
     """
     setup = check.setup
     hangs = False
-    for scene in scenes(setup, against):
+    for case in named_situations(setup, against):
         probe = Probe(setup.reward, setup.reward_time_limit_s)
-        answer = Answer(float("nan"), NOT_CALLED) if hangs else _act(probe, scene)
+        answer = Answer(float("nan"), NOT_CALLED) if hangs else _act(probe, case)
         if probe.failures:
             answer = replace(answer, failure=_with_line(setup, *probe.failures[0]))
         hangs = hangs or probe.hangs
-        taken = None if answer.failure else probe.median_s(next(scene.now.params()))
-        check.tried.append(Trying(scene.name, answer, None if taken is None else taken * 1e6))
+        taken = None if answer.failure else probe.median_s(next(case.now.params()))
+        check.tried.append(SituationResult(case.name, answer, None if taken is None else taken * 1e6))
     failed = {tried.answer.failure for tried in check.tried} - {None, NOT_CALLED}
     for what in sorted(map(str, failed)):
         names = [tried.name for tried in check.tried if tried.answer.failure == what]
         check.failures.append(f"{what}, at {', '.join(names)}")
 
 
-def _act(probe: Probe, scene: Scene) -> Answer:
-    """Ask what a scene pays, after what came before it."""
-    if scene.before is not None:
-        before = probe.ask(next(scene.before.params()))
+def _act(probe: Probe, case: NamedSituation) -> Answer:
+    """Return the reward of a named situation, after the step before it."""
+    if case.before is not None:
+        before = probe.call(next(case.before.params()))
         if before.failure:
             return before
-    return probe.ask(next(scene.now.params()))
+    return probe.call(next(case.now.params()))
 
 
 def look_closer(check: Check, against: Track) -> None:
-    """Call the function in many situations and note what may go wrong; adds to `check`."""
+    """Call the function in many situations and add failures, warnings and the reward grid to `check`."""
     setup, source = check.setup, check.setup.reward
     probe = Probe(source, setup.reward_time_limit_s)
     plain_s = _cpu_s_per_call(probe, setup)
     check.detail = next((detail for limit_s, detail in _DETAILS if plain_s < limit_s), None)
     if not probe.hangs:
-        check.memory = memory_of(setup, Probe(source, setup.reward_time_limit_s), 40 if check.detail else 5)
+        check.state = state_of(setup, Probe(source, setup.reward_time_limit_s), 40 if check.detail else 5)
         executed, n = _execute_scenes(probe, setup, against) if check.detail else (None, _SAMPLES[-1][1])
-        asked, rewards = _sample(check, probe, executed, n)
-    check.failures += _told(setup, probe, check.situations)
+        sampled, rewards = _sample(check, probe, executed, n)
+    check.failures += _failures(setup, probe, check.situations)
     if check.failures:
         return
 
-    last_point = Probe(source, setup.reward_time_limit_s).ask(next(seam(setup).params()))
+    last_point = Probe(source, setup.reward_time_limit_s).call(next(seam(setup).params()))
     if last_point.failure:
-        check.warnings.append(
-            f"where the last waypoint is behind and the first ahead, which are one place: {last_point.failure}"
-        )
+        check.warnings.append(f"at the finish, between the last waypoint and the first: {last_point.failure}")
     if plain_s > _SLOW_S:
         waits = f"a step of 64 cars waits {64 * plain_s:.2g} s for it"
         check.warnings.append(f"takes {plain_s * 1e3:.2g} ms of CPU a call: {waits}")
-    if check.memory == "chance":
+    if check.state == "randomness":
         check.warnings.append(
-            "pays differently for the same calls: it draws random numbers or looks at a clock"
+            "returns different rewards for the same calls: it draws random numbers or reads a clock"
         )
-    elif check.memory == "none":
+    elif check.state == "none":
         try:
-            check.warnings += pitfalls.batch_differs(setup, asked, rewards)
+            check.warnings += pitfalls.batch_differs(setup, sampled, rewards)
         except (BadInput, RewardFailed) as error:
             check.failures.append(str(error))
             return
@@ -154,22 +149,22 @@ def look_closer(check: Check, against: Track) -> None:
         check.warnings += _unreached(source.text, executed.lines, check.situations)
     if check.detail is None:
         return
-    check.surveyor = Surveyor(setup, check.memory)
-    check.survey = survey(setup, check.surveyor, check.detail)
-    if constant:  # which the other warnings would only say in other words
+    check.sampler = RewardSampler(setup, check.state)
+    check.grid = sample_reward_grid(setup, check.sampler, check.detail)
+    if constant:  # the other warnings would only repeat it
         return
     laps = action_space_laps(setup)
-    check.warnings += pitfalls.pays_off_the_road(check.survey)
+    check.warnings += pitfalls.pays_off_the_road(check.grid)
     check.warnings += pitfalls.pays_for_standing(setup, laps)
     check.warnings += pitfalls.pays_for_slowness(setup, laps)
 
 
 def _execute_scenes(probe: Probe, setup: RaceSetup, against: Track) -> tuple[Coverage, int]:
-    """Note the lines executed in the named situations; return them, and how many more situations to look at."""
+    """Return the lines executed in the named situations, and how many more situations to sample."""
     with Coverage(setup.reward.path) as executed:
-        for scene in scenes(setup, against):
-            _act(probe, scene)
-        Probe(setup.reward, setup.reward_time_limit_s).ask(next(seam(setup).params()))
+        for case in named_situations(setup, against):
+            _act(probe, case)
+        Probe(setup.reward, setup.reward_time_limit_s).call(next(seam(setup).params()))
         traced_s = _cpu_s_per_call(probe, setup)
     return executed, next(n for limit_s, n in _SAMPLES if traced_s < limit_s)
 
@@ -177,13 +172,13 @@ def _execute_scenes(probe: Probe, setup: RaceSetup, against: Track) -> tuple[Cov
 def _sample(
     check: Check, probe: Probe, executed: Coverage | None, n: int
 ) -> tuple[Situations, NDArray[np.float64]]:
-    """Ask in n situations and note what is paid; return both."""
+    """Return n sampled situations and their rewards; adds the range of rewards to `check`."""
     setup = check.setup
     at = sample(setup, n)
     now = situations(setup, at)
     before = situations(setup, at, earlier=True)
     with executed or nullcontext():
-        rewards = probe.rewards(now, before if check.memory == "earlier calls" else None)
+        rewards = probe.rewards(now, before if check.state == "earlier calls" else None)
     check.situations = n + len(check.tried)
     known = rewards[np.isfinite(rewards)]
     if len(known):
@@ -198,11 +193,11 @@ def other_direction(experiment: Experiment) -> Track:
 
 
 def _cpu_s_per_call(probe: Probe, setup: RaceSetup) -> float:
-    """Return the median CPU time of a call, which does not depend on what else the machine does."""
+    """Return the median CPU time of a call in seconds, which does not depend on the load of the machine."""
     times: list[float] = []
     for params in situations(setup, sample(setup, _WARM)).params():
         began = time.thread_time()
-        probe.ask(params)
+        probe.call(params)
         times.append(time.thread_time() - began)
         if len(times) >= 3 and sum(times) > 0.5:
             break
@@ -210,16 +205,16 @@ def _cpu_s_per_call(probe: Probe, setup: RaceSetup) -> float:
 
 
 def _with_line(setup: RaceSetup, what: str, params: dict[str, Any]) -> str:
-    """Add the line from which something was returned that is no reward; it is found by calling once more."""
+    """Prefix a bad return value with its line number, found by calling the function once more."""
     if not what.startswith("returned"):
         return what
     with Coverage(setup.reward.path) as coverage:
-        again = Probe(setup.reward, setup.reward_time_limit_s).ask(params)
+        again = Probe(setup.reward, setup.reward_time_limit_s).call(params)
     return f"line {coverage.returned_at} {what}" if again.failure == what else what
 
 
-def _told(setup: RaceSetup, probe: Probe, of: int) -> list[str]:
-    """Return each kind of failure once, with its first situation."""
+def _failures(setup: RaceSetup, probe: Probe, of: int) -> list[str]:
+    """Return each kind of failure once, with the first situation in which it occurred."""
     counts: dict[str, int] = {}
     first: dict[str, str] = {}
     for what, params in probe.failures:
@@ -238,10 +233,10 @@ def _told(setup: RaceSetup, probe: Probe, of: int) -> list[str]:
 
 def _unreached(text: str, lines: set[int], of: int) -> list[str]:
     written = text.splitlines()
-    told = []
+    warnings = []
     for first, last in never_executed(text, lines):
         place = f"line {first}" if first == last else f"lines {first} to {last}"
-        told.append(f"never gets to {place} in {of:,} situations: {written[first - 1].strip()}")
-    if told and ("object" in text or "is_crashed" in text):
-        told[-1] += "  (there are no objects on the road here)"
-    return told
+        warnings.append(f"never reaches {place} in {of:,} situations: {written[first - 1].strip()}")
+    if warnings and ("object" in text or "is_crashed" in text):
+        warnings[-1] += "  (there are no objects on the track here)"
+    return warnings

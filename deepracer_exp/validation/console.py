@@ -1,32 +1,91 @@
-"""What the AWS console would say of a reward function before it lets a training begin."""
+"""The checks that the AWS console runs on a reward function before it starts a training."""
 
 import ast
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
-from .findings import Finding
-from .style import style_findings
+import pycodestyle
+from pyflakes.checker import Checker as Flakes
+
+
+@dataclass(frozen=True, order=True)
+class ConsoleFinding:
+    """One line the AWS console would reject."""
+
+    line: int
+    """Counted from 1; 0: the whole file."""
+    text: str
+
+    def __str__(self) -> str:
+        """Return `line N: text`."""
+        return f"line {self.line}: {self.text}" if self.line else self.text
+
+
+_IGNORED = ("W", "E5", "E226", "E261")
+"""The console runs flake8 with the codes E and F without these (deepracer-on-aws, test_reward_function.py)."""
+_NOQA = re.compile(r"#\s*noqa(?::(?P<codes>[\s\w,]+))?", re.IGNORECASE)
+
+
+class _Report(pycodestyle.BaseReport):
+    """Keeps every finding, where the base class only counts them."""
+
+    def __init__(self, options: Any) -> None:
+        super().__init__(options)
+        self.found: list[ConsoleFinding] = []
+
+    def error(self, line_number: int, offset: int, text: str, check: Any) -> str | None:
+        # The base class returns None for ignored codes.
+        code: str | None = super().error(line_number, offset, text, check)
+        if code:
+            self.found.append(ConsoleFinding(line_number, text))
+        return code
+
+
+def style_findings(text: str) -> list[ConsoleFinding]:
+    """Return flake8's E and F findings in valid Python, as pycodestyle and pyflakes report them, by line.
+
+    Lines with a comment `# noqa` are skipped, as in flake8.
+    """
+    lines = text.splitlines(keepends=True)
+    guide = pycodestyle.StyleGuide(ignore=list(_IGNORED), reporter=_Report)
+    pycodestyle.Checker(lines=lines, options=guide.options).check_all()
+    found = {(finding, finding.text[:4]) for finding in guide.options.report.found}
+    for message in Flakes(ast.parse(text)).messages:
+        found.add((ConsoleFinding(message.lineno, f"F {message.message % message.message_args}"), "F"))
+    return sorted(finding for finding, code in found if not _excused(lines, finding.line, code))
+
+
+def _excused(lines: list[str], line: int, code: str) -> bool:
+    match = _NOQA.search(lines[line - 1]) if 0 < line <= len(lines) else None
+    if match is None:
+        return False
+    codes = re.findall(r"[A-Z]+[0-9]*", (match["codes"] or "").upper())
+    # pyflakes' messages lack flake8's numbers: any F code excuses them.
+    return not codes or any(code.startswith(c) if code != "F" else c.startswith("F") for c in codes)
+
 
 LONGEST = 140_000
-"""Characters of code the console takes."""
+"""Longest code the console accepts, in characters."""
 IMPORTS = ("math", "random", "numpy", "scipy", "shapely")
 BUILTINS = ("open", "exec", "eval", "compile", "input")
 WORDS = (
     *("__import__", "load", "fromfile", "genfromtxt", "loadtxt", "tofile", "savez", "save", "savetxt"),
     "memmap",
 )
-"""Forbidden anywhere in the text, even inside a longer word."""
+"""Forbidden anywhere in the text, even as part of a longer word."""
 
 
-def console_findings(text: str) -> list[Finding]:
-    """Return why the console would refuse a reward function, by line; an empty list: it would not.
+def console_findings(text: str) -> list[ConsoleFinding]:
+    """Return the reasons, by line, why the console would reject a reward function; empty if it would accept it.
 
-    The rules are those of deepracer-on-aws, source/libs/reward-function-validation. Its dry run is not among
-    them: ours has the same situations and more. The text must be valid Python.
+    The rules are those of deepracer-on-aws, source/libs/reward-function-validation. Its dry run is left out:
+    ours covers the same situations and more. The text must be valid Python.
     """
-    found: list[Finding] = []
+    found: list[ConsoleFinding] = []
     if len(text) > LONGEST:
-        found.append(Finding(0, f"{len(text):,} characters of code; at most {LONGEST:,} are taken"))
+        found.append(ConsoleFinding(0, f"{len(text):,} characters of code; at most {LONGEST:,} are accepted"))
     tree = ast.parse(text)
     found += _imports(tree)
     found += _builtins(tree)
@@ -34,7 +93,7 @@ def console_findings(text: str) -> list[Finding]:
     return sorted({*found, *style_findings(text)})
 
 
-def _imports(tree: ast.Module) -> Iterator[Finding]:
+def _imports(tree: ast.Module) -> Iterator[ConsoleFinding]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -44,23 +103,23 @@ def _imports(tree: ast.Module) -> Iterator[Finding]:
             continue
         for name in names:
             if name.split(".")[0] not in IMPORTS:
-                yield Finding(node.lineno, f"import of {name}; allowed are {', '.join(IMPORTS)}")
+                yield ConsoleFinding(node.lineno, f"import of {name}; allowed are {', '.join(IMPORTS)}")
         if node not in tree.body:
-            yield Finding(node.lineno, "an import that is not at the top of the file")
+            yield ConsoleFinding(node.lineno, "an import that is not at the top of the file")
 
 
-def _builtins(tree: ast.Module) -> Iterator[Finding]:
+def _builtins(tree: ast.Module) -> Iterator[ConsoleFinding]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Name) and node.id in BUILTINS:
-            yield Finding(node.lineno, f"use of {node.id}, which is forbidden")
+            yield ConsoleFinding(node.lineno, f"use of {node.id}, which is forbidden")
 
 
-def _words(text: str) -> Iterator[Finding]:
-    # The longest first, so that `loadtxt` is told as itself and not as `load`.
+def _words(text: str) -> Iterator[ConsoleFinding]:
+    # The longest first, so that `loadtxt` is reported as itself and not as `load`.
     words = sorted(WORDS, key=len, reverse=True)
     for number, line in enumerate(text.splitlines(), 1):
         for token in re.findall(r"\w+", line):
             word = next((word for word in words if word in token), None)
             if word is not None:
                 inside = f" (in {token})" if token != word else ""
-                yield Finding(number, f"the word {word}{inside}, forbidden anywhere in the text")
+                yield ConsoleFinding(number, f"the word {word}{inside}, forbidden anywhere in the text")

@@ -1,45 +1,48 @@
-"""Calls a reward function in one situation after the other and notes what comes of it."""
+"""Call a reward function in one situation after another, recording rewards, failures and executed lines."""
 
+import ast
+import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from statistics import median
+from types import FrameType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.env.reward import RewardFailed, RewardFunction
-from deepracer_exp.env.reward_guard import CtrlC, Guard, Misconduct
-from deepracer_exp.env.reward_source import RewardSource
+from deepracer_exp.rewards.guard import CtrlC, Guard, Misconduct
+from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
+from deepracer_exp.rewards.source import RewardSource
 
 from .situations import Situations
 
 NOT_CALLED = "not called"
-"""The failure of a call that was left out, since an earlier one hung."""
+"""The failure of a call that was skipped because an earlier one hung."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a call came to."""
+    """Result of a call."""
 
     reward: float
     """NaN where it failed."""
     failure: str | None = None
-    """What went wrong, and in which line."""
+    """Error message with its line number."""
 
 
 class Probe:
-    """A reward module, loaded once as for one car.
+    """A reward module loaded for one car.
 
     Attributes:
-        failures: what went wrong so far, with the params it went wrong with, in the order of the calls.
-        hangs: a call took longer than the time limit, or spoiled what everything uses; from then on every call counts
-            as failed unasked.
+        failures: error messages and the params that caused them, in the order of the calls.
+        hangs: a call exceeded the time limit or damaged the interpreter's shared state; every later call counts as
+            failed without being made.
 
     Raises:
-        BadInput: The module cannot be run.
+        BadInput: the module cannot be loaded.
     """
 
     def __init__(self, source: RewardSource, time_limit_s: float):
@@ -47,34 +50,34 @@ class Probe:
 
         Args:
             source: the module.
-            time_limit_s: seconds of CPU of a single call.
+            time_limit_s: CPU seconds of a single call.
         """
         self._function = RewardFunction(source, 1, time_limit_s, None, scalar=True)
         self.failures: list[tuple[str, dict[str, Any]]] = []
         self.hangs = False
 
-    def ask(self, params: dict[str, Any]) -> Answer:
+    def call(self, params: dict[str, Any]) -> Answer:
         """Call the function once."""
         return self._answers([params])[-1]
 
-    def rewards(self, asked: Situations, before: Situations | None = None) -> NDArray[np.float64]:
-        """Return the reward of each situation, (n,), called in their order; NaN where the call failed.
+    def rewards(self, situations: Situations, before: Situations | None = None) -> NDArray[np.float64]:
+        """Return the reward of each situation in order, (n,); NaN where the call failed.
 
         Args:
-            asked: n situations.
-            before: what the function is called with just before each of them, n situations; None: nothing.
+            situations: n situations.
+            before: n situations, each passed to the function just before its counterpart; None: nothing.
         """
         if before is None:
-            answers = self._answers(asked.params())[: len(asked)]
+            answers = self._answers(situations.params())[: len(situations)]
         else:
-            both = chain.from_iterable(zip(before.params(), asked.params(), strict=True))
-            answers = self._answers(both)[1 : 2 * len(asked) : 2]
+            both = chain.from_iterable(zip(before.params(), situations.params(), strict=True))
+            answers = self._answers(both)[1 : 2 * len(situations) : 2]
         return np.array([answer.reward for answer in answers])
 
-    def _answers(self, asked: Iterable[dict[str, Any]]) -> list[Answer]:
-        """Call the function with each; behind the answers stands what only the end of all calls showed."""
+    def _answers(self, calls: Iterable[dict[str, Any]]) -> list[Answer]:
+        """Call the function with each params; an error that shows only after the last call is appended."""
         answers: list[Answer] = []
-        waiting = iter(asked)
+        waiting = iter(calls)
         params: dict[str, Any] = {}
         try:
             with Guard(self._function.time_limit_s) as guard:
@@ -97,9 +100,9 @@ class Probe:
         return answers
 
     def median_s(self, params: dict[str, Any]) -> float | None:
-        """Return the median time of a call, of as many as fit into 50 ms, 3 to 1000.
+        """Return the median time of a call in seconds, over as many calls as fit into 50 ms (3 to 1000).
 
-        None: a function with a memory fails when it is given the same params again.
+        None: the function keeps state and fails when it is called with the same params again.
         """
         call = self._function.functions[0]
         times: list[float] = []
@@ -112,6 +115,91 @@ class Probe:
                     times.append(time.perf_counter() - began)
         except CtrlC:
             raise
-        except BaseException:  # noqa: BLE001 - told where the car stands still and the same happens
+        except BaseException:  # noqa: BLE001 - reported by the check for standing still, where the same happens
             return None
         return median(times)
+
+
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
+
+
+class Coverage:
+    """Record which lines of one file are executed inside the `with` block.
+
+    A tracer that was active before (a debugger's, a coverage tool's) is suspended meanwhile.
+    """
+
+    def __init__(self, path: str):
+        """Watch the functions of the file `path`, under which it was compiled."""
+        self._path = path
+        self._before: Any = None
+        self.lines: set[int] = set()
+        self.returned_at: int | None = None
+        """The line from which the last call returned."""
+
+    def __enter__(self) -> "Coverage":
+        """Begin to watch."""
+        self._before = sys.gettrace()
+        sys.settrace(self._called)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop."""
+        sys.settrace(self._before)
+
+    def _called(self, frame: FrameType, event: str, arg: Any) -> Any:
+        return self._executed if frame.f_code.co_filename == self._path else None
+
+    def _executed(self, frame: FrameType, event: str, arg: Any) -> Any:
+        if event == "line":
+            self.lines.add(frame.f_lineno)
+        elif event == "return":
+            self.returned_at = frame.f_lineno
+        return self._executed
+
+
+def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
+    """Return the statements that were never executed, as (first, last) lines, adjacent ones joined.
+
+    Only functions of which some line was executed are considered; error handling is left out: handlers, `raise`,
+    `assert`.
+
+    Args:
+        text: the module.
+        lines: numbers of the executed lines.
+    """
+    missed: list[tuple[int, int]] = []
+    for function in ast.walk(ast.parse(text)):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        own = range(function.body[0].lineno, (function.end_lineno or 0) + 1)
+        if lines.isdisjoint(own):
+            continue
+        for first, last in _missed(function.body, lines):
+            if missed and missed[-1][1] >= first - 1:
+                missed[-1] = missed[-1][0], max(last, missed[-1][1])
+            else:
+                missed.append((first, last))
+    return sorted(missed)
+
+
+def _missed(body: list[ast.stmt], lines: set[int]) -> Iterator[tuple[int, int]]:
+    for statement in body:
+        first, last = statement.lineno, statement.end_lineno or statement.lineno
+        if lines.isdisjoint(range(first, last + 1)):
+            if not _has_no_line(statement):
+                yield first, last
+        elif not isinstance(statement, _FUNCTIONS):
+            for block in ("body", "orelse", "finalbody"):
+                yield from _missed(getattr(statement, block, []), lines)
+            for case in getattr(statement, "cases", []):
+                yield from _missed(case.body, lines)
+
+
+def _has_no_line(statement: ast.stmt) -> bool:
+    """Return whether a statement is not traced when it is executed, or need not be executed."""
+    if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+        return True  # a docstring
+    return isinstance(
+        statement, ast.Raise | ast.Assert | ast.Global | ast.Nonlocal | ast.Pass | ast.FunctionDef
+    )

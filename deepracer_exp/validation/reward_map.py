@@ -1,4 +1,4 @@
-"""The picture that shows what a reward function pays for."""
+"""Draw the reward map: the track coloured by reward, and cuts by speed, heading, offset and command."""
 
 from pathlib import Path
 
@@ -17,35 +17,35 @@ from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput
 
-from .scenes import middle_speed_mps
-from .survey import Memory, Survey, Surveyor
+from .reward_grid import RewardGrid, RewardSampler, State
+from .situations import middle_speed_mps
 
 INK, FAINT, GROUND = "#22262b", "#7b828c", "#ffffff"
 PAY = LinearSegmentedColormap.from_list("pay", ["#1f2a44", "#2f5d8c", "#37a08f", "#a8cf5a", "#fff3a3"])
-"""Little to much, where nothing is taken away."""
+"""Colours where no reward is negative."""
 TAKE_AND_PAY = LinearSegmentedColormap.from_list(
     "take_and_pay", ["#7a1f3d", "#c2455b", "#f0a58f", "#f4f1ec", "#9fd3b4", "#2f9273", "#0f4a4a"]
 )
-"""Taken away, nothing, paid."""
+"""Colours from negative over zero to positive."""
 _BESIDE_M = 0.3
-"""How much of the ground beside the road is shown."""
+"""Width of the ground shown beside the track."""
 _DOTS_PER_INCH = 130
 _PIXELS = 16_000
-"""Points of the track that are asked about at detail 1."""
+"""Points of the track sampled at detail 1."""
 
 
 def draw_reward_map(
-    setup: RaceSetup, surveyor: Surveyor, of: Survey, memory: Memory, detail: float, path: Path
+    setup: RaceSetup, sampler: RewardSampler, of: RewardGrid, state: State, detail: float, path: Path
 ) -> None:
-    """Write the picture: the track coloured by the pay for driving along it, and four cuts through what is paid.
+    """Write the picture: the track coloured by the reward for driving along it, and four cuts.
 
     Args:
         setup: the experiment's race.
-        surveyor: asks about the points of the track.
-        of: what was asked already.
-        memory: whether a reward depends on more than the params.
-        detail: 1, or less for functions that take long.
-        path: its ending chooses the format.
+        sampler: of the reward function.
+        of: rewards sampled on a grid.
+        state: whether a reward depends on more than the params.
+        detail: 1, or less for slow functions.
+        path: its suffix chooses the format.
 
     Raises:
         BadInput: the picture cannot be written.
@@ -53,7 +53,7 @@ def draw_reward_map(
     track = setup.track
     low, high = (getattr(np.concatenate([track.inner, track.outer]), f)(axis=0) for f in ("min", "max"))
     low, high = low - _BESIDE_M - 0.1, high + _BESIDE_M + 0.1
-    pixels, extent = _track_pixels(setup, surveyor, low, high, detail)
+    pixels, extent = _track_pixels(setup, sampler, low, high, detail)
     colors, norm, extend = _scale(of, pixels)
 
     width_in, foot_in, head_in = 12.0, 3.9, 1.0
@@ -77,19 +77,17 @@ def draw_reward_map(
     )
     bar.outline.set_visible(False)
     bar.ax.tick_params(length=0, labelcolor=INK, labelsize=10)
-    bar.ax.set_title("reward\na step", fontsize=10, color=FAINT, loc="left", pad=10)
+    bar.ax.set_title("reward\nper step", fontsize=10, color=FAINT, loc="left", pad=10)
 
     _draw_cuts(figure, setup, of, colors, norm, foot_in / height_in)
     top = 1 - 0.42 / height_in
     figure.text(0.035, top, setup.reward.name, fontsize=20, fontweight="bold", color=INK, va="center")
     speed = f"{middle_speed_mps(setup):.1f} m/s"
-    lines = [
-        f"What it pays on {track.title}: the map for driving along the road at {speed}, steering straight"
-    ]
-    if memory == "earlier calls":
-        lines.append("It remembers earlier calls: each point follows one step of driving there")
-    elif memory == "chance":
-        lines.append("It pays by chance, too: this picture is one of many")
+    lines = [f"Reward on {track.title}: the map is for driving along the track at {speed}, steering straight"]
+    if state == "earlier calls":
+        lines.append("It depends on earlier calls: each point follows one step of driving there")
+    elif state == "randomness":
+        lines.append("It is partly random: another picture would look different")
     for k, line in enumerate(lines):
         down_in = 0.34 + 0.24 * k
         figure.text(0.035, top - down_in / height_in, line, fontsize=11, color=FAINT, va="center")
@@ -100,9 +98,9 @@ def draw_reward_map(
 
 
 def _track_pixels(
-    setup: RaceSetup, surveyor: Surveyor, low: np.ndarray, high: np.ndarray, detail: float
+    setup: RaceSetup, sampler: RewardSampler, low: np.ndarray, high: np.ndarray, detail: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Return the pay at a grid of points on and beside the road, NaN elsewhere, and the grid's extent in metres."""
+    """Return the rewards of a grid of points on and beside the track, NaN elsewhere, and its extent in metres."""
     track = setup.track
     area_m2 = float(track.road.buffer(_BESIDE_M).area)
     cell_m = float(np.sqrt(area_m2 / (_PIXELS * detail**2)))
@@ -112,13 +110,13 @@ def _track_pixels(
     near = shapely.contains_xy(track.road.buffer(_BESIDE_M + 1.5 * cell_m), grid_x, grid_y)
     place = track.project(np.column_stack([grid_x[near], grid_y[near]]))
     pixels = np.full(grid_x.shape, np.nan)
-    pixels[near], _ = surveyor.ask(place.ndist, place.offset_m, 0.0, middle_speed_mps(setup))
+    pixels[near], _ = sampler.rewards(place.ndist, place.offset_m, 0.0, middle_speed_mps(setup))
     half_m = cell_m / 2
     return pixels, (x[0] - half_m, x[-1] + half_m, y[0] - half_m, y[-1] + half_m)
 
 
-def _scale(of: Survey, pixels: np.ndarray) -> tuple[Colormap, Normalize, str]:
-    """Choose colours for what is paid on the road; what is beyond, such as a penalty for leaving it, is cut off."""
+def _scale(of: RewardGrid, pixels: np.ndarray) -> tuple[Colormap, Normalize, str]:
+    """Choose colours for the rewards on the track; values beyond, such as a penalty for leaving it, are clipped."""
     everything = np.concatenate([of.reward.ravel(), of.by_command.ravel(), pixels.ravel()])
     everything = everything[np.isfinite(everything)]
     on_road = np.concatenate([of.reward[~of.off_track], of.by_command.ravel()])
@@ -138,7 +136,7 @@ def _scale(of: Survey, pixels: np.ndarray) -> tuple[Colormap, Normalize, str]:
 
 
 def _outline(area: shapely.Geometry) -> Outline:
-    """Return an area's rings as one path; rings run in opposite directions, so holes stay empty."""
+    """Return an area's rings as one path; inner rings run the other way, so holes stay empty."""
     polygons = [
         shapely.orient_polygons(part) for part in shapely.get_parts(area) if part.geom_type == "Polygon"
     ]
@@ -170,7 +168,7 @@ def _draw_course(axes: Axes, setup: RaceSetup) -> None:
 
 
 def _draw_cuts(
-    figure: Figure, setup: RaceSetup, of: Survey, colors: Colormap, norm: Normalize, top: float
+    figure: Figure, setup: RaceSetup, of: RewardGrid, colors: Colormap, norm: Normalize, top: float
 ) -> None:
     half_m = setup.track.width_m / 2
     bottom, height = 0.17 * top, 0.62 * top
@@ -211,7 +209,7 @@ def _draw_cuts(
     figure.text(
         0.035,
         top * 0.93,
-        "By place across the road and heading against it, mean over the lap",
+        "By offset from the centre line and heading, mean over the lap",
         fontsize=12,
         fontweight="bold",
         color=INK,

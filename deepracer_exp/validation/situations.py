@@ -1,16 +1,18 @@
-"""Situations a car can be in, as the params that our environment makes of them."""
+"""Situations of a car and the reward params that the environment computes for them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.env.params import COLUMNS, Road, rows, scalar_params, select
-from deepracer_exp.env.referee import Referee
+from deepracer_exp.env.action_space import ContinuousActions
+from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.rewards.params import COLUMNS, TrackParams, rows, scalar_params, select
 from deepracer_exp.sim.batch import CarState
+from deepracer_exp.tracks.track import Track
 
 Floats = NDArray[np.float64]
 
@@ -21,19 +23,19 @@ class Situations:
 
     columns: dict[str, np.ndarray]
     """`env.params.COLUMNS`, each (n,), `closest_waypoints` (n, 2)."""
-    road: Road
+    road: TrackParams
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of situations."""
         return len(self.columns["x"])
 
     def params(self) -> Iterator[dict[str, Any]]:
-        """Return the params of each situation, made anew."""
+        """Yield fresh params of each situation."""
         for row in rows(select(self.columns, np.arange(len(self)))):
             yield scalar_params(row, *self.road)
 
     def __getitem__(self, which: slice | np.ndarray) -> "Situations":
-        """Return some of them."""
+        """Return a selection."""
         return Situations({key: column[which] for key, column in self.columns.items()}, self.road)
 
     def given(self, **columns: np.ndarray) -> "Situations":
@@ -49,7 +51,7 @@ def together(parts: "list[Situations]") -> Situations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Poses:
-    """Where cars are along a road and what they are doing; all (n,)."""
+    """Poses of cars relative to the centre line, and their commands; all (n,)."""
 
     ndist: Floats
     """Share of the lap."""
@@ -76,7 +78,7 @@ def poses(
     *,
     lateness: ArrayLike = 1.0,
 ) -> Poses:
-    """Return poses with the steps it takes to come there.
+    """Return poses with the number of steps it takes to get there.
 
     Args:
         setup: the track and the car.
@@ -85,7 +87,7 @@ def poses(
         heading_error_rad: see `Poses`.
         speed_mps: see `Poses`.
         steering_deg: see `Poses`.
-        lateness: steps taken so far over those of a lap at the commanded speed.
+        lateness: steps taken so far relative to driving at the commanded speed.
     """
     values = np.broadcast_arrays(ndist, offset_m, heading_error_rad, speed_mps, steering_deg, lateness)
     ndist_, offset_m_, error_rad, speed, steering, late = (np.array(v, np.float64).ravel() for v in values)
@@ -97,19 +99,19 @@ def poses(
         heading_error_rad=error_rad,
         speed_mps=speed,
         steering_deg=steering,
-        # The prepare step is the first, the function is called from the second on.
+        # The first step is the prepare step; the function is called from the second on.
         steps=2 + steps.astype(np.int64),
         progress_before=100.0 * ndist_,
     )
 
 
 def situations(setup: RaceSetup, at: Poses, earlier: bool = False) -> Situations:
-    """Let the environment's referee say what it makes of the poses.
+    """Return the params that the environment's rules compute for poses.
 
     Args:
         setup: the experiment's race.
         at: n poses.
-        earlier: one step before, as cars were that drove straight on at the commanded speed.
+        earlier: one step before, for cars that drove straight at the commanded speed.
     """
     n = len(at.ndist)
     place = setup.track.start_pose(at.ndist)
@@ -125,10 +127,112 @@ def situations(setup: RaceSetup, at: Poses, earlier: bool = False) -> Situations
         yaw_rate_radps=still,
     )
     steps_before = np.maximum(at.steps - 1 - earlier, 0)
-    referee = Referee(setup, n)
-    referee.reset(start_ndist=still)
-    referee.see(cars)
-    referee.resume(steps_before, at.progress_before)
-    referee.clock_steps[:] = steps_before
-    columns = referee.params(referee.judge(), at.steering_deg, at.speed_mps)
-    return Situations(columns, referee.roads[0])
+    rules = RaceRules(setup, n)
+    rules.reset(start_ndist=still)
+    rules.measure(cars)
+    rules.start_midway(steps_before, at.progress_before)
+    rules.clock_steps[:] = steps_before
+    columns = rules.params(rules.apply(), at.steering_deg, at.speed_mps)
+    return Situations(columns, rules.track_params[0])
+
+
+OFF_ROAD_M = 0.5
+"""Sampled distance beyond the border; an episode ends there."""
+
+
+@dataclass(frozen=True)
+class NamedSituation:
+    """A situation with a name, and the step before it."""
+
+    name: str
+    now: Situations
+    """One situation."""
+    before: Situations | None
+    """One step earlier; None at the start."""
+
+
+def middle_speed_mps(setup: RaceSetup) -> float:
+    """Return the mean of the slowest and the fastest speed of the action space."""
+    return float(setup.actions.low[1] + setup.actions.high[1]) / 2
+
+
+def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
+    """Return start, mid-lap, off-track, finish, wrong way, and mid-lap on the track driven in reverse.
+
+    Args:
+        setup: the track, the car and the action space.
+        against: the same track in the other direction.
+    """
+    speed = middle_speed_mps(setup)
+    track = setup.track
+    # The second step is the first that is rewarded; in the first the car stood on the start line.
+    start = poses(setup, setup.car.front_point_m / track.length_m, 0.0, 0.0, speed, lateness=0.0)
+    line = np.array([1.0 if not track.closed else 0.05 / track.length_m])
+    finish = replace(poses(setup, line, 0.0, 0.0, speed), progress_before=np.array([99.5]))
+    lap_steps = track.length_m / speed / setup.car.control_period_s
+    finish = replace(finish, steps=np.array([2 + int(lap_steps)]))
+    backwards = setup.on(against)
+    return [
+        NamedSituation("start", situations(setup, start), None),
+        _named("mid-lap", setup, poses(setup, 0.5, 0.0, 0.0, speed)),
+        _named("off the track", setup, _off_track(setup, speed)),
+        _named("finish", setup, finish),
+        _named("wrong way", setup, poses(setup, 0.5, 0.0, np.pi, speed)),
+        _named("reversed track", backwards, poses(backwards, 0.5, 0.0, 0.0, speed)),
+    ]
+
+
+def _named(name: str, setup: RaceSetup, at: Poses) -> NamedSituation:
+    return NamedSituation(name, situations(setup, at), situations(setup, at, earlier=True))
+
+
+def seam(setup: RaceSetup) -> Situations:
+    """Return the end of the centre line, where the closest waypoints are the last one and its duplicate, the first.
+
+    The service returns these two indices there (`bisect_right` past the end); a car hardly ever hits that point.
+    """
+    at = situations(setup, poses(setup, 0.5, 0.0, 0.0, middle_speed_mps(setup)))
+    track = setup.track
+    x, y = track.waypoints[-1]
+    return at.given(
+        x=np.array([x]),
+        y=np.array([y]),
+        projection_distance=np.array([track.length_m]),
+        progress=np.array([99.9]),
+        closest_waypoints=np.array([[len(track.waypoints) - 1, 0]]),
+    )
+
+
+def _off_track(setup: RaceSetup, speed_mps: float) -> Poses:
+    """Return a pose with no wheel on the track, as close to the track and to the middle of the lap as possible."""
+    half_m = setup.track.width_m / 2
+    away_m, ndist, side = np.meshgrid(
+        half_m + np.array([0.2, 0.3, 0.5, 1.0, 2.0]), 0.5 + np.arange(8) / 20, [1.0, -1.0], indexing="ij"
+    )
+    at = poses(setup, ndist, side * away_m, 0.0, speed_mps)
+    first = int(np.argmax(situations(setup, at).columns["is_offtrack"]))
+    return pick(at, np.array([first]))
+
+
+def pick(at: Poses, which: np.ndarray) -> Poses:
+    """Return selected poses."""
+    return Poses(**{name: values[which] for name, values in vars(at).items()})
+
+
+def sample(setup: RaceSetup, n: int) -> Poses:
+    """Return n poses typical of a learning car, the same at every call: mostly on the track and facing ahead."""
+    random = np.random.default_rng(0)
+    half_m = setup.track.width_m / 2
+    beyond_m = half_m + OFF_ROAD_M
+    offset_m = np.where(
+        random.random(n) < 0.7, random.uniform(-half_m, half_m, n), random.uniform(-beyond_m, beyond_m, n)
+    )
+    kind = random.random(n)
+    error_rad = np.where(kind < 0.6, random.normal(0.0, 0.3, n), random.uniform(-np.pi / 2, np.pi / 2, n))
+    error_rad = np.where(kind < 0.85, error_rad, random.uniform(-np.pi, np.pi, n))
+    if isinstance(setup.actions, ContinuousActions):
+        steering_deg, speed_mps = setup.actions.commands(random.uniform(-1.0, 1.0, (n, 2)))
+    else:
+        steering_deg, speed_mps = setup.actions.commands(random.integers(0, setup.actions.n, n))
+    lateness = random.uniform(0.5, 2.0, n)
+    return poses(setup, random.random(n), offset_m, error_rad, speed_mps, steering_deg, lateness=lateness)

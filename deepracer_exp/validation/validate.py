@@ -1,4 +1,4 @@
-"""The command `validate`: find out, tell, draw, try."""
+"""The command `validate`: check a reward function, print the findings, draw the map, train for a moment."""
 
 import shlex
 from pathlib import Path
@@ -11,16 +11,16 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.errors import BadInput
 
-from .check import Check, look_closer, other_direction, read, try_scenes
+from .check import Check, look_closer, other_direction, read, try_named_situations
 from .probe import NOT_CALLED
 from .reward_map import draw_reward_map
-from .trial import Trial, run_trial
+from .short_training import ShortTraining, run_short_training
 
 _MOST = 12
-"""Lines of one kind that are told."""
+"""Most lines of one kind that are printed."""
 
 
-def validate(
+def validate_reward(
     experiment: Experiment,
     trial: tuple[Experiment, Composition] | None,
     output: str | None,
@@ -28,77 +28,75 @@ def validate(
     out: Console,
     err: Console,
 ) -> int:
-    """Validate the reward function of an experiment and print what was found.
+    """Validate the reward function of an experiment and print the findings.
 
     Args:
         experiment: the reward function, the track, the car and the action space.
-        trial: the same, as a short training; None: no training.
-        output: the picture to write; None: named after reward function and track, beside the runs.
-        strict: what the AWS console would refuse is refused.
+        trial: the same as a short training; None: no training.
+        output: picture to write; None: in `runs_dir`, named after reward function and track.
+        strict: fail if the AWS console would reject it.
         out: for the report.
-        err: for the progress of the trial.
+        err: for the progress of the training.
 
     Returns:
-        The exit code: 0; 2 if the function cannot be used here, or by AWS and `strict` asks for that.
+        The exit code: 0; 2 if the function cannot be used here, or, with `strict`, by AWS.
 
     Raises:
-        BadInput: a file cannot be used or written; the function's module cannot be run.
-        RunFailed: the trial failed.
+        BadInput: a file cannot be used or written; the function's module cannot be loaded.
+        RunFailed: the short training failed.
     """
     check = read(experiment)
     setup = check.setup
     out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
-    _tell_console(out, check)
+    _print_console_findings(out, check)
     (track,) = experiment.tracks.values()
     if track.file is not None or track.knots is not None:
         _line(
-            out, "Waypoints: numbered as in the track's own file or knots, not as in any world of the service"
+            out, "Waypoints: numbered as in the track's own file or knots, not as in a track of the service"
         )
     against = other_direction(experiment)
-    try_scenes(check, against)
-    _tell_scenes(out, check)
+    try_named_situations(check, against)
+    _print_situations(out, check)
     if not check.failures:
         look_closer(check, against)
     if not check.failures:
-        _draw(out, check, _beside_the_runs(experiment, check) if output is None else Path(output))
-    _tell_lines(out, "Warnings", "yellow", check.warnings)
-    _tell_lines(out, "Failures", "red", check.failures)
+        _draw(out, check, _default_picture(experiment, check) if output is None else Path(output))
+    _print_lines(out, "Warnings", "yellow", check.warnings)
+    _print_lines(out, "Failures", "red", check.failures)
     if trial is not None and not check.failures and not (strict and check.console):
-        _tell_trial(out, run_trial(*trial, err))
+        _print_short_training(out, run_short_training(*trial, err))
     return _verdict(out, check, strict)
 
 
-def _beside_the_runs(experiment: Experiment, check: Check) -> Path:
+def _default_picture(experiment: Experiment, check: Check) -> Path:
     folder = Path(experiment.runs_dir) / "validate"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BadInput(
-            f"{folder}: cannot be made: {error.strerror}; runs_dir or --output says where else"
-        ) from None
+        raise BadInput(f"{folder}: cannot be created: {error.strerror}; set runs_dir= or --output") from None
     return folder / f"{check.setup.reward.name}-{check.setup.track.name}.png"
 
 
 def _line(out: Console, text: str, style: str | None = None) -> None:
-    """Print one line as it is; a terminal may fold it, a file gets it whole."""
+    """Print one line without markup; a terminal may wrap it, a file gets it whole."""
     out.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
-def _tell_console(out: Console, check: Check) -> None:
+def _print_console_findings(out: Console, check: Check) -> None:
     if not check.console:
-        _line(out, "AWS console: would take it")
+        _line(out, "AWS console: would accept it")
         return
-    _line(out, "AWS console: would refuse it", "yellow")
+    _line(out, "AWS console: would reject it", "yellow")
     for finding in check.console[:_MOST]:
         _line(out, f"  {finding}")
     if len(check.console) > _MOST:
         _line(out, f"  and {len(check.console) - _MOST} more")
 
 
-def _tell_scenes(out: Console, check: Check) -> None:
+def _print_situations(out: Console, check: Check) -> None:
     table = Table("situation", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
     table.add_column("reward", justify="right")
-    table.add_column("time a call", justify="right")
+    table.add_column("time per call", justify="right")
     for tried in check.tried:
         taken = "" if tried.microseconds is None else _time(tried.microseconds)
         failed = tried.answer.failure is not None
@@ -114,19 +112,19 @@ def _time(microseconds: float) -> str:
 
 
 def _draw(out: Console, check: Check, path: Path) -> None:
-    paid = f"Pays {check.lowest:.4g} to {check.highest:.4g} a step, in {check.situations:,} situations"
-    if check.memory == "earlier calls":
-        paid += "; what it pays depends on earlier calls"
+    paid = f"Reward per step: {check.lowest:.4g} to {check.highest:.4g} in {check.situations:,} situations"
+    if check.state == "earlier calls":
+        paid += "; it depends on earlier calls"
     _line(out, paid)
-    if check.survey is None or check.surveyor is None or check.detail is None:
-        _line(out, "No map and no laps: a call takes too long")
+    if check.grid is None or check.sampler is None or check.detail is None:
+        _line(out, "No map and no laps: the function is too slow")
         return
     setup = check.setup
-    draw_reward_map(setup, check.surveyor, check.survey, check.memory, check.detail, path)
-    _line(out, f"What it pays for: {shlex.quote(str(path))}")
+    draw_reward_map(setup, check.sampler, check.grid, check.state, check.detail, path)
+    _line(out, f"Reward map: {shlex.quote(str(path))}")
 
 
-def _tell_lines(out: Console, title: str, style: str, lines: list[str]) -> None:
+def _print_lines(out: Console, title: str, style: str, lines: list[str]) -> None:
     if not lines:
         return
     _line(out, f"\n{title}", style)
@@ -136,12 +134,12 @@ def _tell_lines(out: Console, title: str, style: str, lines: list[str]) -> None:
         _line(out, f"  and {len(lines) - _MOST} more")
 
 
-def _tell_trial(out: Console, trial: Trial) -> None:
+def _print_short_training(out: Console, trial: ShortTraining) -> None:
     _line(out, f"\nTrial: {trial.env_steps:,} steps -> {trial.folder}")
     if not trial.changes:
-        _line(out, "  too short to say whether anything rises; give it more time")
+        _line(out, "  too short to see whether anything improves; give it more time")
     for change in trial.changes:
-        what = "rises" if change.rises else "does not rise"
+        what = "improves" if change.rises else "does not improve"
         _line(
             out,
             f"  {change.name} {what}: {change.first:.4g} in the first third ({trial.first_episodes:,} episodes), "
@@ -156,11 +154,11 @@ def _verdict(out: Console, check: Check, strict: bool) -> int:
         return 2
     findings = f"{len(check.console)} finding{'s' if len(check.console) > 1 else ''}"
     if strict and check.console:
-        _line(out, f"Verdict: the AWS console would refuse it: {findings}", "bold red")
+        _line(out, f"Verdict: the AWS console would reject it: {findings}", "bold red")
         return 2
     count = len(check.warnings)
     warnings = f", with {count} warning{'s' if count > 1 else ''}" if count else ""
-    refused = f"; the AWS console would refuse it: {findings}" if check.console else ""
+    refused = f"; the AWS console would reject it: {findings}" if check.console else ""
     _line(
         out,
         f"Verdict: can be trained{warnings}{refused}",

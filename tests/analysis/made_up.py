@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.analysis.log_course import catalogue_track
-from deepracer_exp.analysis.step_columns import FRONT_TO_REAR_AXLE_M
-from deepracer_exp.formats.model_metadata import Action, LidarConfig, ModelMetadata
-from deepracer_exp.formats.recording import STEP_COLUMNS, TOLD_COLUMNS, UPDATE_COLUMNS, Recording
+from deepracer_exp.analysis.tables import FRONT_TO_REAR_AXLE_M
+from deepracer_exp.deepracer.model_metadata import Action, LidarConfig, ModelMetadata
+from deepracer_exp.deepracer.recording import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS, Recording
 from deepracer_exp.tracks.track import Track
 
 COURSE = "reinvent_base"
@@ -104,7 +104,7 @@ def made_up_recording(
         name=name,
         steps=_typed(steps, STEP_COLUMNS),
         updates=_typed(updates, UPDATE_COLUMNS),
-        told=_told(drives, evaluated),
+        metrics=_told(drives, evaluated),
         metadata=_metadata(speeds),
         hyperparameters={"discount_factor": 0.99},
         reward_source=None,
@@ -241,7 +241,7 @@ def _told(drives: Sequence[Drive], evaluated: Sequence[float]) -> pd.DataFrame:
         for iteration, completion in enumerate(evaluated)
         for trial in range(5)
     ]
-    return _typed(pd.DataFrame(rows, columns=list(TOLD_COLUMNS)), TOLD_COLUMNS)
+    return _typed(pd.DataFrame(rows, columns=list(METRICS_COLUMNS)), METRICS_COLUMNS)
 
 
 def _typed(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:

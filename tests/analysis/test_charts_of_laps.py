@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from deepracer_exp.analysis.candidates import candidates
-from deepracer_exp.analysis.chart import Bars, Chart, Line, Mark, Points
-from deepracer_exp.analysis.charts_of_correlations import correlations
-from deepracer_exp.analysis.charts_of_laps import LUCK, lap_delta, lap_time_histogram, lap_time_percentile
+from deepracer_exp.analysis.charts.laps import (
+    CHANCES,
+    correlations,
+    lap_delta,
+    lap_time_histogram,
+    lap_time_percentile,
+)
 from deepracer_exp.analysis.log_view import LogView, prepare
 
+from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording
-
-
-def layers(chart: Chart | None, kind: type) -> list:
-    assert chart is not None
-    return [layer for row in chart.rows for panel in row for layer in panel.layers if isinstance(layer, kind)]
 
 
 @pytest.fixture(scope="module")
@@ -34,31 +34,29 @@ def view() -> LogView:
 
 
 def test_the_chance_of_a_marked_lap_time_is_that_of_a_normal_distribution() -> None:
-    assert LUCK[-2] == pytest.approx(NormalDist().cdf(-2)) == pytest.approx(0.02275, abs=1e-5)
-    assert LUCK[-3] == pytest.approx(NormalDist().cdf(-3)) == pytest.approx(0.00135, abs=1e-5)
+    assert CHANCES[-2] == pytest.approx(NormalDist().cdf(-2)) == pytest.approx(0.02275, abs=1e-5)
+    assert CHANCES[-3] == pytest.approx(NormalDist().cdf(-3)) == pytest.approx(0.00135, abs=1e-5)
 
 
 def test_marks_stand_at_mean_best_and_deviations_of_all_laps(view: LogView) -> None:
     times = view.episodes["lap_time_s"].dropna()
     panel = lap_time_histogram(view).rows[0][0]  # type: ignore[union-attr]
-    marks = sorted(layer.at for layer in panel.layers if isinstance(layer, Mark))
+    marks = sorted(one.x0 for one in layers(panel, "mark"))
     deviations = [times.mean() - n * times.std() for n in (2, 3)]
     assert marks == pytest.approx(sorted([times.mean(), times.min(), *deviations]))
 
 
 def test_the_histogram_counts_every_complete_lap_once(view: LogView) -> None:
     panels = lap_time_histogram(view).rows[0]  # type: ignore[union-attr]
-    counts = [
-        sum(layer.height.sum() for layer in panel.layers if isinstance(layer, Bars)) for panel in panels
-    ]
+    counts = [sum(one.y.sum() for one in layers(panel, "bars")) for panel in panels]
     late = view.episodes["iteration"] >= 6
     assert counts == [60, (late & view.episodes["complete"]).sum()]
 
 
 def test_the_curve_over_the_histogram_has_its_area(view: LogView) -> None:
     panel = lap_time_histogram(view).rows[0][0]  # type: ignore[union-attr]
-    bars, line = (next(x for x in panel.layers if isinstance(x, kind)) for kind in (Bars, Line))
-    assert np.trapezoid(line.y, line.x) == pytest.approx(bars.height.sum() * bars.width, rel=0.01)
+    bars, line = layers(panel, "bars")[0], layers(panel, "line")[0]
+    assert np.trapezoid(line.y, line.x) == pytest.approx(bars.y.sum() * bars.width, rel=0.01)
 
 
 def test_without_complete_laps_nothing_is_drawn() -> None:
@@ -70,12 +68,12 @@ def test_without_complete_laps_nothing_is_drawn() -> None:
 
 def test_one_lap_is_a_histogram_without_chances() -> None:
     chart = lap_time_histogram(prepare(made_up_recording([Drive()])))
-    assert len(layers(chart, Mark)) == 2
-    assert layers(chart, Bars)[0].height.sum() == 1
+    assert len(layers(chart, "mark")) == 2
+    assert layers(chart, "bars")[0].y.sum() == 1
 
 
 def test_stars_are_the_candidates_for_submission(view: LogView) -> None:
-    star = next(layer for layer in layers(lap_time_percentile(view), Points) if layer.symbol == "star")
+    star = next(one for one in layers(lap_time_percentile(view), "points") if one.marker.symbol == "star")
     assert sorted(star.x) == sorted(candidates(view.iterations)["iteration"])
 
 
@@ -84,7 +82,7 @@ def test_time_is_lost_where_the_slower_lap_is_slower() -> None:
     fast = Drive(speed_mps=1.5)
     chart = lap_delta(prepare(made_up_recording([fast, slow])))
     assert chart is not None
-    line = next(layer for layer in chart.rows[0][0].layers if isinstance(layer, Line))
+    line = layers(chart.rows[0][0], "line")[0]
     length_m = made_up_course().length_m
     lost_s = np.interp(np.array([0.39, 0.51, 1.0]) * length_m, line.x, line.y)
     whole = slow.lap_time_s() - fast.lap_time_s()
@@ -92,11 +90,11 @@ def test_time_is_lost_where_the_slower_lap_is_slower() -> None:
     assert f"{whole:.2f} s slower" in chart.caption
 
 
-def test_the_usual_lap_began_where_the_fastest_did() -> None:
+def test_the_ordinary_lap_began_where_the_fastest_did() -> None:
     drives = [Drive(speed_mps=1.3 + 0.01 * k, start=0.1 * (k % 2)) for k in range(20)]
     view = prepare(made_up_recording(drives))
     chart = lap_delta(view)
-    speeds = [layer for layer in layers(chart, Line) if layer.name]
+    speeds = [one for one in layers(chart, "line") if one.showlegend]
     assert len(speeds) == 2
     gaps = [layer.x[np.flatnonzero(np.isnan(layer.x))[0] + 1] for layer in speeds]
     assert gaps[0] == pytest.approx(gaps[1], abs=0.2)

@@ -8,31 +8,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis import chart_matplotlib, chart_plotly
-from deepracer_exp.analysis.chart import Band, Cells, Chart, Line, Mark
-from deepracer_exp.analysis.charts_of_runs import (
-    generalisation_matrix,
-    generations,
-    group_name,
-    runs_compared,
-)
+from deepracer_exp.analysis.charts.runs import generalisation_matrix, generations, group_name, runs_compared
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.run_folders import RESULT_COLUMNS, clone_chain, evaluation_results
-from deepracer_exp.formats.recording import Round
+from deepracer_exp.deepracer.recording import Round
 
+from .chart_layers import layers
 from .made_up import Drive, made_up_recording
 
 
 def run(name: str, speed_mps: float = 1.4, iterations: int = 4) -> LogView:
     drives = [Drive(iteration=k, speed_mps=speed_mps, off_at=None if k else 40) for k in range(iterations)]
     return prepare(made_up_recording(drives, entropy=[2.0] * iterations, name=name))
-
-
-def layers(chart: Chart | None, kind: type) -> list:
-    assert chart is not None
-    chart_plotly.draw(chart)
-    assert chart_matplotlib.draw(chart).axes
-    return [layer for row in chart.rows for panel in row for layer in panel.layers if isinstance(layer, kind)]
 
 
 def in_folder(view: LogView, folder: Path) -> LogView:
@@ -56,8 +43,8 @@ def test_seeds_become_a_median_with_a_band() -> None:
     views = [run(f"a-seed{k}", 1.3 + 0.1 * k) for k in range(3)]
     chart = runs_compared(views)
     assert chart is not None
-    assert len(layers(chart, Band)) == 4
-    assert {line.name for line in layers(chart, Line)} == {"a", None}
+    assert len(layers(chart, "band")) == 4
+    assert {line.name for line in layers(chart, "line")} == {"a", ""}
     laps = chart.table[chart.table["column"] == "lap_time_p25_s"].dropna()
     # The slower a run, the more steps it has driven: at both ends some have no value.
     middle = laps[laps["steps"].between(0.5 * laps["steps"].max(), 0.8 * laps["steps"].max())]
@@ -68,7 +55,7 @@ def test_seeds_become_a_median_with_a_band() -> None:
 
 def test_single_runs_are_lines_without_bands() -> None:
     chart = runs_compared([run("a-seed0"), run("b-seed0")])
-    assert not layers(chart, Band)
+    assert not layers(chart, "band")
     assert "nothing says how much" in chart.caption  # type: ignore[union-attr]
 
 
@@ -82,7 +69,7 @@ def test_generations_stand_one_after_the_other() -> None:
     assert chart is not None
     assert list(chart.table["iteration"]) == list(range(7))
     assert list(chart.table["generation"]) == [0] * 3 + [1] * 4
-    assert {mark.at for mark in layers(chart, Mark)} == {2.5}
+    assert {mark.x0 for mark in layers(chart, "mark")} == {2.5}
 
 
 def test_rounds_of_a_recording_are_generations() -> None:
@@ -113,8 +100,8 @@ def test_the_matrix_has_every_policy_on_every_track() -> None:
         pd.DataFrame([("Oval_track", 70.0, 0.5, 9.5)], columns=RESULT_COLUMNS),
     ]
     chart = generalisation_matrix(views, results)
-    cells = layers(chart, Cells)[0]
-    np.testing.assert_array_equal(cells.values, [[90.0, 50.0], [np.nan, 70.0]])
+    cells = layers(chart, "cells")[0]
+    np.testing.assert_array_equal(cells.z, [[90.0, 50.0], [np.nan, 70.0]])
     assert "mean is 60 per cent" in chart.caption  # type: ignore[union-attr]
 
 

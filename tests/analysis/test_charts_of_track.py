@@ -7,34 +7,31 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis import chart_matplotlib, chart_plotly
-from deepracer_exp.analysis.action_classes import action_classes
-from deepracer_exp.analysis.cells import Grid, means, quantiles, totals, wilson
-from deepracer_exp.analysis.chart import Cells, Chart
-from deepracer_exp.analysis.charts_of_actions import (
+from deepracer_exp.analysis.charts.actions import (
+    action_classes,
     action_use_by_section,
     entropy_along_track,
     zero_steering_top_speed,
 )
-from deepracer_exp.analysis.charts_of_rewards import reward_by_waypoint, reward_map, reward_terms, value_map
-from deepracer_exp.analysis.charts_of_track import (
-    episode_ends_map,
-    off_track_risk,
-    risk_counts,
-    visits_map,
-    waypoint_map,
-)
-from deepracer_exp.analysis.charts_of_track_line import (
+from deepracer_exp.analysis.charts.driving_line import (
+    acceleration_map,
+    lap_line,
     racing_line,
     sector_times,
+    slide_map,
     speed_steering_by_waypoint,
+    waypoint_map,
 )
-from deepracer_exp.analysis.charts_of_track_motion import acceleration_map, lap_line, slide_map
+from deepracer_exp.analysis.charts.figure import Chart
+from deepracer_exp.analysis.charts.layout import draw
+from deepracer_exp.analysis.charts.maps import Grid
+from deepracer_exp.analysis.charts.mistakes import episode_ends_map, off_track_risk, risk_counts, visits_map
+from deepracer_exp.analysis.charts.rewards import reward_by_waypoint, reward_map, reward_terms, value_map
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.analysis.maps import driven, waypoint_count
-from deepracer_exp.analysis.racing_line import MARGIN_M, center_line
-from deepracer_exp.analysis.racing_line import racing_line as line_of
+from deepracer_exp.analysis.racing_line import MARGIN_M, center_line, minimum_curvature_line
+from deepracer_exp.analysis.statistics import means, quantiles, totals, wilson
 
+from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording
 
 MAPS = (
@@ -79,13 +76,10 @@ def test_every_chart_bears_its_name_and_can_be_drawn(
     assert chart.name == make.__name__
     assert chart.caption.count(". ") >= 1
     assert len(chart.table)
-    assert chart_matplotlib.draw(chart).axes
-    assert len(chart_plotly.draw(chart).to_json()) < 1_000_000
-    cells = [
-        layer for row in chart.rows for panel in row for layer in panel.layers if isinstance(layer, Cells)
-    ]
-    assert all(layer.values.dtype == np.float32 for layer in cells)
-    assert sum(layer.values.size for layer in cells) <= 60_000
+    assert len(draw(chart).to_json()) < 1_000_000
+    cells = layers(chart, "cells")
+    assert all(layer.z.dtype == np.float32 for layer in cells)
+    assert sum(layer.z.size for layer in cells) <= 60_000
 
 
 @pytest.mark.parametrize("make", MAPS, ids=lambda make: make.__name__)
@@ -101,7 +95,7 @@ def test_without_a_known_course_there_are_still_charts_by_waypoint(
 ) -> None:
     chart = drawn(make(lost))
     assert not any(panel.map for row in chart.rows for panel in row)
-    assert chart_matplotlib.draw(chart).axes
+    assert draw(chart).data
 
 
 @pytest.mark.parametrize("make", MAPS[:1] + MAPS[2:] + BY_WAYPOINT, ids=lambda make: make.__name__)
@@ -119,13 +113,13 @@ def test_visits_add_up_to_the_rows(view: LogView) -> None:
 def test_the_reward_map_weighted_by_visits_is_the_mean_reward(view: LogView) -> None:
     table = drawn(reward_map(view)).table
     mean = np.average(table["reward_mean"], weights=table["visits"])
-    assert mean == pytest.approx(driven(view, "reward")["reward"].mean())
+    assert mean == pytest.approx(view.driven("reward")["reward"].mean())
 
 
 def test_rewards_by_waypoint_add_up_to_all_rewards(view: LogView) -> None:
     table = drawn(reward_by_waypoint(view)).table
     assert (table["reward_mean"] * table["steps"]).sum() == pytest.approx(
-        driven(view, "reward")["reward"].sum()
+        view.driven("reward")["reward"].sum()
     )
     known = table[table["steps"] > 0]
     for low, high in (("worst", "median"), ("median", "best"), ("worst", "mean"), ("mean", "best")):
@@ -141,7 +135,7 @@ def test_risk_counts_add_up_to_the_episodes_that_left_the_road(view: LogView) ->
 
 
 def test_every_waypoint_of_a_complete_lap_is_passed_once(view: LogView) -> None:
-    n = waypoint_count(view)
+    n = view.waypoint_count
     complete = view.episodes["complete"].to_numpy()
     passes, off = risk_counts(view, complete, n)
     np.testing.assert_array_equal(passes, complete.sum())
@@ -149,7 +143,7 @@ def test_every_waypoint_of_a_complete_lap_is_passed_once(view: LogView) -> None:
 
 
 def test_an_episode_passes_the_waypoints_from_its_start_to_its_end(view: LogView) -> None:
-    n = waypoint_count(view)
+    n = view.waypoint_count
     row = view.episodes.index[view.episodes["last_waypoint"].between(78, 82) & ~view.episodes["complete"]][0]
     wanted = np.arange(len(view.episodes)) == row
     first, last = view.episodes.loc[row, ["first_waypoint", "last_waypoint"]]
@@ -162,7 +156,7 @@ def test_an_episode_passes_the_waypoints_from_its_start_to_its_end(view: LogView
 
 def test_more_episodes_never_leave_the_road_near_a_waypoint_than_came_near_it(view: LogView) -> None:
     for reach in (0, 2, 5):
-        passes, off = risk_counts(view, np.ones(len(view.episodes), bool), waypoint_count(view), reach)
+        passes, off = risk_counts(view, np.ones(len(view.episodes), bool), view.waypoint_count, reach)
         assert (off <= passes).all()
 
 
@@ -214,7 +208,7 @@ def test_a_car_on_the_centre_line_is_away_from_the_racing_line_by_the_lines_own_
     view = prepare(made_up_recording([Drive(speed_mps=0.5)]))
     assert view.course is not None
     table = drawn(racing_line(view)).table
-    line = line_of(view.course)
+    line = minimum_curvature_line(view.course)
     places = np.linspace(0.0, 1.0, 1000)
     expected = -line.at(places, line.offset_m)
     assert table["median_m"].min() == pytest.approx(expected.min(), abs=0.02)
@@ -224,7 +218,7 @@ def test_a_car_on_the_centre_line_is_away_from_the_racing_line_by_the_lines_own_
 @pytest.mark.parametrize("name", ["reinvent_base", "Monaco", "reInvent2019_track", "Straight_track"])
 def test_the_racing_line_bends_less_than_the_centre_line_and_keeps_to_the_road(name: str) -> None:
     course = made_up_course(name)
-    line, center = line_of(course), center_line(course)
+    line, center = minimum_curvature_line(course), center_line(course)
 
     def bends(which: np.ndarray) -> float:
         return float(np.square(which).mean())
@@ -284,5 +278,5 @@ def test_terms_are_shown_with_their_sum(view: LogView) -> None:
     known = chart.table.dropna()
     np.testing.assert_allclose(known["sum"], 1.0)
     np.testing.assert_allclose(known["off_road"], -0.5)
-    assert chart_matplotlib.draw(chart).axes
+    assert draw(chart).data
     assert reward_terms(view, terms.iloc[:0]) is None

@@ -4,18 +4,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from matplotlib.image import imread
 
+from deepracer_exp.analysis.charts.layout import draw
+from deepracer_exp.analysis.charts.runs import learning_curves_compared
 from deepracer_exp.analysis.comparison import (
     NOTHING,
-    differences,
     last_value,
     results,
     value_text,
 )
-from deepracer_exp.analysis.comparison_figure import comparison_figure
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.formats.run_files import RunRecord
+from deepracer_exp.runs.files import RunRecord
+from deepracer_exp.runs.lineage import run_differences
+
+from .chart_layers import layers
 
 
 def row(iteration: int, lap_s: float | None = None, **more: object) -> dict:
@@ -49,26 +51,28 @@ def record(tmp_path: Path) -> Callable[..., RunRecord]:
 
 
 def test_configurations_differ_in_exactly_what_was_overridden(record):
-    found = differences([record("a"), record("b", "algorithm.lr=3e-4", "seed=7"), record("c", "seed=7")])
+    found = run_differences([record("a"), record("b", "algorithm.lr=3e-4", "seed=7"), record("c", "seed=7")])
     assert found == {"seed": [0, 7, 7], "algorithm.lr": [0.001, 0.0003, 0.001]}
 
 
 def test_a_key_that_only_some_runs_have_shows_nothing_at_the_others(record):
-    found = differences([record("a", "stopping=none"), record("b", "stopping=reliable")])
+    found = run_differences([record("a", "stopping=none"), record("b", "stopping=reliable")])
     assert found["stopping.episodes"] == [NOTHING, 50]
 
 
 def test_tracks_differ_by_their_names_not_by_their_points(record):
-    found = differences([record("a"), record("b", "track=Oval_track")])
+    found = run_differences([record("a"), record("b", "track=Oval_track")])
     assert found == {"track": ["reinvent_base", "Oval_track"]}
 
 
 def test_what_does_not_change_the_driving_is_no_difference(record):
-    assert differences([record("a"), record("b", "runs_dir=elsewhere", "tracking=off", "debug=true")]) == {}
+    assert (
+        run_differences([record("a"), record("b", "runs_dir=elsewhere", "tracking=off", "debug=true")]) == {}
+    )
 
 
 def test_a_reward_function_that_was_edited_is_a_difference_though_its_file_has_the_same_name(record):
-    found = differences([record("a", sha256="1" * 64), record("b", sha256="2" * 64)])
+    found = run_differences([record("a", sha256="1" * 64), record("b", sha256="2" * 64)])
     assert found == {"reward_function.py": ["sha256 11111111", "sha256 22222222"]}
 
 
@@ -126,19 +130,19 @@ def test_long_values_are_shortened_in_their_middle():
     )
 
 
-def test_the_picture_is_drawn_of_runs_of_any_kind(record, tmp_path):
-    records = {
-        "A": record("one"),
-        "B": record("without a lap", lap_s=None),
-        "C": record(
-            "tracks", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 9.0, "mean_lap_time_s/A": 8.5}
-        ),
-    }
-    comparison_figure(records).savefig(tmp_path / "picture.png")
-    assert imread(tmp_path / "picture.png").std() > 0.05
-    comparison_figure({"A": record("x", lap_s=None), "B": record("y", lap_s=None)}).savefig(
-        tmp_path / "none.png"
-    )
+def test_runs_of_any_kind_are_drawn_over_each_other(record):
+    tracks = {"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 9.0, "mean_lap_time_s/A": 8.5}
+    records = {"A": record("one"), "B": record("without a lap", lap_s=None), "C": record("tracks", **tracks)}
+    chart = learning_curves_compared(records)
+    assert len(layers(chart, "line")) == 9
+    assert [line.name for line in layers(chart.rows[0][0], "line")] == [
+        "A  one",
+        "B  without a lap",
+        "C  tracks",
+    ]
+    assert draw(chart).data
+    none = learning_curves_compared({"A": record("x", lap_s=None), "B": record("y", lap_s=None)})
+    assert draw(none).data
 
 
 def write(record: RunRecord) -> None:
@@ -150,13 +154,13 @@ def write(record: RunRecord) -> None:
 def test_the_command_shows_differences_and_results_and_writes_the_picture(record, call, tmp_path):
     write(record("runs/e/first", "seed=1"))
     write(record("runs/e/second", "seed=2", lap_s=9.25))
-    ended = call("compare", "first", "second", "-o", "out.png")
+    ended = call("runs", "compare", "first", "second", "-o", "out.html")
     assert ended.code == 0, ended.stderr
     words = [line.split() for line in ended.stdout.splitlines()]
     assert ["A", "runs/e/first"] in words
     assert ["seed", "1", "2"] in words
     assert ["best", "lap", "in", "training,", "s", "10.00", "9.25"] in words
-    assert (tmp_path / "out.png").stat().st_size > 10_000
+    assert (tmp_path / "out.html").stat().st_size > 1_000_000
 
 
 @pytest.mark.parametrize(
@@ -165,12 +169,12 @@ def test_the_command_shows_differences_and_results_and_writes_the_picture(record
         (["first"], "1 runs given; accepted: 2 to 26"),
         (["first", "runs/e/first"], "1 runs given"),
         (["first", "third"], "third: no such run"),
-        (["first", "second", "-o", "nowhere/out.png"], "--output nowhere/out.png: cannot be written"),
+        (["first", "second", "-o", "nowhere/out.html"], "--output nowhere/out.html: cannot be written"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(record, call, arguments, words):
     write(record("runs/e/first"))
     write(record("runs/e/second"))
-    ended = call("compare", *arguments)
+    ended = call("runs", "compare", *arguments)
     assert ended.code == 2
     assert words in ended.complaint

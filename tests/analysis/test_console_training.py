@@ -11,7 +11,7 @@ from deepracer.logs import AnalysisUtils, DeepRacerLog
 
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.formats.recording_reader import read_recording
+from deepracer_exp.deepracer.recording_reader import read_recording
 
 CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
 pytestmark = pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from deepracer_exp.analysis.figures import (
+from deepracer_exp.analysis.charts.run_pictures import (
     LINE_COLUMNS,
     driven_line,
     driven_lines,
@@ -256,5 +256,7 @@ def test_values_read_from_json_as_none_are_gaps() -> None:
 
 
 def test_drawing_needs_no_pyplot_and_so_no_screen() -> None:
-    code = "import sys, deepracer_exp.analysis.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
+    code = (
+        "import sys, deepracer_exp.analysis.charts.run_pictures; sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -10,13 +10,14 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from deepracer_exp.analysis.candidates import candidates, lap_chance
-from deepracer_exp.analysis.charts import draw_sections
 from deepracer_exp.analysis.findings import Finding, findings
-from deepracer_exp.analysis.learning import PATIENCE, convergence
+from deepracer_exp.analysis.log_report import draw_sections
 from deepracer_exp.analysis.log_tables import best_laps, headline
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.runs.convergence import LOG_RULE, convergence
 
 from .made_up import Drive, made_up_course, made_up_recording
 
@@ -41,7 +42,7 @@ def training(completions: list[float], **told: list[float]) -> LogView:
 
 
 RISING = [0.1 + 0.06 * k for k in range(15)]
-LEARNED = [*RISING, *[1.0] * (PATIENCE + 4)]
+LEARNED = [*RISING, *[1.0] * (LOG_RULE.patience + 4)]
 
 
 def test_a_training_that_stands_at_full_laps_has_converged_when_it_reached_them() -> None:
@@ -61,7 +62,7 @@ def test_a_training_that_still_grows_has_not_converged() -> None:
 def test_entropy_that_still_falls_keeps_a_training_from_being_converged() -> None:
     falling = list(np.linspace(1.7, 0.2, len(LEARNED)))
     flat = [1.0] * len(LEARNED)
-    assert "the entropy still moves" in of(training(LEARNED, entropy=falling), "converged").sentence
+    assert "the entropy still changes" in of(training(LEARNED, entropy=falling), "converged").sentence
     assert of(training(LEARNED, entropy=flat), "converged").sentence.startswith("Converged")
 
 
@@ -77,7 +78,7 @@ def test_a_flat_training_that_never_drove_far_is_told_to_change_something() -> N
 
 
 def test_a_short_training_is_not_judged() -> None:
-    view = training([0.2] * PATIENCE)
+    view = training([0.2] * LOG_RULE.patience)
     assert convergence(view.iterations, 9) is None
     assert of(view, "converged").sentence.startswith("Too short")
 
@@ -118,6 +119,23 @@ def test_without_enough_laps_nothing_is_to_be_submitted() -> None:
     found = of(laps_of((0, 5, 2.0), (2, 5, 2.0)), "submit")
     assert found.sentence.startswith(
         "Nothing to submit yet: no iteration has 3 complete laps (2 laps in all)"
+    )
+
+
+def test_where_only_evaluations_have_laps_the_fastest_of_them_is_to_be_submitted() -> None:
+    recording = laps_of((0, 5, 2.0), (2, 5, 2.0)).recording
+    rows = [  # of iteration 3 one lap of two is incomplete, of 4 and 5 all are complete
+        *((3, 100.0, 8.0), (3, 90.0, 7.0)),
+        *((4, 100.0, 9.5), (4, 100.0, 9.7)),
+        *((5, 100.0, 9.8), (5, 100.0, 9.8)),
+    ]
+    evaluated = pd.DataFrame(rows, columns=["iteration", "completion", "time_s"])
+    evaluated = evaluated.assign(stream="training", phase="evaluation").reindex(
+        columns=recording.metrics.columns
+    )
+    found = of(prepare(replace(recording, metrics=evaluated)), "submit")
+    assert found.sentence.startswith(
+        "Submit the checkpoint saved after iteration 4: its evaluation completed both laps, in 9.60 s on average."
     )
 
 
@@ -272,7 +290,7 @@ def test_laps_that_only_metrics_tell_of_can_be_submitted() -> None:
         }
         | {"reward": 1.0, "completion": 100.0, "time_s": 9.5, "episode_status": "lap_complete", "resets": 0.0}
     )
-    view = prepare(replace(recording, told=told))
+    view = prepare(replace(recording, metrics=told))
     assert of(view, "submit").sentence.startswith("Submit the checkpoint that drove iteration 7:")
     assert "8 more episodes known from metrics files only; 8 complete laps, the best in 9.50 s" in headline(
         view
@@ -317,3 +335,19 @@ def test_places_off_the_road_are_counted_the_shorter_way_round(at, others, withi
     assume(not (np.abs(away - within) < 1e-12).any())
     counted = neighbours(np.array(at), np.array(others), within)
     assert counted.tolist() == (away <= within).sum(axis=1).tolist()
+
+
+def test_a_run_of_ours_is_judged_by_its_own_rule_and_its_decision_is_what_the_report_says() -> None:
+    view = training(LEARNED)
+    stopping = compose_experiment(["stopping.converged.patience=40"])[1].mapping["stopping"]
+    own = replace(view, recording=replace(view.recording, stopping=stopping))
+    assert "at least 41 are needed" in of(own, "converged").sentence
+    decision = {
+        "rule": "overfitting",
+        "why": "held-out completion fell",
+        "values": {"a": 1.0},
+        "thresholds": {},
+    }
+    ended = replace(view, recording=replace(view.recording, decision=decision))
+    assert "ended it (overfitting): held-out completion fell." in of(ended, "converged").sentence
+    assert "overfits" not in [one.rule for one in findings(ended)]

@@ -7,15 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.charts import SECTIONS
 from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_report import LogPage, write_report
+from deepracer_exp.analysis.log_report import SECTIONS, LogPage, write_report
 from deepracer_exp.analysis.log_report import html as page_html
 from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_comparison import compare_rewards
+from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import LogProblem, Recording
 from tests.browser import browser, needs_chromium
 from tests.page_html import Html
 
@@ -268,3 +267,9 @@ def test_another_reward_is_told_with_the_ranks_of_laps_and_places(view):
 def test_every_finding_names_a_chart_of_the_page(view):
     names = {chart.__name__ for some in SECTIONS.values() for chart in some}
     assert {one.figure for one in findings(view)} <= names
+
+
+def test_the_gallery_lists_every_figure_of_the_page():
+    gallery = (Path(__file__).parents[2] / "docs" / "gallery.md").read_text(encoding="utf-8")
+    names = [chart.__name__ for some in SECTIONS.values() for chart in some]
+    assert [name for name in names if f"`{name}`" not in gallery] == []

@@ -7,12 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.episode_table import EPISODE_COLUMNS
-from deepracer_exp.analysis.iteration_table import ITERATION_COLUMNS
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.analysis.step_columns import DERIVED_COLUMNS
+from deepracer_exp.analysis.tables import DERIVED_COLUMNS, EPISODE_COLUMNS, ITERATION_COLUMNS
+from deepracer_exp.deepracer.recording import STEP_COLUMNS
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording import STEP_COLUMNS
 
 from .made_up import Drive, made_up_course, made_up_recording
 

@@ -12,10 +12,10 @@ from deepracer_exp.analysis.sectors import (
     BEND_PM,
     SHORTEST_M,
     interval_times,
-    lap_delta,
-    sector_times,
     sectors_of,
     theoretical_best_s,
+    time_lost,
+    times_by_sector,
 )
 
 from .made_up import Drive, made_up_course, made_up_recording
@@ -52,7 +52,7 @@ def test_a_straight_road_is_one_sector() -> None:
 def test_at_constant_speed_a_sector_takes_its_share_of_the_lap_wherever_the_lap_starts() -> None:
     drives = [Drive(speed_mps=1.0), Drive(speed_mps=1.0, start=0.37)]
     sectors = sectors_of(COURSE)
-    times = sector_times(prepare(made_up_recording(drives)).steps, sectors)
+    times = times_by_sector(prepare(made_up_recording(drives)).steps, sectors)
     share = np.array([part.end - part.begin for part in sectors.parts])
     np.testing.assert_allclose(times.to_numpy(), [share * COURSE.length_m] * 2, atol=1e-6)
 
@@ -60,13 +60,13 @@ def test_at_constant_speed_a_sector_takes_its_share_of_the_lap_wherever_the_lap_
 def test_sector_times_sum_up_to_the_lap_time() -> None:
     drives = [Drive(sections=((0.2, 0.4, 3.0),), start=s) for s in (0.0, 0.1, 0.3, 0.999)]
     view = prepare(made_up_recording(drives))
-    times = sector_times(view.steps, sectors_of(COURSE))
+    times = times_by_sector(view.steps, sectors_of(COURSE))
     np.testing.assert_allclose(times.sum(axis=1), view.episodes["lap_time_s"], rtol=1e-9)
 
 
 def test_incomplete_laps_have_no_sector_times() -> None:
     drives = [Drive(until=0.7), Drive(), Drive(off_at=30)]
-    assert sector_times(prepare(made_up_recording(drives)).steps, sectors_of(COURSE)).index.tolist() == [1]
+    assert times_by_sector(prepare(made_up_recording(drives)).steps, sectors_of(COURSE)).index.tolist() == [1]
 
 
 def test_the_theoretical_best_lap_takes_the_fast_half_of_each_lap() -> None:
@@ -76,13 +76,13 @@ def test_the_theoretical_best_lap_takes_the_fast_half_of_each_lap() -> None:
         Drive(speed_mps=1.0, sections=((0.0, middle, 2.0),)),
         Drive(speed_mps=1.0, sections=((middle, 1.0, 2.0),)),
     ]
-    times = sector_times(prepare(made_up_recording(drives)).steps, sectors)
+    times = times_by_sector(prepare(made_up_recording(drives)).steps, sectors)
     assert theoretical_best_s(times) == pytest.approx(COURSE.length_m / 2.0, abs=0.02)
     assert times.sum(axis=1).min() > COURSE.length_m / 2.0 + 1.0
 
 
 def test_without_a_lap_there_are_no_times() -> None:
-    times = sector_times(prepare(made_up_recording([Drive(off_at=30)])).steps, sectors_of(COURSE))
+    times = times_by_sector(prepare(made_up_recording([Drive(off_at=30)])).steps, sectors_of(COURSE))
     assert len(times) == 0
     assert np.isnan(theoretical_best_s(times))
 
@@ -90,7 +90,7 @@ def test_without_a_lap_there_are_no_times() -> None:
 def test_a_lap_loses_time_where_it_is_slower_and_nowhere_else() -> None:
     slow = Drive(speed_mps=2.0, sections=((0.5, 0.6, 1.0),))
     steps = prepare(made_up_recording([slow, Drive(speed_mps=2.0, start=0.8)])).steps
-    delta = lap_delta(steps, 0, 1).set_index("lap_position")["delta_s"]
+    delta = time_lost(steps, 0, 1).set_index("lap_position")["delta_s"]
     lost_s = 0.1 * COURSE.length_m / 2.0
     assert delta.loc[:0.49].abs().max() < 0.01
     np.testing.assert_allclose(delta.loc[0.62:], lost_s, atol=0.01)
@@ -100,7 +100,7 @@ def test_a_lap_loses_time_where_it_is_slower_and_nowhere_else() -> None:
 def test_a_lap_that_was_not_completed_cannot_be_compared() -> None:
     steps = prepare(made_up_recording([Drive(), Drive(until=0.5)])).steps
     with pytest.raises(KeyError):
-        lap_delta(steps, 0, 1)
+        time_lost(steps, 0, 1)
 
 
 def test_times_of_many_laps_do_not_mix() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from deepracer_exp.analysis.statistics import (
     correlation,
-    fit,
+    fit_polynomial,
     histogram,
     median_band,
     moving_average,
@@ -43,7 +43,7 @@ def test_bins_of_times_in_steps_hold_equally_many_steps() -> None:
 
 def test_a_fit_finds_the_curve_that_made_the_points() -> None:
     x = np.linspace(14, 16, 40)
-    found = fit(x, 3 * x**2 - 2 * x + 1, 2)
+    found = fit_polynomial(x, 3 * x**2 - 2 * x + 1, 2)
     assert found is not None
     np.testing.assert_allclose(found.coefficients, [3, -2, 1], rtol=1e-6, atol=1e-5)
     assert found.r_squared == pytest.approx(1.0)
@@ -53,13 +53,13 @@ def test_a_straight_fit_explains_the_square_of_the_correlation() -> None:
     dice = np.random.default_rng(1)
     x = dice.normal(size=300)
     y = x + dice.normal(size=300)
-    found = fit(x, y, 1)
+    found = fit_polynomial(x, y, 1)
     assert found is not None
     assert found.r_squared == pytest.approx(correlation(x, y) ** 2)
 
 
 def test_too_few_places_decide_on_no_curve() -> None:
-    assert fit(np.array([1.0, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]), 1) is None
+    assert fit_polynomial(np.array([1.0, 1.0, 2.0]), np.array([1.0, 2.0, 3.0]), 1) is None
     assert np.isnan(correlation(np.ones(5), np.arange(5.0)))
 
 

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks import fidelity
+from benchmarks.calibrate import car_named
+from benchmarks.replay import WARM_UP_STEPS, Windows, errors
 from benchmarks.simple_cars import Formula, bicycle, fit_formula
-from deepracer_exp.sim.calibrate import car_named
-from deepracer_exp.sim.recordings import WARM_UP_STEPS, Windows
-from deepracer_exp.sim.replay import errors
 
 CAR = car_named("deepracer")
 TRACES = Path(__file__).parents[3] / "shared/reference/console_training/sim-trace"

@@ -18,8 +18,8 @@ from benchmarks.intervals import mean_and_interval
 from benchmarks.same import different_points, different_rows, different_tensors, different_traces
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import Evaluation, Group
-from deepracer_exp.evaluation.stewards import Attempt
 
 SHORT = ("budget.iterations=1", "checkpoints.every=null")
 

@@ -3,8 +3,8 @@
 import pytest
 
 from benchmarks.long_log import write_long_log
-from deepracer_exp.formats.recording_reader import read_recording
-from tests.formats import made_up_logs as made
+from deepracer_exp.deepracer.recording_reader import read_recording
+from tests.deepracer import made_up_logs as made
 
 
 # Lines that are left out make a turn shorter than the file, the more the shorter the others are.

@@ -21,20 +21,20 @@ STEPS = 1000
 
 
 def course(
-    number: int, values: Sequence[float], value: float | None = None, fate: str = "finished"
+    number: int, values: Sequence[float], value: float | None = None, outcome: str = "finished"
 ) -> Course:
     """A trial that is evaluated every 1,000 steps, and ends with its last evaluation."""
     points = tuple((STEPS * place, one) for place, one in enumerate(values, 1))
-    worth = None if fate == "failed" else min(values) if value is None else value
-    return Course(number=number, points=points, env_steps=STEPS * len(values), fate=fate, value=worth)
+    worth = None if outcome == "failed" else min(values) if value is None else value
+    return Course(number=number, points=points, env_steps=STEPS * len(values), outcome=outcome, value=worth)
 
 
 def ended(
-    number: int, env_steps: int, value: float | None, fate: str = "finished", began_s: float = 0.0
+    number: int, env_steps: int, value: float | None, outcome: str = "finished", began_s: float = 0.0
 ) -> Ended:
     return Ended(
         number=number,
-        fate=fate,
+        outcome=outcome,
         env_steps=env_steps,
         value=value,
         began_s=began_s,
@@ -45,10 +45,15 @@ def ended(
 def test_without_a_pruner_every_trial_comes_to_its_own_end_and_workers_take_the_next_when_they_are_free() -> (
     None
 ):
-    courses = [course(0, [9.0] * 4), course(1, [8.0]), course(2, [7.0] * 2), course(3, [6.0], fate="failed")]
+    courses = [
+        course(0, [9.0] * 4),
+        course(1, [8.0]),
+        course(2, [7.0] * 2),
+        course(3, [6.0], outcome="failed"),
+    ]
     found = replay(courses, NopPruner(), "pruned", pace=PACE, workers=2)
     assert [one.env_steps for one in found] == [4000, 1000, 2000, 1000]
-    assert [one.fate for one in found] == ["finished"] * 3 + ["failed"]
+    assert [one.outcome for one in found] == ["finished"] * 3 + ["failed"]
     assert [one.value for one in found] == [9.0, 8.0, 7.0, None]
     # 45, 15, 25 and 15 seconds: the second worker makes trials 1 and 2, and is free for 3 when the first one is not.
     assert [(one.began_s, one.ended_s) for one in found] == [(0, 45), (0, 15), (15, 40), (40, 55)]
@@ -67,7 +72,7 @@ def test_the_median_ends_what_is_worse_than_the_median_of_the_complete_trials_at
     ]
     pruner = MedianPruner(n_startup_trials=2, n_warmup_steps=2)
     found = replay(courses, pruner, "median", pace=PACE, workers=1)
-    assert [one.fate for one in found] == ["finished", "finished", "median", "median", "finished"]
+    assert [one.outcome for one in found] == ["finished", "finished", "median", "median", "finished"]
     assert [one.env_steps for one in found] == [3000, 3000, 2000, 3000, 3000]
     assert [one.value for one in found] == [6.0, 8.0, None, None, 5.5]
     assert found[3].began_s == found[2].ended_s == 35 + 35 + 25
@@ -91,7 +96,7 @@ def test_hyperband_lets_a_third_of_a_rung_go_on() -> None:
     found = replay(courses, pruner, "hyperband", pace=PACE, workers=1)
     # The first is alone at its rung; each new best of a third goes on.
     assert [one.env_steps for one in found] == [3000, 1000, 1000, 3000, 1000]
-    assert [one.fate for one in found] == ["finished", "hyperband", "hyperband", "finished", "hyperband"]
+    assert [one.outcome for one in found] == ["finished", "hyperband", "hyperband", "finished", "hyperband"]
 
 
 def test_equal_steps_are_those_of_all_workers_together() -> None:
@@ -132,7 +137,7 @@ def test_the_winner_is_the_best_of_the_first_on_more_laps() -> None:
         sweep.winner_of([], "race_score", 3, drive)
 
 
-def test_a_trial_that_told_optuna_something_else_than_its_whole_run_is_refused() -> None:
+def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused() -> None:
     whole = course(0, [12.0, 10.0, 9.0, 8.0])
 
     def trial(reports: dict[int, float]) -> FrozenTrial:
@@ -141,7 +146,7 @@ def test_a_trial_that_told_optuna_something_else_than_its_whole_run_is_refused()
 
     sweep_runs.refuse_other_reports(trial({1: 12.0, 2: 10.0}), whole)
     for reports in ({1: 12.0}, {1: 12.0, 2: 10.5}, {1: 12.0, 2: 10.0, 3: 9.0}):
-        with pytest.raises(SystemExit, match="told Optuna"):
+        with pytest.raises(SystemExit, match="to Optuna"):
             sweep_runs.refuse_other_reports(trial(reports), whole)
 
 
@@ -166,7 +171,7 @@ def test_a_whole_run_tells_what_the_sweep_would_report_at_each_evaluation(
     found = sweep_runs.course_of(3, run, "completion", config)
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert found.points == tuple((rows[at]["env_steps"], rows[at]["eval_completion"]) for at in (1, 3))
-    assert (found.number, found.env_steps, found.fate, found.value) == (3, 5 * 1024, "finished", 12.5)
+    assert (found.number, found.env_steps, found.outcome, found.value) == (3, 5 * 1024, "finished", 12.5)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 
 from deepracer_exp.analysis import log_report
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats import recording_reader
+from deepracer_exp.runs import own_recording
 from tests.page_html import Html
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
@@ -45,13 +45,13 @@ def test_runs_are_found_as_by_other_commands(run_dir, call, monkeypatch, what):
         found.append(place)
         raise BadInput("found")
 
-    monkeypatch.setattr(recording_reader, "read_recording", stop)
+    monkeypatch.setattr(own_recording, "read_log", stop)
     ended = call("analyze", what.format(name=run_dir.name, begin=run_dir.name[:11]))
     assert [(ended.cwd / place).resolve() for place in found] == [run_dir.resolve()]
 
 
 def test_logs_from_elsewhere_have_their_page_in_the_current_folder(run_dir, call, tmp_path):
-    exported = call("export", f"run={run_dir}", "format=aws-logs", "-o", str(tmp_path / "from aws"))
+    exported = call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws"))
     assert exported.code == 0, exported.stderr
     ended = call("analyze", "from aws")
     assert ended.code == 0, ended.stderr
@@ -60,7 +60,9 @@ def test_logs_from_elsewhere_have_their_page_in_the_current_folder(run_dir, call
 
 
 def test_a_target_has_its_chance_and_others_stand_beside_it(run_dir, call):
-    ended = call("analyze", str(run_dir), "--target", "1000", "--compare", str(run_dir), "--out", "page.html")
+    ended = call(
+        "analyze", str(run_dir), "--target", "1000", "--compare", str(run_dir), "--output", "page.html"
+    )
     assert ended.code == 0, ended.stderr
     assert "1000.00 s" in ended.stdout
     assert 'id="figure-runs_compared"' in (ended.cwd / "page.html").read_text()
@@ -70,7 +72,7 @@ def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, 
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
     (tmp_path / "mine.py").write_text("def reward_function(params):\n    return float(params['speed'])\n")
-    ended = call("analyze", str(run_dir), "--reward", "mine.py", "--open", "--out", "page.html")
+    ended = call("analyze", str(run_dir), "--reward", "mine.py", "--open", "--output", "page.html")
     assert ended.code == 0, ended.stderr
     assert "mine" in ended.stdout
     assert "Paid by another reward function" in findings_told(tmp_path / "page.html")
@@ -81,7 +83,7 @@ def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not
     ended = call("analyze", str(run_dir))
     assert ended.code == 0, ended.stderr
     assert 'id="figure-reward_terms"' in (run_dir / "report.html").read_text()
-    call("export", f"run={run_dir}", "format=aws-logs", "-o", str(tmp_path / "theirs"))
+    call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "theirs"))
     trap = f"open({str(tmp_path / 'trapped')!r}, 'w')\ndef terms(params): return {{}}\n"
     for file in (tmp_path / "theirs").rglob("reward_function.py"):
         file.write_text(trap)
@@ -103,8 +105,8 @@ def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not
         (["RUN", "--target", "-3"], ["--target -3", "accepted"]),
         (["RUN", "--target", "nan"], ["--target nan", "accepted"]),
         (
-            ["RUN", "--out", "no/such/folder/page.html"],
-            ["--out no/such/folder/page.html", "its folder is not there"],
+            ["RUN", "--output", "no/such/folder/page.html"],
+            ["--output no/such/folder/page.html", "its folder does not exist"],
         ),
         (["RUN", "--reward", "racing_lime"], ["racing_lime"]),
         (["RUN", "--reward", "missing.py"], ["missing.py"]),
@@ -133,7 +135,7 @@ def test_a_training_ends_with_its_page(trained):
 def test_the_page_of_a_training_stands_in_its_mlflow_run(call):
     from mlflow import MlflowClient
 
-    from deepracer_exp.formats.run_files import read_run_id
+    from deepracer_exp.runs.files import read_run_id
 
     tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.iterations=1")
     ended = call("train", *tiny, "report=true")

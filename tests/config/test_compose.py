@@ -6,10 +6,11 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid, validate
+from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid
+from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
-from deepracer_exp.config.randomization import RandomizationConfig
+from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.errors import BadInput
 
 
@@ -69,7 +70,7 @@ def test_an_option_may_be_named_as_its_file():
 )
 def test_what_is_printed_can_be_read_back(overrides):
     experiment, composition = compose_experiment(overrides)
-    assert validate(yaml.safe_load(composition.yaml())) == experiment
+    assert parse_experiment(yaml.safe_load(composition.yaml())) == experiment
 
 
 # --- Paths and addresses are typed as they are
@@ -233,7 +234,7 @@ def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepte
         (["collector=in_process", "collector.processes=3"], ["processes=3", "in_process"]),
         (["track.width_m=[1,2]", "track.knots=[[0,0],[1,0],[1,1]]"], ["2 values", "knots 3"]),
         (["track.width_m=0.8"], ["track.width_m without track.knots"]),
-        (["track.name=moon"], ["track.name=moon: no world"]),
+        (["track.name=moon"], ["track.name=moon: not a world"]),
         (["car.min_speed_mps=5"], ["5.0", "4.0"]),
         (["car.rear_axle_x_m=1"], ["1.0", "0.082311"]),
         (["reward.time_limit_s=30"], ["30", "20"]),
@@ -378,7 +379,7 @@ def test_an_option_that_is_no_mapping_is_refused(tmp_path, monkeypatch):
     own.mkdir(parents=True)
     (own / "mine.yaml").write_text("- a\n")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(BadInput, match=r"mine\.yaml: .*holds no keys"):
+    with pytest.raises(BadInput, match=r"mine\.yaml: .*has no keys"):
         compose_option("randomization", "mine", RandomizationConfig)
 
 

@@ -6,12 +6,19 @@ from pathlib import Path
 import pytest
 import yaml
 
-from deepracer_exp.config.compose import Composition, compose_experiment, expand_grid, validate
-from deepracer_exp.config.custom_files import NOT_APPLICABLE, TAKEN, Beneath, beneath, read_custom_files
+from deepracer_exp.config.compose import Composition, compose_experiment, expand_grid
+from deepracer_exp.config.custom_files import (
+    NOT_APPLICABLE,
+    TAKEN,
+    FileOverrides,
+    file_overrides,
+    read_custom_files,
+)
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line, parse_single
+from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats import hyperparameters, model_metadata
 
 from .conftest import CONTINUOUS, HYPERPARAMETERS, METADATA
 
@@ -25,9 +32,11 @@ def composed(folder: Path, *overrides: str) -> tuple[Experiment, Composition]:
     return compose_experiment([f"custom_files={folder}", *overrides])
 
 
-def told(folder: Path, *overrides: str) -> Beneath:
+def told(folder: Path, *overrides: str) -> FileOverrides:
     """Return what the files stand for, without composing it."""
-    return beneath(read_custom_files(str(folder)), {text.partition("=")[0]: text for text in overrides})
+    return file_overrides(
+        read_custom_files(str(folder)), {text.partition("=")[0]: text for text in overrides}
+    )
 
 
 def refusal(folder: Path) -> str:
@@ -70,7 +79,7 @@ def test_what_is_printed_needs_the_folder_no_longer_for_its_values(custom_files)
     experiment, composition = composed(folder)
     for path in folder.iterdir():
         path.unlink()
-    assert validate(yaml.safe_load(composition.yaml())) == experiment
+    assert parse_experiment(yaml.safe_load(composition.yaml())) == experiment
     assert experiment.action_space.file is None
 
 
@@ -179,18 +188,18 @@ def test_a_key_that_is_not_there_is_not_named(custom_files):
     assert not any(key in note for key in NOT_APPLICABLE for note in notes)
 
 
-def test_unknown_keys_and_foreign_indices_are_told(custom_files):
+def test_notes_name_unknown_keys_and_ignored_indices(custom_files):
     space = [dict(action, index=9) for action in METADATA["action_space"]]
     folder = custom_files(HYPERPARAMETERS | {"momentum": 1}, METADATA | {"foo": 2, "action_space": space})
     notes = told(folder).notes
-    for part in ("hyperparameters.json: momentum: not read", "model_metadata.json: foo: not read", "index"):
+    for part in ("hyperparameters.json: momentum: ignored", "model_metadata.json: foo: ignored", "index"):
         assert any(part in note for note in notes), part
 
 
-def test_what_the_console_would_refuse_is_taken_and_told(custom_files):
+def test_values_beyond_the_consoles_limits_are_used_and_noted(custom_files):
     found = told(custom_files(HYPERPARAMETERS | {"batch_size": 1024}))
     assert "algorithm.batch_size=1024" in found.lines
-    assert any("batch_size=1024: taken" in note for note in found.notes)
+    assert any("batch_size=1024: used" in note for note in found.notes)
 
 
 def test_notes_are_a_line_each(custom_files):
@@ -206,7 +215,7 @@ def test_a_value_given_wins_over_the_files_wherever_it_stands(custom_files, firs
     experiment, composition = compose_experiment(words[:: 1 if first else -1])
     assert experiment.algorithm.lr == 1e-5
     assert experiment.algorithm.batch_size == 64
-    assert any("lr=0.0003: not used, algorithm.lr=1e-5 takes its place" in n for n in composition.notes)
+    assert any("lr=0.0003: not used, because of algorithm.lr=1e-5" in n for n in composition.notes)
 
 
 @pytest.mark.parametrize(
@@ -227,7 +236,7 @@ def test_a_choice_given_takes_the_place_of_a_file(custom_files, override, group)
     assert not any(re.match(rf"{group}\b", line) for line in found.lines)
     assert found.lines
     assert group not in found.names
-    assert any(f"not used, {override} takes its place" in note for note in found.notes)
+    assert any(f"not used, because of {override}" in note for note in found.notes)
 
 
 def test_an_option_given_is_used_as_it_is(custom_files):
@@ -278,7 +287,7 @@ def test_a_folder_without_any_file_is_told_the_three(tmp_path, name):
 
 
 def test_what_is_no_folder_is_refused(custom_files, tmp_path):
-    assert refusal(tmp_path / "nowhere").startswith(str(tmp_path / "nowhere"))
+    assert f"custom_files {tmp_path / 'nowhere'}: cannot be read" in refusal(tmp_path / "nowhere")
     assert "Not a directory" in refusal(custom_files() / "reward_function.py")
     with pytest.raises(BadInput, match="custom_files='': no folder"):
         compose_experiment(["custom_files="])

@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 
-from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid, validate
+from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.overrides import key_of
+from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stopping import NoStopping
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput
@@ -138,7 +139,7 @@ def _try_values(seed: int, each: int) -> int:
                 node = node[part]
             node[leaf] = value
             # Of values that contradict each other the message may name the other one.
-            _assert_one_line(_refusal(validate, changed), path[0] if path else leaf, leaf)
+            _assert_one_line(_refusal(parse_experiment, changed), path[0] if path else leaf, leaf)
     return each * len(_places())
 
 

@@ -128,13 +128,13 @@ def test_a_file_that_is_there_is_named_and_left_alone(custom_files, here, name):
     path.parent.mkdir(parents=True)
     path.write_text("# mine\n")
     before = everything(here)
-    assert f"conf/{name} is there already" in refusal(custom_files(), "mine")
+    assert f"conf/{name} exists already" in refusal(custom_files(), "mine")
     assert everything(here) == before
     assert path.read_text() == "# mine\n"
 
 
 def test_a_name_of_the_projects_is_not_taken_over(custom_files, here):
-    assert "action_space/console.yaml is there already" in refusal(custom_files(), "console")
+    assert "action_space/console.yaml exists already" in refusal(custom_files(), "console")
     assert everything(here) == []
 
 

@@ -7,8 +7,8 @@ from deepracer_exp.config.compose import compose_experiment, expand_grid
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.config.track_options import by_world_name
+from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.worlds import find_world, leaders, worlds
 
 TWO = "track=[Oval_track,Bowtie_track]"
 
@@ -129,7 +129,7 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
         (["track=[Oval_trak]"], r"no such track Oval_trak \(did you mean Oval_track\?\)"),
         (["track=al"], "track=al: no such track"),
         (["track=[]"], r"track=\[\]: no track; accepted: track=\[A,B\], track=all"),
-        (["track=[Monaco,Monaco]"], "Monaco stands there twice; track.Monaco.weight=2"),
+        (["track=[Monaco,Monaco]"], "Monaco is listed twice; track.Monaco.weight=2"),
         ([TWO, "track.Ovl_track.weight=2"], r"Ovl_track is neither .* \(did you mean Oval_track\?\)"),
         ([TWO, "track.Monaco.weight=2"], "Monaco is neither a chosen track nor a key of all tracks"),
         ([TWO, "track.wieght=2"], r"wieght is neither .* \(did you mean weight\?\)"),
@@ -149,8 +149,8 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
             "track.Oval_track.width_m without track.Oval_track.knots",
         ),
         ([TWO, "+track.Oval_track.foo=2"], "track.Oval_track.foo: no such key"),
-        (["track.Oval_track.weight=2"], r"accepted where several tracks are chosen .* it is track.weight"),
-        (["track.2022_summit_speedway.weight=2"], "accepted where several tracks are chosen"),
+        (["track.Oval_track.weight=2"], r"accepted with several tracks .* write track.weight"),
+        (["track.2022_summit_speedway.weight=2"], "accepted with several tracks"),
         (["track.weight=abc"], 'track.weight="abc": input should be a valid number'),
         (
             [TWO, "collector.cars=1", "collector.processes=1"],

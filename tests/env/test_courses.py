@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.courses import courses_of_cars
+from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.setup import build_setup
+from deepracer_exp.env.setup import build_setup, courses_of_cars
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import PACKED
 
 THREE = ("track=[reinvent_wood,Straight_track,Spain_track]", "track.Spain_track.direction=reversed")
 WAYS = ("action_space=continuous", "episode.max_steps=40", "randomization=sim2real")
@@ -75,8 +74,8 @@ def test_every_process_has_its_share():
 
 def test_the_number_of_processes_does_not_change_a_cars_course(setup_of):
     setup = setup_of(*THREE, "track.Straight_track.weight=2")
-    whole = Race(setup, 12).referee.course
-    parts = [Race(setup, 4, first_car=first).referee.course for first in (0, 4, 8)]
+    whole = Race(setup, 12).rules.course
+    parts = [Race(setup, 4, first_car=first).rules.course for first in (0, 4, 8)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
@@ -87,10 +86,10 @@ def test_each_car_drives_bit_for_bit_as_alone_on_its_course(setup_of):
     actions = np.random.default_rng(4).uniform(-1, 1, (90, 6, 2))
     setup = setup_of(*THREE, *WAYS)
     race = Race(setup, 6)
-    np.testing.assert_array_equal(race.referee.course, [0, 1, 2, 0, 1, 2])
+    np.testing.assert_array_equal(race.rules.course, [0, 1, 2, 0, 1, 2])
     rows, seen = drive(race, actions)
     assert rows[:, :, PACKED["done"]].sum() >= 12
-    for car, course in enumerate(race.referee.course):
+    for car, course in enumerate(race.rules.course):
         alone = Race(dataclasses.replace(setup, courses=setup.courses[course : course + 1]), 1, first_car=car)
         own_rows, own_seen = drive(alone, actions[:, car : car + 1])
         own_rows[:, :, PACKED["track"]] = course
@@ -111,7 +110,7 @@ def test_a_reward_function_is_told_of_its_cars_own_course(setup_of, tmp_path):
     race = Race(setup_of(*THREE, f"reward.file={tmp_path / 'spy.py'}"), 6)
     drive(race, np.zeros((3, 6), np.int64))
     for car, function in enumerate(race._reward_function._functions):
-        track = race.setup.courses[race.referee.course[car]].tracks[0]
+        track = race.setup.courses[race.rules.course[car]].tracks[0]
         for params in function.__globals__["seen"]:
             assert params["track_length"] == track.length_m
             assert params["is_reversed"] == track.reversed
@@ -131,16 +130,16 @@ def test_the_batch_form_is_called_for_each_course(setup_of, tmp_path):
         paid.append(race.reward)
     np.testing.assert_array_equal(*paid)
     assert len(set(paid[0])) == 3
-    assert (paid[0][race.referee.course == 2] > 1000).all()
+    assert (paid[0][race.rules.course == 2] > 1000).all()
 
 
 def test_open_courses_start_at_their_start_and_closed_ones_further_along(setup_of):
     race = Race(setup_of(*THREE), 6)
     for _ in range(3):
         race.reset()
-    on = race.referee.course == 1
-    assert not race.referee.start_ndist[on].any()
-    assert race.referee.start_ndist[~on].all()
+    on = race.rules.course == 1
+    assert not race.rules.start_ndist[on].any()
+    assert race.rules.start_ndist[~on].all()
 
 
 def test_a_start_inside_an_open_course_is_refused_among_others(setup_of):
@@ -168,14 +167,14 @@ def test_the_direction_alternates_episode_by_episode_for_each_car(setup_of):
     reversed_ = [track.reversed for track in race.setup.courses[0].tracks]
     assert reversed_ == [False, True]
     race.reset()
-    np.testing.assert_array_equal(race.referee.which, [0, 0, 0])
+    np.testing.assert_array_equal(race.rules.track_index, [0, 0, 0])
     race.reset(np.array([1]))
-    np.testing.assert_array_equal(race.referee.which, [0, 1, 0])
+    np.testing.assert_array_equal(race.rules.track_index, [0, 1, 0])
     race.reset()
-    np.testing.assert_array_equal(race.referee.which, [1, 0, 1])
+    np.testing.assert_array_equal(race.rules.track_index, [1, 0, 1])
     race.seed(0)
     race.reset()
-    np.testing.assert_array_equal(race.referee.which, [0, 0, 0])
+    np.testing.assert_array_equal(race.rules.track_index, [0, 0, 0])
 
 
 def test_an_alternating_car_looks_and_is_paid_along_its_direction(setup_of, tmp_path, steer_ahead):
@@ -207,17 +206,17 @@ def test_a_gym_car_goes_from_track_to_track():
     driven = []
     for _ in range(6):
         env.reset()
-        driven.append((int(env._race.referee.course[0]), int(env._race.referee.which[0])))
+        driven.append((int(env._race.rules.course[0]), int(env._race.rules.track_index[0])))
     assert driven == [(0, 0), (1, 2), (2, 4), (0, 1), (1, 3), (2, 5)]
     env.reset(seed=3)
-    assert env._race.referee.which[0] == 0
+    assert env._race.rules.track_index[0] == 0
 
 
 def test_gym_cars_are_shared_out_and_each_track_needs_one():
     env = DeepRacerVectorEnv(4, [THREE[0]])
     observation, _ = env.reset()
     assert observation.shape == (4, env.single_observation_space.shape[0])
-    np.testing.assert_array_equal(env._race.referee.course, [0, 1, 2, 0])
+    np.testing.assert_array_equal(env._race.rules.course, [0, 1, 2, 0])
     with pytest.raises(BadInput, match="num_envs=2 with 3 tracks"):
         DeepRacerVectorEnv(2, [THREE[0]])
 

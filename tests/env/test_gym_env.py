@@ -9,9 +9,9 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import EPISODE_STATUS
 
 SPACES = ["action_space=discrete", "action_space=continuous"]
 

@@ -50,7 +50,7 @@ def test_the_edge_of_the_road_is_an_offset_of_one(race_of):
 
 def test_the_road_ahead_is_where_the_centre_line_goes_on(race_of):
     race = race_of("observation.lookahead_m=[0.5,1.5]", "observation.lookahead_scale_m=3", n_cars=20)
-    now, track, seen = race.referee.now, race.setup.track, features(race)
+    now, track, seen = race.rules.now, race.setup.track, features(race)
     for distance in (0.5, 1.5):
         point = track.points_at(now.ndist + distance / track.length_m)
         x, y = 3 * seen[f"ahead_x_{distance}"], 3 * seen[f"ahead_y_{distance}"]
@@ -68,7 +68,7 @@ def test_motion_and_last_action_are_scaled(race_of):
     )
     for _ in range(20):
         race.step(np.array([[1.0, 0.5], [-0.5, 1.0]]))
-    seen, now, space = features(race), race.referee.now, race.setup.actions
+    seen, now, space = features(race), race.rules.now, race.setup.actions
     np.testing.assert_allclose(seen["speed"], now.speed_mps / 2, rtol=1e-6)
     np.testing.assert_allclose(seen["yaw_rate"], now.yaw_rate_radps / 3, rtol=1e-6)
     assert seen["yaw_rate"][0] > 0 > seen["yaw_rate"][1]

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.race import NonFinite, Race
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import PACKED, STATUS_CODE
 
 REFERENCE = Path(__file__).parents[2] / "../shared/reference"
 NOISY = ("randomization=aws", "action_space=continuous", "episode.max_steps=40")
@@ -67,20 +67,20 @@ def test_without_noise_the_seed_changes_nothing(race_of):
 
 def test_the_first_step_is_the_prepare_step(race_of, column):
     race = race_of("track=reinvent_base", "reward=speed_on_track", n_cars=3)
-    front = race.referee.now.front.copy()
+    front = race.rules.now.front.copy()
     race.step(np.zeros(3, np.int64))
     assert (column(race, "episode_status") == STATUS_CODE["prepare"]).all()
     assert (column(race, "steps") == 1).all()
     assert not race.reward.any()
     assert not (race.terminated | race.truncated).any()
-    np.testing.assert_allclose(race.referee.now.front, front, atol=1e-9)
+    np.testing.assert_allclose(race.rules.now.front, front, atol=1e-9)
     # The front point is 0.14 m ahead of the start.
     np.testing.assert_allclose(column(race, "progress"), 100 * 0.14 / race.setup.track.length_m, rtol=2e-3)
     race.step(np.zeros(3, np.int64))
     assert (column(race, "steps") == 2).all()
     assert (column(race, "episode_status") == STATUS_CODE["in_progress"]).all()
     assert (race.reward != 0).all()
-    assert (np.linalg.norm(race.referee.now.front - front, axis=1) > 1e-3).all()
+    assert (np.linalg.norm(race.rules.now.front - front, axis=1) > 1e-3).all()
 
 
 def test_the_reward_function_first_sees_step_two(race_of, tmp_path):
@@ -95,23 +95,23 @@ def test_the_reward_function_first_sees_step_two(race_of, tmp_path):
 
 def test_each_episode_starts_further_along_and_each_car_elsewhere(race_of):
     race = race_of("episode.start_offset=0.5", n_cars=3)
-    starts = [race.referee.start_ndist.copy()]
+    starts = [race.rules.start_ndist.copy()]
     for _ in range(12):
         race.reset()
-        starts.append(race.referee.start_ndist.copy())
+        starts.append(race.rules.start_ndist.copy())
     expected = (0.5 + 0.05 * (np.arange(13)[:, None] + np.arange(3))) % 1.0
     np.testing.assert_allclose((np.array(starts) - expected + 0.5) % 1.0, 0.5, atol=1e-12)
-    origin = race.setup.track.project(np.column_stack([race.referee.now.x_m, race.referee.now.y_m]))
+    origin = race.setup.track.project(np.column_stack([race.rules.now.x_m, race.rules.now.y_m]))
     np.testing.assert_allclose(origin.ndist, starts[-1], atol=1e-9)
     np.testing.assert_allclose(origin.offset_m, 0, atol=1e-9)
-    np.testing.assert_allclose(np.cos(race.referee.now.yaw_rad - origin.heading_rad), 1, atol=1e-12)
+    np.testing.assert_allclose(np.cos(race.rules.now.yaw_rad - origin.heading_rad), 1, atol=1e-12)
 
 
 def test_a_start_moves_on_for_the_car_whose_episode_ended_alone(race_of, column):
     race = race_of(n_cars=3)
     before = race.observation.copy()
     race.reset(np.array([1]))
-    np.testing.assert_allclose(race.referee.start_ndist, [0.0, 0.1, 0.1])
+    np.testing.assert_allclose(race.rules.start_ndist, [0.0, 0.1, 0.1])
     np.testing.assert_array_equal(race.observation[[0, 2]], before[[0, 2]])
     assert (race.observation[1] != before[1]).any()
     race.step(np.zeros(3, np.int64))
@@ -121,7 +121,7 @@ def test_a_start_moves_on_for_the_car_whose_episode_ended_alone(race_of, column)
 def test_a_row_belongs_to_the_pose_its_action_was_chosen_at(race_of, column):
     race = race_of("action_space=continuous", n_cars=4)
     for action in random_actions(25, 4):
-        seen, pose = race.observation.copy(), race.referee.now
+        seen, pose = race.observation.copy(), race.rules.now
         race.step(action)
         np.testing.assert_array_equal(column(race, "X"), pose.front[:, 0])
         np.testing.assert_allclose(
@@ -187,7 +187,7 @@ def test_params_are_what_shapely_says_of_the_pose(race_of, column, steer_ahead, 
     rows = []
     for step in range(60):
         action = steer_ahead(race, 0.3) + rng.uniform(-1, 1, (3, 2)) * [1.0, 0.3]
-        pose = race.referee.now
+        pose = race.rules.now
         race.step(action)
         if step:
             rows.append((pose, race.trace.copy()))
@@ -282,7 +282,7 @@ def test_a_car_that_hardly_moves_is_immobilized(race_of, column):
 def test_every_episode_of_an_open_course_begins_at_its_start(race_of):
     race = race_of("track=Straight_track", n_cars=3)
     race.reset()
-    np.testing.assert_array_equal(race.referee.start_ndist, 0.0)
+    np.testing.assert_array_equal(race.rules.start_ndist, 0.0)
 
 
 def test_a_start_inside_an_open_course_is_refused(setup_of):

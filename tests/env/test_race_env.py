@@ -5,9 +5,9 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
+from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.race import NonFinite, Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.formats.trace import PACKED
 
 SPACES = ["action_space=discrete", "action_space=continuous"]
 
@@ -74,7 +74,7 @@ def test_a_partial_reset_starts_the_marked_cars_alone(setup_of):
     mark = torch.tensor([[False], [True], [False]])
     again = env.reset(root.clone().set("_reset", mark))
     np.testing.assert_array_equal((again["observation"] == root["observation"]).all(-1), [True, False, True])
-    np.testing.assert_array_equal(env.race.referee.episode, [0, 1, 0])
+    np.testing.assert_array_equal(env.race.rules.episode, [0, 1, 0])
 
 
 @pytest.mark.parametrize("space", SPACES)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.trace import STATUS_CODE
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.rules import EpisodeRules
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import STATUS_CODE
 
 EVERYTHING = (
     "track=[reinvent_carpet,Oval_track]",
@@ -44,7 +44,7 @@ def future(race: Race, seed: int, turns: int) -> list[np.ndarray]:
             race.put_back(dice.permutation(race.n_cars)[:2], dice.uniform(0, 60, 2))
         if dice.random() < 0.02:
             race.reset()
-        seen += [race.observation.copy(), race.referee.now.front.copy()]
+        seen += [race.observation.copy(), race.rules.now.front.copy()]
     return seen
 
 
@@ -110,7 +110,7 @@ def test_a_race_with_little_or_no_randomization_goes_on_as_well(off):
     ("overrides", "options", "what"),
     [
         ((), {"n_cars": 4}, "'physics' of its cars has shape (3, "),
-        ((), {"n_cars": 3, "first_car": 3}, "begin with number 0; accepted here: 3"),
+        ((), {"n_cars": 3, "first_car": 3}, "first car has number 0; accepted here: 3"),
         (
             ("track=reinvent_carpet",),
             {"n_cars": 3},
@@ -136,12 +136,12 @@ def test_a_car_that_was_reversed_for_ten_steps_ends_its_episode_after_five_more(
     assert config.reversed_steps == 15
     at = np.zeros(1)
 
-    def judge(rules: EpisodeRules, step: int) -> int:
-        return int(rules.judge(at + step, 50.0 - at - step, 51.0 - at - step, at + 1.0, at > 0)[0])
+    def apply(rules: EpisodeRules, step: int) -> int:
+        return int(rules.apply(at + step, 50.0 - at - step, 51.0 - at - step, at + 1.0, at > 0)[0])
 
     before, after = EpisodeRules(config, 1), EpisodeRules(config, 1)
     for step in range(2, 12):
-        judge(before, step)
+        apply(before, step)
     after.load_state_dict(before.state_dict())
-    verdicts = [judge(after, step) for step in range(12, 17)]
+    verdicts = [apply(after, step) for step in range(12, 17)]
     assert verdicts == [STATUS_CODE["in_progress"]] * 4 + [STATUS_CODE["reversed"]]

@@ -6,13 +6,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deepracer_exp.config.compose import compose_experiment, validate
-from deepracer_exp.config.randomization import OFF, QUANTITIES
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import OFF, QUANTITIES
+from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.deepracer.trace import PACKED, RANDOMIZED
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.env.streams import CarStreams
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.trace import PACKED, RANDOMIZED
 from deepracer_exp.sim.batch import CarBatch
 
 DRAWN = [PACKED[name] for name in QUANTITIES]
@@ -67,7 +68,7 @@ def by_episode(trace: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 
 @pytest.fixture
-def sent(monkeypatch) -> Callable[[Race], list]:
+def disturb_commands(monkeypatch) -> Callable[[Race], list]:
     """Write down what reaches the cars of a race: steering in degrees, speed, and whether they may move."""
 
     def spy(race: Race) -> list:
@@ -172,9 +173,9 @@ def test_draws_are_uniform_and_every_delay_is_as_likely():
 # --- What reaches the car
 
 
-def test_constant_noise_has_its_mean_and_deviation(sent):
+def test_constant_noise_has_its_mean_and_deviation(disturb_commands):
     race = race_of("aws", steering_offset_deg=(-1.5, -1.5), n_cars=500)
-    log, action = sent(race), np.zeros((500, 2))
+    log, action = disturb_commands(race), np.zeros((500, 2))
     commanded_deg, commanded_mps = race.setup.actions.commands(action)
     for _ in range(8):
         race.step(action)
@@ -188,9 +189,9 @@ def test_constant_noise_has_its_mean_and_deviation(sent):
     assert abs(np.corrcoef(steering.ravel(), speed.ravel())[0, 1]) < 0.07
 
 
-def test_a_delayed_command_reaches_the_car_exactly_so_many_steps_later(sent):
+def test_a_delayed_command_reaches_the_car_exactly_so_many_steps_later(disturb_commands):
     race = race_of(action_delay_steps=(0, 4), max_steps=12, n_cars=12)
-    log, told, steps, delays = sent(race), [], [], []
+    log, told, steps, delays = disturb_commands(race), [], [], []
     for action in random_actions(40, 12):
         told.append(race.setup.actions.commands(action))
         delays.append(drawn_of(race, "action_delay_steps").astype(int))
@@ -209,12 +210,12 @@ def test_a_delayed_command_reaches_the_car_exactly_so_many_steps_later(sent):
 
 def test_a_late_car_stands_until_its_first_command_arrives():
     race = race_of(action_delay_steps=(3, 3), n_cars=2)
-    start = race.referee.now.front.copy()
+    start = race.rules.now.front.copy()
     for _ in range(4):
         race.step(np.zeros((2, 2)))
-        np.testing.assert_allclose(race.referee.now.front, start, atol=1e-6)
+        np.testing.assert_allclose(race.rules.now.front, start, atol=1e-6)
     race.step(np.zeros((2, 2)))
-    assert (np.linalg.norm(race.referee.now.front - start, axis=1) > 1e-3).all()
+    assert (np.linalg.norm(race.rules.now.front - start, axis=1) > 1e-3).all()
 
 
 def test_the_largest_delay_that_is_accepted_lets_a_car_drive():
@@ -227,9 +228,9 @@ def test_the_largest_delay_that_is_accepted_lets_a_car_drive():
     assert compose_experiment(["randomization.action_delay_steps=[0,15]", "episode.immobilized_steps=0"])
 
 
-def test_a_battery_loses_its_share_of_the_speed_over_twenty_seconds_and_no_more(sent):
+def test_a_battery_loses_its_share_of_the_speed_over_twenty_seconds_and_no_more(disturb_commands):
     race = race_of(battery_sag=(0.3, 0.3), max_steps=0)
-    log = sent(race)
+    log = disturb_commands(race)
     told = race.setup.actions.commands(np.zeros((1, 2)))[1][0]
     for _ in range(320):
         race.step(np.zeros((1, 2)))
@@ -266,7 +267,7 @@ def test_a_heavy_car_with_weak_motors_is_slower_away():
         race = race_of(**ranges)
         for _ in range(6):
             race.step(np.array([[0.0, 1.0]]))
-        speeds.append(race.referee.now.speed_mps[0])
+        speeds.append(race.rules.now.speed_mps[0])
     assert speeds[1] < 0.7 * speeds[0]
 
 
@@ -337,11 +338,13 @@ def test_a_dropout_shows_the_last_observation_again_but_never_that_of_another_ep
 
 def test_dropouts_come_as_often_as_was_drawn():
     race = race_of(observation_dropout=(0.0, 0.6), n_cars=60, max_steps=0)
-    seen = [race.observation]
+    disturb_observation = [race.observation]
     for _ in range(200):
         race.step(np.zeros((60, 2)))
-        seen.append(race.observation)
-    repeated = (np.diff(np.array(seen), axis=0) == 0).all(axis=2)[2:]  # a standing car repeats itself
+        disturb_observation.append(race.observation)
+    repeated = (np.diff(np.array(disturb_observation), axis=0) == 0).all(axis=2)[
+        2:
+    ]  # a standing car repeats itself
     expected = drawn_of(race, "observation_dropout")
     np.testing.assert_allclose(repeated.mean(axis=0), expected, atol=0.15)
     assert repeated.mean() == pytest.approx(expected.mean(), abs=0.02)
@@ -390,7 +393,7 @@ def test_an_observation_that_was_handed_out_stays_as_it_was():
 def test_a_silly_range_is_refused_in_one_line(mapping, name, value, complaint):
     silly = {**mapping, "randomization": {**mapping["randomization"], name: value}}
     with pytest.raises(BadInput, match=rf"^randomization\.{name}(: )?{complaint}") as caught:
-        validate(silly)
+        parse_experiment(silly)
     assert "\n" not in str(caught.value)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.env.referee import Referee
-from deepracer_exp.env.reward import RewardFunction
-from deepracer_exp.env.reward_source import RewardSource
-from deepracer_exp.formats.recording_reader import read_recording
-from deepracer_exp.formats.trace import EPISODE_STATUS
+from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.deepracer.trace import EPISODE_STATUS
+from deepracer_exp.env.rules import RaceRules
+from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.sim.batch import CarState
 
 REFERENCE = Path(__file__).parents[2] / "../shared/reference"
@@ -62,28 +62,30 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
     # A car whose episode is over waits where it ended.
     poses = np.repeat(recorded_pose[:, rows.groupby("episode")["steps"].idxmax()][:, None], steps, axis=1)
     poses[:, step, car] = recorded_pose
-    referee = Referee(setup, cars)
+    rules = RaceRules(setup, cars)
     source = RewardSource("follow", "follow.py", FOLLOW + FOLLOW_MANY, "", {}, {})
     reward = RewardFunction(source, cars, 30.0, None)
     # The service does not write where an episode began: it is where the first progress says.
     first = rows.groupby("episode").first()
     begun = setup.track.project(first[["X", "Y"]].to_numpy()).ndist - first["progress"].to_numpy() / 100
-    referee.reset(start_ndist=begun % 1)
+    rules.reset(start_ndist=begun % 1)
     out = np.empty((steps, cars, len(JUDGED)))
     for at in range(steps):
-        referee.see(CarState(*poses[:, at], *np.zeros((3, cars))))
-        verdict = referee.judge()
-        paid = reward(referee.params(verdict, np.zeros(cars), np.zeros(cars)), referee.roads, verdict.running)
+        rules.measure(CarState(*poses[:, at], *np.zeros((3, cars))))
+        result = rules.apply()
+        paid = reward(
+            rules.params(result, np.zeros(cars), np.zeros(cars)), rules.track_params, result.running
+        )
         out[at] = np.column_stack(
             [
-                verdict.progress,
-                verdict.all_wheels_on_track,
-                verdict.status,
-                verdict.terminated,
-                referee.nearer_waypoint(),
+                result.progress,
+                result.all_wheels_on_track,
+                result.status,
+                result.terminated,
+                rules.nearer_waypoint(),
                 paid,
-                referee.steps,
-                verdict.now.track_width_m,
+                rules.steps,
+                result.now.track_width_m,
             ]
         )
     table = pd.DataFrame(out[step, car], columns=JUDGED)
@@ -186,7 +188,7 @@ def test_training_episodes_start_where_our_cars_start(training, setup):
     rows, ours = training
     recorded_start = ours["start"][rows["steps"] == 1].to_numpy()
     assert len(recorded_start) == 560
-    one = Referee(setup, 1)
+    one = RaceRules(setup, 1)
     own_start = []
     for _ in recorded_start:
         one.reset()
@@ -217,12 +219,12 @@ def test_poses_from_the_middle_of_a_lap_are_judged_as_in_the_whole_lap(training,
     rows, ours = training
     steps = rows.groupby("episode")["steps"].transform("max")
     middle = rows.index[(rows["steps"] == 30) & (steps > 31)].to_numpy()[:50]
-    referee = Referee(setup, len(middle))
-    referee.reset(start_ndist=ours["start"].to_numpy()[middle])
-    referee.resume(rows["steps"].to_numpy()[middle], rows["progress"].to_numpy()[middle])
+    rules = RaceRules(setup, len(middle))
+    rules.reset(start_ndist=ours["start"].to_numpy()[middle])
+    rules.start_midway(rows["steps"].to_numpy()[middle], rows["progress"].to_numpy()[middle])
     after = rows.iloc[middle + 1]
     yaw_rad = np.radians(after["yaw"].to_numpy())
     x_m, y_m = after["X"] - FRONT_M * np.cos(yaw_rad), after["Y"] - FRONT_M * np.sin(yaw_rad)
-    referee.see(CarState(x_m.to_numpy(), y_m.to_numpy(), yaw_rad, *np.zeros((3, len(middle)))))
-    np.testing.assert_allclose(referee.judge().progress, after["progress"], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(referee.steps, after["steps"])
+    rules.measure(CarState(x_m.to_numpy(), y_m.to_numpy(), yaw_rad, *np.zeros((3, len(middle)))))
+    np.testing.assert_allclose(rules.apply().progress, after["progress"], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(rules.steps, after["steps"])

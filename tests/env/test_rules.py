@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepracer_exp.config.driving import EpisodeConfig
+from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.rules import EpisodeRules
-from deepracer_exp.formats.trace import EPISODE_STATUS
 
 CONFIG = EpisodeConfig(
     start_offset=0.0,
@@ -30,7 +30,7 @@ class OneCar:
         self.steps += 1
         before = self.progress
         self.progress = before + 0.01 if progress is None else progress
-        status = self.rules.judge(
+        status = self.rules.apply(
             *(np.array([value]) for value in (self.steps, self.progress, before, moved_m, off_track))
         )
         return EPISODE_STATUS[status[0]]
@@ -134,7 +134,7 @@ def test_a_new_episode_counts_from_zero_and_leaves_the_other_cars_alone():
     def stand(steps: int) -> np.ndarray:
         for step in range(steps):
             progress = np.full(3, 50.0 - 0.1 * step)
-            status = rules.judge(
+            status = rules.apply(
                 np.full(3, 10 + step), progress, progress + 0.1, np.zeros(3), np.zeros(3, bool)
             )
         return status

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.formats.checkpoint_files import HASHES, pin, write_hashes
+from deepracer_exp.runs.checkpoint_files import HASHES, pin, write_hashes
 
 QUICK = ("evaluation.trials=2", "evaluation.held_out=aws", "evaluation.time_s=20")
 
@@ -33,19 +33,19 @@ def run_dir(trained, tmp_path) -> Path:
     return copy
 
 
-def tear(run_dir: Path, name: str) -> None:
+def corrupt(run_dir: Path, name: str) -> None:
     os.truncate(next((run_dir / "checkpoints" / name).rglob("state.tdz")), 100)
 
 
 def test_every_kept_checkpoint_drives_the_same_trials(run_dir, call, tmp_path):
     pin(run_dir / "checkpoints", "000008", "promoted as racer@champion")
-    ended = call("checkpoints", run_dir.name, *QUICK, "-o", "picture.png", "--json", "figures.json")
+    ended = call("checkpoints", run_dir.name, *QUICK, "-o", "picture.html", "--json", "figures.json")
     assert ended.code == 0, ended.stderr
     assert re.search(r"000007 .*best", ended.stdout)
     assert re.search(r"000008 .*pinned", ended.stdout)
     assert re.search(r"000009 .*last", ended.stdout)
     assert "000008 is pinned: promoted as racer@champion" in ended.stdout
-    assert (tmp_path / "picture.png").stat().st_size > 10_000
+    assert (tmp_path / "picture.html").stat().st_size > 1_000_000
     found = json.loads((tmp_path / "figures.json").read_text())
     assert [one["name"] for one in found["checkpoints"]] == ["000007", "000008", "000009"]
     assert [one["labels"] for one in found["checkpoints"]] == [["best"], [], ["last"]]
@@ -57,45 +57,43 @@ def test_every_kept_checkpoint_drives_the_same_trials(run_dir, call, tmp_path):
     assert "recommended: {name}: {why}".format_map(found["recommended"]) in ended.stdout
 
 
-def test_a_torn_checkpoint_is_shown_and_left_out(run_dir, call, tmp_path):
-    tear(run_dir, "000009")
-    ended = call(
-        "checkpoints", f"run={run_dir}", *QUICK, "evaluation.held_out=null", "--json", "figures.json"
-    )
+def test_a_corrupt_checkpoint_is_shown_and_left_out(run_dir, call, tmp_path):
+    corrupt(run_dir, "000009")
+    ended = call("checkpoints", str(run_dir), *QUICK, "evaluation.held_out=null", "--json", "figures.json")
     assert ended.code == 0, ended.stderr
-    assert re.search(r"000009 .*last, torn", ended.stdout)
-    assert re.search(r"000009 is left out: torn: .*state.tdz is not as it was written", ended.stdout)
+    assert re.search(r"000009 .*last, bad", ended.stdout)
+    assert re.search(r"000009 is left out: .*state.tdz is not as it was written", ended.stdout)
     found = json.loads((tmp_path / "figures.json").read_text())
     assert found["checkpoints"][2]["figures"] is None
     assert found["recommended"]["name"] != "000009"
 
 
-def test_with_all_checkpoints_torn_there_is_a_refusal(run_dir, call):
+def test_a_run_with_only_corrupt_checkpoints_is_refused(run_dir, call):
     for name in ("000007", "000008", "000009"):
-        tear(run_dir, name)
+        corrupt(run_dir, name)
     ended = call("checkpoints", run_dir.name, *QUICK)
     assert ended.code == 2
-    assert "torn" in ended.complaint
+    assert "state.tdz" in ended.complaint
     assert ended.stdout == ""
 
 
-def test_the_trials_of_the_training_are_driven_unless_told_otherwise(run_dir, call, tmp_path):
+def test_by_default_the_trials_of_the_training_are_driven(run_dir, call, tmp_path):
     for name in ("000007", "000008"):
         shutil.rmtree(run_dir / "checkpoints" / name)
     ended = call("checkpoints", run_dir.name, "--json", "figures.json")
     assert ended.code == 0, ended.stderr
     assert "1 checkpoint, 16 trials each" in ended.stderr
-    assert "best leads nowhere" in ended.stderr
+    assert "best is a broken link" in ended.stderr
     assert json.loads((tmp_path / "figures.json").read_text())["evaluation"]["trials"] == 8
 
 
-def test_evaluate_says_loudly_that_another_checkpoint_drives(run_dir, call):
-    tear(run_dir, "000007")
-    ended = call("evaluate", f"run={run_dir.name}", "checkpoint=best", "evaluation.held_out=null")
+def test_evaluate_warns_when_it_uses_another_checkpoint(run_dir, call):
+    corrupt(run_dir, "000007")
+    ended = call("evaluate", run_dir.name, "checkpoint=best", "evaluation.held_out=null")
     assert ended.code == 0, ended.stderr
     (warning,) = [line for line in ended.stderr.splitlines() if line.startswith("warning: ")]
-    assert "000007: torn: " in warning
-    assert "000009, the newest intact one, takes its place" in warning
+    assert "000007: " in warning
+    assert "using 000009, the newest intact one" in warning
     assert "checkpoint 000009" in ended.stderr
     (file,) = (run_dir / "evaluations").iterdir()
     assert json.loads(file.read_text())["checkpoint"]["name"] == "000009"
@@ -104,12 +102,12 @@ def test_evaluate_says_loudly_that_another_checkpoint_drives(run_dir, call):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("nowhere",), ("run=nowhere: no such run",)),
-        (("evaluation=summit",), ("run: missing",)),
-        (("one", "two"), ("2 runs given: one, two",)),
+        (("nowhere",), ("nowhere: no such run",)),
+        (("evaluation=summit",), ("RUN: missing",)),
+        (("one", "two"), ("one two: 2 runs given",)),
         (("x", "checkpoint=best"), ("checkpoint=best", "evaluate")),
         (("x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
-        (("x", "-o", "nowhere/picture.png"), ("--output nowhere/picture.png",)),
+        (("x", "-o", "nowhere/picture.html"), ("--output nowhere/picture.html",)),
         (("x", "--json", "nowhere/figures.json"), ("--json nowhere/figures.json",)),
     ],
 )
@@ -120,7 +118,7 @@ def test_bad_input_is_one_line(call, arguments, words):
     assert ended.stdout == ""
 
 
-def test_a_picture_of_an_unknown_kind_is_refused_before_anybody_drives(call):
+def test_an_unknown_picture_format_is_refused_before_any_driving(call):
     assert "--output picture.txt" in call("checkpoints", "x", "-o", "picture.txt").complaint
 
 

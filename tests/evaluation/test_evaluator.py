@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.formats.trace import PACKED, STATUS_CODE
 
 
 def evaluate(experiment, config, policy):
@@ -110,14 +110,14 @@ def test_a_car_put_back_keeps_what_its_episode_drew_but_no_command_on_its_way(ci
     race.reset()
     for _ in range(10):
         race.step(np.array([[0.0, 1.0]], np.float32))
-    drawn, episode = race.randomization.values.copy(), race.referee.episode.copy()
+    drawn, episode = race.randomization.values.copy(), race.rules.episode.copy()
     race.put_back(np.array([0]), np.array([20.0]))
     speeds = []
     for _ in range(6):
         race.step(np.array([[0.0, 1.0]], np.float32))
         speeds.append(race.trace[0, PACKED["speed_mps"]])
     assert (race.randomization.values == drawn).all()
-    assert (race.referee.episode == episode).all()
+    assert (race.rules.episode == episode).all()
     # The command chosen at the first pose acts three steps later, and the pose after that shows it.
     assert np.abs(speeds[:4]).max() < 1e-3
     assert speeds[4] > 0.05

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import Evaluation, Group
-from deepracer_exp.evaluation.stewards import Attempt
 
 
 def attempt(trial=0, time_s=10.0, progress=100.0, end=None, **more):

@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from deepracer_exp.deepracer.recording import STEP_COLUMNS, Recording
+from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.reward_replay import replay_reward
-from deepracer_exp.formats.own_recording import read_own_recording
-from deepracer_exp.formats.recording import STEP_COLUMNS, Recording
-from deepracer_exp.formats.recording_reader import read_recording
+from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.tracks.track import Track
 
 REFERENCE = Path(__file__).parents[2] / "../shared/reference"
@@ -44,7 +44,7 @@ def made(steps: pd.DataFrame) -> Recording:
         name="made up",
         steps=steps,
         updates=pd.DataFrame(),
-        told=pd.DataFrame(),
+        metrics=pd.DataFrame(),
         metadata=None,
         hyperparameters=None,
         reward_source=None,
@@ -206,13 +206,13 @@ def test_laps_driven_the_other_way_are_seen(circle, reward):
     assert replayed.episodes["new_reward"].tolist() == [100.0, 200.0]
 
 
-def test_a_course_that_is_not_known_leaves_rows_without_a_reward_and_tells_so(circle, reward):
+def test_rows_on_an_unknown_course_have_no_reward_and_a_problem(circle, reward):
     steps = laps_of({0: 50, 1: 60}, 1.0).steps
     steps["track"] = pd.Categorical(np.where(steps["episode"] == 1, "elsewhere", "circle"))
     replayed = replay_reward(made(steps), reward("def reward_function(p):\n    return 1\n"), circle)
     assert replayed.steps["new_reward"].isna().tolist() == (steps["episode"] == 1).tolist()
     assert [str(problem) for problem in replayed.problems] == [
-        "made up: 61 of 112 steps have no new reward: their course or place is not known"
+        "made up: 61 of 112 steps have no new reward: their course or position is unknown"
     ]
     assert replayed.laps["episode"].tolist() == [0]
     with pytest.raises(BadInput, match="no step is on a known course"):

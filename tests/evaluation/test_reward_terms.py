@@ -7,10 +7,10 @@ import pytest
 
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.config.driving import RewardConfig
-from deepracer_exp.env.reward_source import RewardSource, load_reward_source, zoo_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.reward_replay import replay_reward
 from deepracer_exp.evaluation.reward_terms import recorded_source, reward_terms
+from deepracer_exp.rewards.source import RewardSource, load_reward_source, zoo_names
 
 from ..analysis.made_up import Drive, made_up_recording  # noqa: TID252
 
@@ -81,15 +81,15 @@ def test_without_a_course_there_are_no_terms(view: LogView) -> None:
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ("return 3.0", "returned '3.0', no dict of numbers"),
-        ("return {}", "no dict of numbers"),
+        ("return 3.0", "returned '3.0', not a dict of numbers"),
+        ("return {}", "not a dict of numbers"),
         ("return {'a': 'b'}", "returned 'b' for 'a'"),
         ("return {'a': float('nan')}", "returned 'nan' for 'a'"),
         ("return {'a': 1 / 0}", "raised ZeroDivisionError"),
         ("while True: pass", "took longer than the time limit of 0.2 s"),
     ],
 )
-def test_terms_that_fail_are_told_in_one_line(body: str, words: str, view: LogView) -> None:
+def test_terms_that_fail_are_reported_in_one_line(body: str, words: str, view: LogView) -> None:
     text = f"def terms(params):\n    {body}\n\n\ndef reward_function(params):\n    return 1.0\n"
     with pytest.raises(BadInput, match=r"mine\.py: terms ") as caught:
         reward_terms(view, module(text), time_limit_s=0.2)

@@ -13,10 +13,10 @@ from rich.console import Console
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
-from deepracer_exp.evaluation.report import table
+from deepracer_exp.evaluation.evaluate import results_table
+from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import Evaluation, Group
-from deepracer_exp.evaluation.run import read_run
-from deepracer_exp.evaluation.stewards import Attempt
+from deepracer_exp.runs.resolve import resolve
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def run_dir(trained, tmp_path) -> Path:
 @pytest.fixture
 def read(tmp_path):
     def go(run: object, checkpoint: str = "best"):
-        stored = read_run(str(run), tmp_path / "runs", None)
+        stored = resolve(str(run), tmp_path / "runs", None)
         return read_checkpoint(stored.experiment, stored.checkpoints, checkpoint)
 
     return go
@@ -63,7 +63,7 @@ def test_best_last_and_the_number_lead_to_checkpoints(run_dir, read):
 
 def test_a_beginning_that_several_runs_have_is_refused(run_dir, read):
     shutil.copytree(run_dir, run_dir.with_name(f"{run_dir.name}-2"), symlinks=True)
-    assert "2 runs are meant" in refusal(read, run_dir.name[:8])
+    assert "ambiguous: 2 runs match" in refusal(read, run_dir.name[:8])
     assert read(run_dir.name).path.parents[1] == run_dir
 
 
@@ -101,7 +101,7 @@ def test_a_configuration_that_is_none_is_refused(run_dir, read, text):
 
 
 def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
-    ended = call("evaluate", f"run={run_dir.name}", "evaluation.trials=2", "evaluation.held_out=aws")
+    ended = call("evaluate", run_dir.name, "evaluation.trials=2", "evaluation.held_out=aws")
     assert ended.code == 0, ended.stderr
     assert re.search(r"reinvent_base +usual +\d of 2", ended.stdout)
     assert re.search(r"reinvent_base +held out +\d of 2", ended.stdout)
@@ -119,13 +119,13 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), ("run: missing",)),
-        (("run=nowhere",), ("run=nowhere: no such run",)),
-        (("run=x", "checkpoint=newest"), ("checkpoint", "best, last")),
-        (("run=x", "evaluation=sumit"), ("sumit", "summit")),
-        (("run=x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
-        (("run=x", "evaluation.trials=0"), ("evaluation.trials=0",)),
-        (("run=x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
+        ((), ("RUN: missing",)),
+        (("nowhere",), ("nowhere: no such run",)),
+        (("x", "checkpoint=newest"), ("checkpoint", "best, last")),
+        (("x", "evaluation=sumit"), ("sumit", "summit")),
+        (("x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
+        (("x", "evaluation.trials=0"), ("evaluation.trials=0",)),
+        (("x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
     ],
 )
 def test_bad_input_is_one_line(call, arguments, words):
@@ -139,7 +139,7 @@ def test_a_video_needs_a_library_to_draw_with(call, monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     monkeypatch.setattr("sys.platform", "linux")
-    ended = call("evaluate", "run=x", "--video", "lap.mp4")
+    ended = call("evaluate", "x", "--video", "lap.mp4")
     assert ended.code == 2
     assert "EGL nor OSMesa" in ended.complaint
 
@@ -156,7 +156,7 @@ def test_a_narrow_table_leaves_out_columns_but_cuts_no_figure(protocol, width, m
     ]
     evaluation = Evaluation((Group("reinvent_base", "usual", (0, 1, 2), tuple(laps)),))
     console = Console(width=width, file=io.StringIO())
-    console.print(table(evaluation, protocol("summit"), ["reinvent_base"], console))
+    console.print(results_table(evaluation, protocol("summit"), ["reinvent_base"], console))
     text = console.file.getvalue()
     assert "11.25" in text
     assert ("median" in text, "(10.25" in text) == (median, intervals)

@@ -3,10 +3,10 @@ import json
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
 from deepracer_exp.export.aws_files import AwsFiles, aws_files, write_aws_files
-from deepracer_exp.formats.hyperparameters import read_hyperparameters
 
 REWARD = "def reward_function(params):\n    return params['speed']\n"
 
@@ -49,13 +49,15 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
         ("algorithm.epochs=1", "num_epochs", 3),
     ],
 )
-def test_what_the_console_does_not_take_is_brought_into_its_range_and_told(tmp_path, override, key, value):
+def test_values_beyond_the_console_are_clipped_and_reported(tmp_path, override, key, value):
     exported = files("algorithm.batch_size=64", override)
     write_aws_files(exported, tmp_path)
     learning = read_hyperparameters(tmp_path / "hyperparameters.json")
     assert getattr(learning, key) == value
     assert learning.beyond_console() == ()
-    assert any(note.startswith(f"hyperparameters.json: {key}={value}, as near to") for note in exported.notes)
+    assert any(
+        note.startswith(f"hyperparameters.json: {key}={value}, the nearest to") for note in exported.notes
+    )
 
 
 def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_told():
@@ -71,11 +73,11 @@ def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_told()
         (["action_space=grid", "action_space.steering_levels=17"], "34 actions"),
         (
             ["action_space=continuous", "action_space.speed.low=0.3"],
-            "speed from 0.3 to 3; the AWS console takes 0.5",
+            "speed from 0.3 to 3; the AWS console accepts 0.5",
         ),
     ],
 )
-def test_an_action_space_beyond_the_console_stays_as_it_is_and_is_told(overrides, words):
+def test_an_action_space_beyond_the_console_is_kept_and_reported(overrides, words):
     assert any(words in note for note in files(*overrides).notes)
 
 

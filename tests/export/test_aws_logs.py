@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from deepracer.logs import AnalysisUtils, DeepRacerLog, LogFolderType, TrainingMetrics
 
-from deepracer_exp.formats.recording_reader import read_recording
-from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.deepracer.trace import read_trace
 
 RENAMED = {
     "X": "x",
@@ -48,7 +48,7 @@ def export(call_at, tmp_path_factory):
     def go(folder, layout: str):
         to = tmp_path_factory.mktemp("exported") / "logs"
         ended = call_at(
-            to.parent, "export", f"run={folder}", "format=aws-logs", f"layout={layout}", "-o", str(to)
+            to.parent, "export", str(folder), "format=aws-logs", f"layout={layout}", "-o", str(to)
         )
         assert ended.code == 0, ended.stderr
         return to, ended.stdout
@@ -174,7 +174,7 @@ def test_the_trainers_log_has_a_line_for_each_update(run, exported):
 def test_what_is_left_out_is_told(run, exported):
     _, said = exported["console"]
     missing = len(read_trace(run.folder / "trace", ["steps"])) - len(finished(run.folder))
-    assert f"{missing:,} rows of episodes that had not ended are left out" in said
+    assert f"{missing:,} rows of unfinished episodes are left out" in said
 
 
 def test_a_policy_without_action_numbers_writes_what_it_commanded(trained, export, caplog):
@@ -204,7 +204,7 @@ def test_our_own_reader_finds_in_the_files_what_the_run_had(run, exported):
 def test_a_folder_that_is_not_empty_is_refused(run, call, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    ended = call("export", f"run={run.folder}", "format=aws-logs", "-o", "full")
+    ended = call("export", str(run.folder), "format=aws-logs", "-o", "full")
     assert ended.code == 2
     assert "full: is not empty; accepted: a new or an empty folder" in ended.complaint
 

@@ -5,7 +5,7 @@ import pytest
 
 def test_onnx_goes_into_the_runs_folder_and_is_checked(trained, call):
     run = trained()
-    ended = call("export", f"run={run.folder}", "format=onnx", "checkpoint=last")
+    ended = call("export", str(run.folder), "format=onnx", "checkpoint=last")
     assert ended.code == 0, ended.stderr
     assert ended.stdout.splitlines()[0] == str(run.folder / "export" / "policy.onnx")
     assert (run.folder / "export" / "policy.onnx").stat().st_size > 10_000
@@ -13,34 +13,34 @@ def test_onnx_goes_into_the_runs_folder_and_is_checked(trained, call):
     assert "on 1,000 observations" in ended.stdout
 
 
-def test_aws_goes_where_it_is_told_and_says_what_it_changed(trained, call):
+def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
     run = trained("reward.constants.SPEED_WEIGHT=2.5", "algorithm.batch_size=1000")
-    ended = call("export", f"run={run.folder}", "format=aws", "-o", "custom_files")
+    ended = call("export", str(run.folder), "format=aws", "-o", "custom_files")
     assert ended.code == 0, ended.stderr
     assert sorted(path.name for path in (ended.cwd / "custom_files").iterdir()) == [
         *("hyperparameters.json", "model_metadata.json", "reward_function.py"),
     ]
     assert "SPEED_WEIGHT = 2.5" in (ended.cwd / "custom_files" / "reward_function.py").read_text()
-    assert "batch_size=512, as near to 1000 as the AWS console takes" in ended.stdout
+    assert "batch_size=512, the nearest to 1000 that the AWS console accepts" in ended.stdout
 
 
 def test_what_the_console_would_refuse_of_a_reward_is_told(trained, call, tmp_path):
     reward = tmp_path / "mine.py"
     reward.write_text("import os\n\n\ndef reward_function(params):\n    return 1.0\n")
-    ended = call("export", f"run={trained(f'reward.file={reward}').folder}", "format=aws", "-o", "files")
+    ended = call("export", str(trained(f"reward.file={reward}").folder), "format=aws", "-o", "files")
     assert ended.code == 0, ended.stderr
-    assert "reward_function.py: the AWS console would refuse it: line 1: import of os" in ended.stdout
+    assert "reward_function.py: the AWS console would reject it: line 1: import of os" in ended.stdout
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["format=onnx"], "run: missing"),
-        (["run=nowhere"], "format: missing; write format=onnx, format=aws or format=aws-logs"),
-        (["run=nowhere", "format=onnx"], "nowhere: no such run"),
-        (["run=nowhere", "format=coreml"], 'format="coreml"'),
+        (["format=onnx"], "RUN: missing"),
+        (["nowhere"], "format: missing; write format=onnx, format=aws or format=aws-logs"),
+        (["nowhere", "format=onnx"], "nowhere: no such run"),
+        (["nowhere", "format=coreml"], 'format="coreml"'),
         (
-            ["run=nowhere", "format=onnx", "chekpoint=last"],
+            ["nowhere", "format=onnx", "chekpoint=last"],
             "chekpoint: no such key (did you mean checkpoint?)",
         ),
     ],
@@ -55,10 +55,10 @@ def test_what_cannot_be_exported_is_refused_in_one_line(call, arguments, words):
     ("arguments", "words"),
     [
         (["format=onnx", "checkpoint=77"], "000077 is not there"),
-        (["format=onnx", "-o", "."], "is a folder; a file is wanted"),
+        (["format=onnx", "-o", "."], "is a folder; give a file"),
     ],
 )
 def test_what_a_run_does_not_have_is_refused(trained, call, arguments, words):
-    ended = call("export", f"run={trained().folder}", *arguments)
+    ended = call("export", str(trained().folder), *arguments)
     assert ended.code == 2
     assert words in ended.complaint

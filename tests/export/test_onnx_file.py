@@ -106,7 +106,7 @@ def test_the_file_names_its_features(default):
     assert [file.name for file in path.parent.iterdir()] == ["policy.onnx"]
 
 
-def test_a_file_of_another_network_is_told_apart(default):
+def test_a_file_of_another_network_is_detected(default):
     content = default.path.read_bytes()
     assert (
         compare(DeployedPolicy(default.networks, default.actions), content, len(FEATURES)).largest_difference

@@ -14,9 +14,9 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from deepracer_exp.formats.run_files import read_metrics
+from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.tracking.mlflow_run import MLflowRun
-from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 
 ITERATIONS = 160
@@ -24,7 +24,7 @@ CHECKPOINT_EVERY = 12
 KEYS = ("completion", "kl", "env_steps_per_s")
 
 
-def write_whole(path: Path, text: str) -> None:
+def atomic_write(path: Path, text: str) -> None:
     aside = path.with_name(f".{path.name}")
     aside.write_text(text)
     aside.replace(path)
@@ -37,7 +37,7 @@ def record(run_dir: Path, uri: str) -> None:
     tracker = MLflowTracker(resolve_store(uri, run_dir))
     kept = json.loads(checkpoint.read_text()) if checkpoint.exists() else 0
     rows = read_metrics(metrics)[:kept] if metrics.exists() else []
-    write_whole(metrics, "".join(json.dumps(row) + "\n" for row in rows))
+    atomic_write(metrics, "".join(json.dumps(row) + "\n" for row in rows))
     if identity.exists():
         tracker.reopen(identity)
     else:
@@ -53,7 +53,7 @@ def record(run_dir: Path, uri: str) -> None:
         tracker.log(row, row["env_steps"])
         if iteration % CHECKPOINT_EVERY == 0:
             tracker.set_tag("half", str(2 * iteration // ITERATIONS))
-            write_whole(checkpoint, str(iteration))
+            atomic_write(checkpoint, str(iteration))
             tracker.safe_until(100 * iteration)
             while tracker.waiting:  # kills shall find the recorder at work, not far behind
                 time.sleep(0.001)

@@ -16,9 +16,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deepracer_exp.formats.run_files import read_metrics, read_object
+from deepracer_exp.runs.files import read_metrics, read_object
 
-from .test_killed_sweeps import PATIENCE_S, Sweep, assert_every_trial_is_accounted_for_once, slots
+from .test_killed_sweeps import PATIENCE_S, Sweep, assert_every_trial_is_accounted_for_once, claims
 
 KILLS = int(os.environ.get("FAULT_TIMES", "1"))
 GONE_S = 10.0
@@ -37,8 +37,8 @@ def kill(request):
         began = time.monotonic()
         while (left := doomed()) and time.monotonic() < began + GONE_S:
             time.sleep(0.05)
-        told = [" ".join(process.cmdline())[:120] for process in left]
-        kills.append({"moment": moment, "gone_after_s": round(time.monotonic() - began, 2), "left": told})
+        lines = [" ".join(process.cmdline())[:120] for process in left]
+        kills.append({"moment": moment, "gone_after_s": round(time.monotonic() - began, 2), "left": lines})
         assert not left
 
     yield go
@@ -55,9 +55,9 @@ def ended(cwd):
 
 
 def rest(start, cwd):
-    """Let the trials that have begun come to their end in a sweep that nobody kills."""
-    # Workers that claim at the same moment spread out, so that a slot before the last may not have begun.
-    begun = max((slot.slot for slot in slots(cwd)), default=0) + 1
+    """Finish the trials that have begun, in a sweep without kills."""
+    # Workers that claim at the same moment spread out, so that a trial before the last may not have begun.
+    begun = max((claim.index for claim in claims(cwd)), default=0) + 1
     Sweep(start, cwd, f"sweep.trials={begun}").end()
     assert_every_trial_is_accounted_for_once(cwd, trials=begun)
 
@@ -103,7 +103,7 @@ def test_a_sweep_survives_a_killed(what, start, tmp_path, kill):
 
 
 def test_nothing_outlives_a_killed_run_and_it_resumes(start, tmp_path, kill):
-    iterations = 20 * KILLS
+    iterations = 15 * KILLS  # more than the rows that are waited for
     run = (
         *("train", "experiment=tiny", "tracking=off", "collector.processes=2", "checkpoints.every=4"),
         *("episode.max_steps=60", "budget.env_steps=null", f"budget.iterations={iterations}"),
@@ -123,7 +123,7 @@ def test_nothing_outlives_a_killed_run_and_it_resumes(start, tmp_path, kill):
         started.popen.wait()
         folders = [path.parent for path in tmp_path.glob("runs/tiny/*/config.yaml")]
     (folder,) = folders
-    last = start("resume", str(folder)).end(PATIENCE_S)
+    last = start("resume", str(folder)).end(PATIENCE_S + 10.0 * KILLS)
     assert last.code == 0, last.stderr
     assert read_object(folder / "summary.json")["status"] == "finished"
     assert [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")] == list(

@@ -13,8 +13,8 @@ import optuna
 import psutil
 import pytest
 
-from deepracer_exp.formats.run_files import read_metrics, read_object
-from sweeps.ledger import Ledger
+from deepracer_exp.runs.files import read_metrics, read_object
+from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage
 
 TIMES = range(int(os.environ.get("FAULT_TIMES", "1")))
@@ -90,27 +90,27 @@ def wait_at_random(moment, sweep):
     time.sleep(more_s)
 
 
-def slots(cwd, storage=None):
-    return Ledger(open_storage(storage, cwd / "runs").engine, "s").slots()
+def claims(cwd, storage=None):
+    return TrialClaims(open_storage(storage, cwd / "runs").engine, "s").all()
 
 
 def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS):
     """The study has each trial once, with the value of a run that has each of its iterations once."""
     opened = open_storage(storage, cwd / "runs")
-    ledger = Ledger(opened.engine, "s").slots()
-    assert [slot.slot for slot in ledger] == list(range(trials))
-    assert {slot.state for slot in ledger} == {"told"}
+    found = TrialClaims(opened.engine, "s").all()
+    assert [claim.index for claim in found] == list(range(trials))
+    assert {claim.state for claim in found} == {"told"}
     known = {one._trial_id: one for one in optuna.load_study(study_name="s", storage=opened.optuna).trials}
-    assert {slot.trial_id for slot in ledger} == {
+    assert {claim.trial_id for claim in found} == {
         key for key, one in known.items() if one.state == optuna.trial.TrialState.COMPLETE
     }
-    # A worker may be killed just when it had made a trial; it is told as such.
-    rest = [one.state for key, one in known.items() if key not in {slot.trial_id for slot in ledger}]
+    # A worker may be killed just after it created a trial, which fails then.
+    rest = [one.state for key, one in known.items() if key not in {claim.trial_id for claim in found}]
     assert set(rest) <= {optuna.trial.TrialState.FAIL}
-    for slot in ledger:
-        trial = known[slot.trial_id]
-        assert trial.user_attrs["slot"] == slot.slot
-        assert trial.values == slot.values
+    for claim in found:
+        trial = known[claim.trial_id]
+        assert trial.user_attrs["slot"] == claim.index
+        assert trial.values == claim.result.values
         (run,) = trial.user_attrs["runs"]
         assert trial.values == run["value"]
         folder = cwd / "runs" / "s" / Path(run["run_dir"]).name
@@ -121,7 +121,7 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS):
 
 
 @pytest.mark.parametrize("seed", TIMES)
-def test_after_kill_9_of_the_only_worker_another_one_goes_on(sweep, tmp_path, seed):
+def test_after_kill_9_of_the_only_worker_another_one_continues(sweep, tmp_path, seed):
     running = sweep("sweep.workers=1", at_random=random.Random(seed))
     (worker,) = running.workers()
     worker.kill()
@@ -148,13 +148,15 @@ def test_ctrl_c_begins_no_other_trial_and_leaves_those_under_way_ready_to_resume
     running = sweep("sweep.workers=2", "sweep.trials=1000")
     running.wait_for(lambda: running.rows() >= ITERATIONS + 1, "rows")
     assert interrupted(running) < SOON_S
-    begun = slots(tmp_path)
-    assert {slot.attempt for slot in begun} == {1}
-    open_ones = [slot for slot in begun if slot.outcome is None]
+    begun = claims(tmp_path)
+    assert {claim.attempt for claim in begun} == {1}
+    open_ones = [claim for claim in begun if claim.result is None]
     assert len(open_ones) <= 2
-    assert all(slot.expired for slot in open_ones)
-    sweep(f"sweep.trials={len(begun)}").end()
-    assert_every_trial_is_accounted_for_once(tmp_path, trials=len(begun))
+    assert all(claim.expired for claim in open_ones)
+    # Workers that claimed at the same moment may have left a gap.
+    trials = 1 + max(claim.index for claim in begun)
+    sweep(f"sweep.trials={trials}").end()
+    assert_every_trial_is_accounted_for_once(tmp_path, trials=trials)
 
 
 @pytest.mark.slow
@@ -164,7 +166,7 @@ def test_ctrl_c_ends_a_sweep_whose_trials_would_take_minutes_to_end(sweep, tmp_p
         "import time\n\n\ndef reward_function(params):\n    time.sleep(0.2)\n    return 1.0\n"
     )
     running = sweep("sweep.workers=2", "reward.file=slow.py", "reward.time_limit_s=19", "collector.cars=4")
-    running.wait_for(lambda: len([slot for slot in slots(tmp_path) if slot.runs]) == 2, "runs")
+    running.wait_for(lambda: len([claim for claim in claims(tmp_path) if claim.runs]) == 2, "runs")
     assert interrupted(running, times) < within_s
 
 
@@ -183,7 +185,7 @@ def test_the_cars_of_a_killed_worker_are_gone_with_it(sweep):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", TIMES)
-def test_after_kill_9_of_everything_the_study_goes_on(sweep, tmp_path, seed):
+def test_after_kill_9_of_everything_the_study_resumes(sweep, tmp_path, seed):
     running = sweep("sweep.workers=2", at_random=random.Random(seed))
     for process in (running.driver, *running.workers()):
         process.kill()
@@ -199,31 +201,31 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
 ):
     running = sweep("sweep.workers=2")
     running.wait_for(lambda: running.rows() >= 1 + random.Random(seed).randrange(4), "rows")
-    (held, *_) = [slot for slot in slots(tmp_path) if slot.state == "claimed" and slot.runs]
+    (held, *_) = [claim for claim in claims(tmp_path) if claim.state == "claimed" and claim.runs]
     (late,) = [one for one in running.workers() if one.pid == pid_of(held)]
     late.suspend()
     try:
         taken = running.wait_for(
-            lambda: next((s for s in slots(tmp_path) if s.slot == held.slot and s.attempt > 1), None),
+            lambda: next((s for s in claims(tmp_path) if s.index == held.index and s.attempt > 1), None),
             "other worker that takes over",
         )
         assert taken.owner != held.owner
         running.wait_for(
-            lambda: next(s for s in slots(tmp_path) if s.slot == held.slot).state == "told", "result"
+            lambda: next(s for s in claims(tmp_path) if s.index == held.index).state == "told", "result"
         )
     finally:
         late.resume()
     running.end()
     assert_every_trial_is_accounted_for_once(tmp_path)
-    slot = next(slot for slot in slots(tmp_path) if slot.slot == held.slot)
-    assert slot.attempt == taken.attempt
+    claim = next(claim for claim in claims(tmp_path) if claim.index == held.index)
+    assert claim.attempt == taken.attempt
     # The sleeper held its folder, so that the other one went on in a copy.
-    assert slot.runs[0]["run_dir"] != held.runs[0]["run_dir"]
+    assert claim.runs[0]["run_dir"] != held.runs[0]["run_dir"]
     assert not (Path(held.runs[0]["run_dir"]) / "summary.json").exists()
 
 
-def pid_of(slot):
-    return int(slot.owner.rsplit(":", 2)[1])
+def pid_of(claim):
+    return int(claim.owner.rsplit(":", 2)[1])
 
 
 @pytest.mark.slow
@@ -237,7 +239,7 @@ def test_two_drivers_share_one_study(sweep, tmp_path, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", TIMES)
-def test_while_the_database_is_away_everybody_waits_and_then_goes_on(sweep, tmp_path, postgres, seed):
+def test_while_the_database_is_away_all_wait_and_then_continue(sweep, tmp_path, postgres, seed):
     moment, url = random.Random(seed), postgres.new_database()
     running = sweep("sweep.workers=2", f"sweep.storage={url}", at_random=moment)
     postgres.stop(moment.choice([signal.SIGINT, signal.SIGQUIT]))

@@ -9,9 +9,9 @@ import pytest
 from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
-from deepracer_exp.formats.run_files import read_metrics
-from deepracer_exp.tracking.names import metric_name
-from deepracer_exp.training.run import TIMES
+from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.training.metrics import TIMES
 
 ITERATIONS = 14
 RUN = (

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from deepracer_exp.config.driving import RewardConfig
-from deepracer_exp.env.params import Road
-from deepracer_exp.env.reward import RewardFunction
-from deepracer_exp.env.reward_source import load_reward_source, zoo_names
+from deepracer_exp.rewards.params import TrackParams
+from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.rewards.source import load_reward_source, zoo_names
 
 CONF = Path(__file__).parents[2] / "conf" / "reward"
 STATELESS = [name for name in zoo_names() if name != "progress_delta"]
@@ -42,7 +42,7 @@ ROADS = {
 
 def drive(
     road: str, index: np.ndarray, off: np.ndarray, heading_error: np.ndarray, **given: np.ndarray | float
-) -> tuple[dict[str, np.ndarray], list[Road]]:
+) -> tuple[dict[str, np.ndarray], list[TrackParams]]:
     """Return columns and road of cars half way after waypoint `index`, `off` metres left of the line."""
     points = ROADS[road]
     n = len(index)
@@ -71,15 +71,15 @@ def drive(
     columns.update(given)
     columns = {k: np.broadcast_to(v, (n, 2) if k == "closest_waypoints" else n) for k, v in columns.items()}
     waypoints = [tuple(point) for point in points.tolist()]
-    return columns, [Road(waypoints, float(lengths[-1]), road.endswith("reversed"))]
+    return columns, [TrackParams(waypoints, float(lengths[-1]), road.endswith("reversed"))]
 
 
-def anywhere(road: str, n: int) -> tuple[dict[str, np.ndarray], list[Road]]:
+def anywhere(road: str, n: int) -> tuple[dict[str, np.ndarray], list[TrackParams]]:
     """Return n cars in all states a car can be in, and some beyond."""
     random = np.random.default_rng(sum(map(ord, road)))
     index = random.integers(0, len(ROADS[road]) - 1, n)
     off = random.choice([0.0, 0.2, 0.45, 0.5, 3.0], n) * random.uniform(-1.0, 1.0, n)
-    columns, roads = drive(
+    columns, track_params = drive(
         road,
         index,
         off,
@@ -94,7 +94,7 @@ def anywhere(road: str, n: int) -> tuple[dict[str, np.ndarray], list[Road]]:
     # The last place on the line, where the service gives the closing point and its repetition.
     pairs = columns["closest_waypoints"].copy()
     pairs[:3] = len(ROADS[road]) - 1, 0
-    return {**columns, "closest_waypoints": pairs}, roads
+    return {**columns, "closest_waypoints": pairs}, track_params
 
 
 def config(name: str, **constants: float) -> RewardConfig:
@@ -113,15 +113,15 @@ def pay(
     name: str, road: str = "oval", *, at: int = 10, off: float = 0.0, turned: float = 0.0, **given: float
 ) -> float:
     """Return what one car gets."""
-    columns, roads = drive(road, np.array([at]), np.array([off]), np.array([turned]), **given)
-    return float(zoo(name, 1, scalar=True)(columns, roads, None)[0])
+    columns, track_params = drive(road, np.array([at]), np.array([off]), np.array([turned]), **given)
+    return float(zoo(name, 1, scalar=True)(columns, track_params, None)[0])
 
 
 @pytest.mark.parametrize("road", ROADS)
 @pytest.mark.parametrize("name", zoo_names())
 def test_every_reward_is_finite_in_every_state(name: str, road: str) -> None:
-    columns, roads = anywhere(road, 200)
-    rewards = zoo(name, 200)(columns, roads, None)
+    columns, track_params = anywhere(road, 200)
+    rewards = zoo(name, 200)(columns, track_params, None)
     assert np.abs(rewards).max() < 1e4
 
 
@@ -129,19 +129,19 @@ def test_every_reward_is_finite_in_every_state(name: str, road: str) -> None:
 @pytest.mark.parametrize("name", STATELESS)
 def test_the_batch_formula_is_the_scalar_formula(name: str, road: str) -> None:
     n = 4 if name == "racing_line" else 200  # each car's module works the line out anew
-    columns, roads = anywhere(road, n)
-    scalar = zoo(name, n, scalar=True)(columns, roads, None)
-    np.testing.assert_allclose(zoo(name, n)(columns, roads, None), scalar, rtol=1e-9, atol=1e-12)
+    columns, track_params = anywhere(road, n)
+    scalar = zoo(name, n, scalar=True)(columns, track_params, None)
+    np.testing.assert_allclose(zoo(name, n)(columns, track_params, None), scalar, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", STATELESS)
 def test_every_reward_but_one_has_a_batch_and_no_memory(name: str) -> None:
-    columns, roads = anywhere("oval", 8)
+    columns, track_params = anywhere("oval", 8)
     reward = zoo(name, 8)
     assert "def reward_batch(" in reward.source.text
-    first = reward(columns, roads, None)
-    reward(anywhere("wavy", 8)[0], roads, None)
-    np.testing.assert_array_equal(reward(columns, roads, None), first)
+    first = reward(columns, track_params, None)
+    reward(anywhere("wavy", 8)[0], track_params, None)
+    np.testing.assert_array_equal(reward(columns, track_params, None), first)
 
 
 @pytest.mark.parametrize("name", zoo_names())
@@ -183,13 +183,13 @@ def test_every_reward_says_what_it_teaches_and_when_it_fails(name: str) -> None:
 
 @pytest.mark.parametrize("name", zoo_names())
 def test_every_constant_has_an_effect(name: str) -> None:
-    columns, roads = anywhere("corner", 200)
+    columns, track_params = anywhere("corner", 200)
     # Two calls in a row, for the one that compares with the call before.
     calls = [{**columns, "steps": np.full(200, i), "progress": columns["progress"] * i} for i in (1, 2)]
 
     def rewards(**changed: float) -> list[np.ndarray]:
         reward = zoo(name, 200, **changed)
-        return [reward(call, roads, None) for call in calls]
+        return [reward(call, track_params, None) for call in calls]
 
     before = rewards()
     for constant, value in load_reward_source(config(name)).constants.items():
@@ -285,10 +285,10 @@ def test_progress_delta_adds_up_to_the_lap_less_the_time() -> None:
     for progress in (np.linspace(0.5, 100.0, 40), np.linspace(0.5, 60.0, 20)):  # two episodes
         total = 0.0
         for step, done in enumerate(progress):
-            columns, roads = drive(
+            columns, track_params = drive(
                 "oval", np.array([5]), np.zeros(1), np.zeros(1), progress=done, steps=step + 2.0
             )
-            total += float(reward(columns, roads, None)[0])
+            total += float(reward(columns, track_params, None)[0])
         assert total == pytest.approx(progress[-1] - progress[0] - 0.05 * len(progress))
 
 
@@ -344,6 +344,6 @@ def test_racing_line_pays_for_the_inside_of_a_corner_at_its_speed() -> None:
     off = np.array([0.25, -0.25, 0.25, 0.25])
     speeds = target + np.array([0.0, 0.0, -1.0, 1.0])
     # Waypoint 0 is the tip of the oval, where it turns left most.
-    columns, roads = drive("oval", np.zeros(4, int), off, np.zeros(4), speed=speeds)
-    best, *others = zoo("racing_line", 4)(columns, roads, None)
+    columns, track_params = drive("oval", np.zeros(4, int), off, np.zeros(4), speed=speeds)
+    best, *others = zoo("racing_line", 4)(columns, track_params, None)
     assert best > max(others)

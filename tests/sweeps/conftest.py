@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
+from sweeps.claims import TrialClaims
 from sweeps.database import resolve_database
-from sweeps.ledger import Ledger
 
 PATIENCE_S = 120.0
 MYSQL = "SWEEPS_TEST_MYSQL"
@@ -44,8 +44,8 @@ def engine(url: str) -> Iterator[sa.Engine]:
 
 
 @pytest.fixture
-def ledger(engine: sa.Engine) -> Ledger:
-    return Ledger(engine, "study")
+def claims(engine: sa.Engine) -> TrialClaims:
+    return TrialClaims(engine, "study")
 
 
 class Racers:

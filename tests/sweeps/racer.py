@@ -1,4 +1,4 @@
-"""A process of the tests of `sweeps`: `python racer.py WHAT URL OWNER ...`; begins when it is told so, on its stdin."""
+"""A process of the tests of `sweeps`: `python racer.py WHAT URL OWNER ...`; begins at a line on its stdin."""
 
 import sys
 from pathlib import Path
@@ -7,8 +7,8 @@ import sqlalchemy as sa
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from sweeps.claims import TrialClaims
 from sweeps.database import resolve_database
-from sweeps.ledger import Ledger
 
 
 def _ready() -> None:
@@ -24,22 +24,22 @@ def table(url: str, owner: str) -> None:
     """Make the table."""
     engine = _engine(url)
     _ready()
-    Ledger(engine, "study")
+    TrialClaims(engine, "study")
     print("made", flush=True)
 
 
 def claim(url: str, owner: str, total: str, lease_s: str) -> None:
-    """Claim slots, each in another name, until there are none."""
-    ledger = Ledger(_engine(url), "study")
+    """Claim trials, each under another name, until there are none."""
+    claims = TrialClaims(_engine(url), "study")
     _ready()
     count = 0
-    while (claim := ledger.claim(f"{owner}.{count}", int(total), float(lease_s))) is not None:
-        print(claim.slot, claim.attempt, claim.previous_owner, claim.trial_id, flush=True)
+    while (claim := claims.claim(f"{owner}.{count}", int(total), float(lease_s))) is not None:
+        print(claim.index, claim.attempt, claim.previous_owner, claim.trial_id, flush=True)
         count += 1
 
 
 def storage(url: str, owner: str, trials: str) -> None:
-    """Open the storage, make the study if nobody has, make trials and end them."""
+    """Open the storage, make the study if it is missing, make trials and end them."""
     import optuna
 
     from sweeps.storage import open_storage
@@ -47,7 +47,7 @@ def storage(url: str, owner: str, trials: str) -> None:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     _ready()
     storage = open_storage(url, Path())
-    Ledger(storage.engine, "study")
+    TrialClaims(storage.engine, "study")
     study = optuna.create_study(study_name="study", storage=storage.optuna, load_if_exists=True)
     for _ in range(int(trials)):
         trial = study.ask()

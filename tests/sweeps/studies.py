@@ -29,9 +29,9 @@ def new_study(
         for objective in objectives
     ]
     study = optuna.create_study(study_name=name, directions=directions)
-    told = {"space": SPACE, "base": ["track=reinvent_base"], "objectives": list(objectives), "seeds": 1}
-    told |= {"protocol": "sweep", "trials": 60, "runs_dir": str(runs_dir), "mlflow_run_id": "a" * 32}
-    for key, value in (told | attrs).items():
+    attributes = {"space": SPACE, "base": ["track=reinvent_base"], "objectives": list(objectives), "seeds": 1}
+    attributes |= {"protocol": "sweep", "trials": 60, "runs_dir": str(runs_dir), "mlflow_run_id": "a" * 32}
+    for key, value in (attributes | attrs).items():
         study.set_user_attr(key, value)
     return study
 
@@ -39,7 +39,7 @@ def new_study(
 def add(
     study: optuna.Study,
     values: Sequence[float] | None,
-    fate: str = "converged",
+    outcome: str = "converged",
     *,
     params: Mapping[str, Any] | None = None,
     distributions: Mapping[str, BaseDistribution] = DISTRIBUTIONS,
@@ -50,21 +50,26 @@ def add(
     """Add a trial, complete if it has values; `seen` is what a pruned one had, `metrics` the rows of its run."""
     number = len(study.get_trials(deepcopy=False))
     params = {"algorithm.lr": 1e-4, "algorithm.entropy_coeff": 0.01} if params is None else params
-    pruned = TrialState.FAIL if fate == "failed" else TrialState.PRUNED
+    pruned = TrialState.FAIL if outcome == "failed" else TrialState.PRUNED
     run_dir = Path(study.user_attrs["runs_dir"]) / study.study_name / f"run-{number}"
     if metrics:
-        write_metrics(run_dir, metrics, 1e4 if fate == "not_learning" else 20.0 + 7 * (number % 8))
-    told = {"slot": number, "fate": fate, "reason": f"{fate.replace('_', ' ')}: for a reason", "attempt": 1}
-    told |= {"overrides": [f"{key}={value}" for key, value in params.items()], "run_dir": str(run_dir)}
-    told |= {"env_steps": 100_000, "wall_clock_s": 40.0, "lap_time_s": 9.5, "completion": 97.0}
-    told |= {"runs": [{"seed": 0, "run_dir": str(run_dir), "status": "finished", "value": values}]}
+        write_metrics(run_dir, metrics, 1e4 if outcome == "not_learning" else 20.0 + 7 * (number % 8))
+    attributes = {
+        "slot": number,
+        "fate": outcome,
+        "reason": f"{outcome.replace('_', ' ')}: for a reason",
+        "attempt": 1,
+    }
+    attributes |= {"overrides": [f"{key}={value}" for key, value in params.items()], "run_dir": str(run_dir)}
+    attributes |= {"env_steps": 100_000, "wall_clock_s": 40.0, "lap_time_s": 9.5, "completion": 97.0}
+    attributes |= {"runs": [{"seed": 0, "run_dir": str(run_dir), "status": "finished", "value": values}]}
     study.add_trial(
         create_trial(
             state=pruned if values is None else TrialState.COMPLETE,
             values=values,
             params=dict(params),
             distributions={key: distributions[key] for key in params},
-            user_attrs=told | attrs,
+            user_attrs=attributes | attrs,
             intermediate_values={} if seen is None else {1: 2 * seen, 2: seen},
         )
     )
@@ -107,12 +112,12 @@ def season(
                 traceback="Traceback\n  x",
             )
         elif off > 0.9:
-            fate = dice.choice(["not_learning", "collapsed", "median", "hyperband"])
+            outcome = dice.choice(["not_learning", "collapsed", "median", "hyperband"])
             seen = dice.uniform(60, 100) if len(objectives) == 1 else None
             add(
                 study,
                 None,
-                fate,
+                outcome,
                 params=params,
                 seen=seen,
                 metrics=rows // 3,
@@ -120,7 +125,7 @@ def season(
                 lap_time_s=None,
             )
         else:
-            told = [values[name] for name in objectives]
-            add(study, told, dice.choice(kinds), params=params, metrics=rows, lap_time_s=lap_s, completion=completion,
+            found = [values[name] for name in objectives]
+            add(study, found, dice.choice(kinds), params=params, metrics=rows, lap_time_s=lap_s, completion=completion,
                 env_steps=350_000, held_out_completion=completion - 4)  # fmt: skip
     return study

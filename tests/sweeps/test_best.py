@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.references import resolve
-from deepracer_exp.formats.best_of_sweep import BEST_OF_SWEEP, read_best_of_sweep, run_of_sweep
+from deepracer_exp.runs.files import BEST_OF_SWEEP
+from deepracer_exp.runs.resolve import best_run_of_sweep, read_best_of_sweep, resolve
 from sweeps.best import best_line, best_run, best_trial, best_values, complete_trials, write_best
 
 from .studies import add, new_study, write_metrics
@@ -28,7 +28,7 @@ def test_more_completion_is_better(tmp_path):
     assert best_trial(study).number == 1
 
 
-def test_of_lap_time_and_completion_the_fast_car_that_never_arrives_is_not_the_best(tmp_path):
+def test_with_lap_time_and_completion_a_fast_car_that_rarely_finishes_is_not_the_best(tmp_path):
     study = new_study(tmp_path, objectives=["lap_time", "completion"])
     for values in ((8.0, 40.0), (9.0, 98.0), (11.0, 100.0), (60.0, 0.0)):
         add(study, values)
@@ -47,7 +47,7 @@ def test_on_fresh_laps_another_trial_may_win(tmp_path):
     assert (best_trial(study).number, best_values(study)) == (1, [9.3])
     study.set_user_attr("reranked_of", 3)
     assert (best_trial(study).number, best_values(study)) == (1, [9.3])
-    # Trials made since may be better, and nobody has driven them on fresh laps.
+    # Trials made since may be better, and have driven no fresh laps.
     add(study, [8.0])
     assert (best_trial(study).number, best_values(study)) == (3, [8.0])
 
@@ -59,14 +59,14 @@ def test_without_a_complete_trial_there_is_no_best(tmp_path):
         best_line(study)
 
 
-def test_the_line_gives_back_every_override_when_a_shell_reads_it(tmp_path):
+def test_a_shell_reads_every_override_back_from_the_command(tmp_path):
     study = new_study(tmp_path)
     overrides = ["algorithm.lr=0.0003", "network.hidden=[64, 64]", "reward.constants.NAME=it's <a> $HOME"]
     add(study, [9.0], overrides=overrides)
     assert shlex.split(best_line(study)) == ["deepracer-exp", "train", *overrides]
     study.set_user_attr("parent", "best:spring")
     study.set_user_attr("parent_run", ["run=/my runs/a", "checkpoint=40"])
-    cloned = ["deepracer-exp", "clone", "run=/my runs/a", "checkpoint=40", *overrides]
+    cloned = ["deepracer-exp", "clone", "/my runs/a", "checkpoint=40", *overrides]
     assert shlex.split(best_line(study)) == cloned
 
 
@@ -105,20 +105,20 @@ def test_best_of_a_study_leads_to_the_run_of_its_best_trial(tmp_path):
     assert resolve("best:lr_entropy", tmp_path, None).path == folder / "by-hand"
     write_best(study, tmp_path)
     assert resolve("best:lr_entropy", tmp_path, None).path == folder / "seed-1"
-    told = read_best_of_sweep(folder)
-    assert told is not None
-    assert (told.study, told.trial, told.values) == ("lr_entropy", 0, {"race_score": 9.5})
+    best = read_best_of_sweep(folder)
+    assert best is not None
+    assert (best.study, best.trial, best.values) == ("lr_entropy", 0, {"race_score": 9.5})
 
 
 @pytest.mark.parametrize("name", ["../elsewhere", "/etc", "..", ".", "", "a/b", "a\\b", "seed-0\n", 3, None])
-def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+def test_a_path_in_place_of_a_name_is_refused(tmp_path, name):
     write_metrics(tmp_path / "elsewhere", 1)
     folder = tmp_path / "study"
     folder.mkdir()
-    told = {"study": "study", "trial": 0, "run_dir": name, "values": {}}
-    (folder / BEST_OF_SWEEP).write_text(json.dumps(told))
+    stored = {"study": "study", "trial": 0, "run_dir": name, "values": {}}
+    (folder / BEST_OF_SWEEP).write_text(json.dumps(stored))
     with pytest.raises(BadInput, match="run_dir") as refused:
-        run_of_sweep(folder)
+        best_run_of_sweep(folder)
     assert "\n" not in str(refused.value)
 
 
@@ -129,18 +129,18 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
     (folder / "run").symlink_to(tmp_path / "elsewhere")
     (folder / BEST_OF_SWEEP).write_text('{"study": "study", "trial": 0, "run_dir": "run", "values": {}}')
     with pytest.raises(BadInput, match="leads out of"):
-        run_of_sweep(folder)
+        best_run_of_sweep(folder)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"study": "x"}', '{"study": "x", "trial": -1}'])
-def test_a_file_that_no_sweep_has_written_is_named(tmp_path, text):
+def test_a_file_that_no_sweep_has_written_is_refused(tmp_path, text):
     (tmp_path / BEST_OF_SWEEP).write_text(text)
     with pytest.raises(BadInput, match=BEST_OF_SWEEP):
-        run_of_sweep(tmp_path)
+        best_run_of_sweep(tmp_path)
 
 
-def test_a_best_run_that_is_gone_is_told(tmp_path):
-    assert run_of_sweep(tmp_path) is None
+def test_a_best_run_that_is_gone_is_refused(tmp_path):
+    assert best_run_of_sweep(tmp_path) is None
     (tmp_path / BEST_OF_SWEEP).write_text('{"study": "s", "trial": 7, "run_dir": "run", "values": {}}')
     with pytest.raises(BadInput, match="run run of trial 7 is gone"):
-        run_of_sweep(tmp_path)
+        best_run_of_sweep(tmp_path)

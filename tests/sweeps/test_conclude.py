@@ -16,28 +16,32 @@ from sweeps.trial_run import Interrupted
 from .studies import add, new_study
 
 
-def test_ctrl_c_is_heard_between_the_trials_that_drive_fresh_laps(tmp_path):
+def test_ctrl_c_ends_the_re_ranking_between_two_trials(tmp_path):
     study = new_study(tmp_path)
     add(study, [9.0])
     config = SimpleNamespace(rerank=1, rerank_laps=60, objectives=("race_score",))
     protocol = compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation
-    plan = SimpleNamespace(config=config, protocol=protocol, folder=tmp_path, runs_dir=tmp_path)
+    worker_config = SimpleNamespace(config=config, protocol=protocol, folder=tmp_path, runs_dir=tmp_path)
     interruption = Interruption()
     interruption.signum = signal.SIGINT
     with pytest.raises(Interrupted):
-        _conclude(plan, study, SimpleNamespace(), SimpleNamespace(), interruption)
+        _conclude(worker_config, study, SimpleNamespace(), SimpleNamespace(), interruption)
     assert "reranked" not in study.user_attrs
 
 
 def test_the_same_error_of_several_runs_is_counted_as_one(tmp_path):
     def failed(number: int) -> SimpleNamespace:
         file = tmp_path.resolve() / f"20261122-12000{number}-seed0" / "metrics.jsonl"
-        return SimpleNamespace(outcome="FAIL", attrs={"reason": f"{file}: cannot be read"})
+        return SimpleNamespace(
+            result=SimpleNamespace(state="FAIL", attrs={"reason": f"{file}: cannot be read"})
+        )
 
-    plan = SimpleNamespace(config=SimpleNamespace(trials=9), folder=tmp_path, study="s")
-    driver = Driver(plan, open_storage(None, tmp_path), SimpleNamespace(workers=1), SimpleNamespace(), print)
+    worker_config = SimpleNamespace(config=SimpleNamespace(trials=9), folder=tmp_path, study="s")
+    driver = Driver(
+        worker_config, open_storage(None, tmp_path), SimpleNamespace(workers=1), SimpleNamespace(), print
+    )
     with pytest.raises(
         RunFailed, match=r"all 3 trials so far failed, 3 of them with: RUN/metrics.jsonl: cannot"
-    ) as told:
-        driver._give_up_if_hopeless([failed(number) for number in range(3)])
-    assert "\n" not in str(told.value)
+    ) as refused:
+        driver._give_up_if_all_fail([failed(number) for number in range(3)])
+    assert "\n" not in str(refused.value)

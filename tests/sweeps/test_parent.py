@@ -3,13 +3,13 @@
 from types import SimpleNamespace
 
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.formats.run_files import read_object
+from deepracer_exp.runs.files import read_object
 from sweeps.sweep import _parent
 
 LR = "algorithm.lr=tag(log,interval(1e-5,1e-3))"
 
 
-def test_the_parent_is_looked_up_when_a_study_is_begun_and_stays_the_same(trained):
+def test_the_parent_is_resolved_when_a_study_is_begun_and_stays_the_same(trained):
     folder = trained().folder
     runs_dir = folder.parents[1]
     request = compose_sweep(["study=p", "parent=best:tiny", LR])

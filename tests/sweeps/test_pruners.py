@@ -14,7 +14,7 @@ from optuna.trial import TrialState, create_trial
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.sweep import SweepConfig, compose_sweep
 from deepracer_exp.errors import BadInput
-from sweeps.pruners import AnyPruner, build_pruner, is_beaten_across_seeds
+from sweeps.pruners import AnyPruner, build_pruner, is_worse_across_seeds
 
 ACTIONS = 15
 pytestmark = pytest.mark.filterwarnings("error")
@@ -88,11 +88,11 @@ class Run:
         (self.path / "metrics.jsonl").write_text(text, encoding="utf-8")
         return self
 
-    def verdict(self, pruner: AnyPruner) -> tuple[str, str] | None:
+    def decision(self, pruner: AnyPruner) -> tuple[str, str] | None:
         trial = self.study.trials[0]
-        verdict = pruner.verdict(self.study, trial)
-        assert pruner.prune(self.study, trial) == (verdict is not None)
-        return verdict
+        decision = pruner.decide(self.study, trial)
+        assert pruner.prune(self.study, trial) == (decision is not None)
+        return decision
 
 
 @pytest.fixture
@@ -100,23 +100,23 @@ def entropy() -> AnyPruner:
     return build_pruner(settings("entropy"))
 
 
-def test_a_collapsed_run_is_given_up_with_its_reason_in_one_line(run, entropy):
-    name, reason = run.begin().write(collapsed()).verdict(entropy)
+def test_a_collapsed_run_is_pruned_with_its_reason_in_one_line(run, entropy):
+    name, reason = run.begin().write(collapsed()).decision(entropy)
     assert name == "collapsed"
     assert re.fullmatch(r"entropy at [1-4]\.\d% with 20 % completion", reason)
 
 
-def test_a_run_that_stays_as_it_began_is_given_up_as_not_learning(run, entropy):
-    name, reason = run.begin().write(idle()).verdict(entropy)
+def test_a_run_that_stays_as_it_began_is_pruned_as_not_learning(run, entropy):
+    name, reason = run.begin().write(idle()).decision(entropy)
     assert name == "not_learning"
     assert "\n" not in reason
 
 
-def test_a_run_is_given_up_at_the_same_row_whether_it_is_read_row_by_row_or_at_once(run, entropy):
+def test_a_run_is_pruned_at_the_same_row_whether_it_is_read_row_by_row_or_at_once(run, entropy):
     found = collapsed()
     run.begin()
-    at_once = [run.write(found[:n]).verdict(build_pruner(settings("entropy"))) for n in range(25, 33)]
-    row_by_row = [run.write(found[:n]).verdict(entropy) for n in range(25, 33)]
+    at_once = [run.write(found[:n]).decision(build_pruner(settings("entropy"))) for n in range(25, 33)]
+    row_by_row = [run.write(found[:n]).decision(entropy) for n in range(25, 33)]
     assert at_once[0] is None
     # What was said at first stays, though later rows say it with other numbers.
     first = at_once.index(next(filter(None, at_once)))
@@ -124,41 +124,41 @@ def test_a_run_is_given_up_at_the_same_row_whether_it_is_read_row_by_row_or_at_o
     assert None not in at_once[first:]
 
 
-def test_a_converged_run_is_never_given_up_even_if_it_falls_apart_later(run, entropy):
+def test_a_converged_run_is_never_pruned_even_if_it_falls_apart_later(run, entropy):
     found = converged()
     worse = [row | {"iteration": 300 + row["iteration"]} for row in collapsed(200)]
     run.begin("stopping=none")
     for length in range(0, 300, 7):
-        assert run.write(found[:length]).verdict(entropy) is None
-    assert run.write([*found, *worse]).verdict(entropy) is None
+        assert run.write(found[:length]).decision(entropy) is None
+    assert run.write([*found, *worse]).decision(entropy) is None
 
 
 @pytest.mark.parametrize("option", ["none", "reliable", "plateau"])
 def test_a_run_with_another_stopping_rule_is_judged_by_the_standard_one(run, entropy, option):
-    assert run.begin(f"stopping={option}").write(collapsed()).verdict(entropy).name == "collapsed"
+    assert run.begin(f"stopping={option}").write(collapsed()).decision(entropy).name == "collapsed"
 
 
 def test_a_run_is_judged_by_its_own_thresholds(run, entropy):
-    assert run.begin("stopping.collapsed=null").write(collapsed()).verdict(entropy) is None
+    assert run.begin("stopping.collapsed=null").write(collapsed()).decision(entropy) is None
 
 
 def test_a_continuous_policy_is_judged_by_its_scatter_since_the_start(run, entropy):
     found = [row | {"entropy": 2.0 - 0.2 * row["iteration"]} for row in collapsed()]
-    assert run.begin("action_space=continuous").write(found).verdict(entropy).name == "collapsed"
+    assert run.begin("action_space=continuous").write(found).decision(entropy).name == "collapsed"
 
 
-def test_a_trial_goes_on_before_it_has_a_run_its_folder_its_files_or_a_row(run, entropy):
+def test_a_trial_continues_before_it_has_a_run_its_folder_its_files_or_a_row(run, entropy):
     study = optuna.create_study()
     study.ask()
-    assert entropy.verdict(study, study.trials[0]) is None
-    assert run.verdict(entropy) is None
+    assert entropy.decide(study, study.trials[0]) is None
+    assert run.decision(entropy) is None
     run.path.mkdir()
-    assert run.verdict(entropy) is None
+    assert run.decision(entropy) is None
     run.path.rmdir()
     run.begin()
-    assert run.verdict(entropy) is None
-    assert run.write([]).verdict(entropy) is None
-    assert run.write([], rest='{"itera').verdict(entropy) is None
+    assert run.decision(entropy) is None
+    assert run.write([]).decision(entropy) is None
+    assert run.write([], rest='{"itera').decision(entropy) is None
 
 
 def test_a_half_written_last_line_is_left_for_the_next_look(run, entropy):
@@ -167,30 +167,30 @@ def test_a_half_written_last_line_is_left_for_the_next_look(run, entropy):
     for row in range(40):
         text = json.dumps(found[row])
         for cut in (0, 1, len(text) // 2, len(text)):
-            run.write(found[:row], rest=text[:cut]).verdict(entropy)
-    assert run.verdict(entropy).name == "collapsed"
+            run.write(found[:row], rest=text[:cut]).decision(entropy)
+    assert run.decision(entropy).name == "collapsed"
 
 
-def test_a_run_that_was_resumed_from_an_earlier_row_is_read_anew(run, entropy):
+def test_a_run_that_was_resumed_from_an_earlier_row_is_read_again(run, entropy):
     begun = converged(48)
-    # Its checkpoint was of row 30; this time the run goes on badly.
+    # Its checkpoint was of row 30; this time the run continues badly.
     bad = rows(60, lambda i: 0.01, lambda i: 20.0)[30:]
     run.begin()
-    assert run.write(begun).verdict(entropy) is None
-    assert run.write([*begun[:30], *bad]).verdict(entropy).name == "collapsed"
+    assert run.write(begun).decision(entropy) is None
+    assert run.write([*begun[:30], *bad]).decision(entropy).name == "collapsed"
 
 
-def test_a_run_that_was_begun_anew_elsewhere_is_read_there(run, entropy, tmp_path):
-    assert run.begin().write(converged(50)).verdict(entropy) is None
+def test_a_run_copied_elsewhere_is_read_there(run, entropy, tmp_path):
+    assert run.begin().write(converged(50)).decision(entropy) is None
     again = Run(tmp_path / "again").begin().write(collapsed())
     run._trial.set_user_attr("run_dir", str(again.path))
-    assert run.verdict(entropy).name == "collapsed"
+    assert run.decision(entropy).name == "collapsed"
 
 
-def test_rows_that_no_training_wrote_are_told_with_file_and_line(run, entropy):
+def test_rows_that_no_training_wrote_are_reported_with_file_and_line(run, entropy):
     run.begin().write([], rest="{}\nno row\n{}\n")
     with pytest.raises(BadInput, match=r"metrics\.jsonl line 2: is not valid JSON"):
-        run.verdict(entropy)
+        run.decision(entropy)
 
 
 def study_of(curves: Sequence[Sequence[float]], direction: str = "minimize") -> optuna.Study:
@@ -202,18 +202,18 @@ def study_of(curves: Sequence[Sequence[float]], direction: str = "minimize") -> 
     return study
 
 
-def given_up(
+def pruned_at(
     study: optuna.Study, pruner: AnyPruner, curve: Sequence[float]
 ) -> tuple[int, tuple[str, str]] | None:
-    """Return after which evaluation a new trial is given up, and why."""
+    """Return the evaluation after which a new trial is pruned, and why."""
     trial = study.ask()
     for step, score in enumerate(curve, 1):
         trial.report(score, step)
-        verdict = pruner.verdict(study, study.trials[trial.number])
-        if verdict is not None:
-            assert verdict == pruner.verdict(study, study.trials[trial.number])
+        decision = pruner.decide(study, study.trials[trial.number])
+        if decision is not None:
+            assert decision == pruner.decide(study, study.trials[trial.number])
             study.tell(trial, state=TrialState.PRUNED)
-            return step, verdict
+            return step, decision
     study.tell(trial, curve[-1])
     return None
 
@@ -222,61 +222,61 @@ SIX = [[90 - level - 5 * step for step in range(6)] for level in range(0, 30, 5)
 """Scores in seconds of six trials, all getting better; 52.5 is their median at the fourth evaluation."""
 
 
-def test_the_median_gives_up_the_worse_half_after_its_warmup_and_names_both_scores():
-    step, (name, reason) = given_up(study_of(SIX), build_pruner(settings("median")), [99, 98, 97, 96])
+def test_the_median_prunes_the_worse_half_after_its_warmup_and_names_both_scores():
+    step, (name, reason) = pruned_at(study_of(SIX), build_pruner(settings("median")), [99, 98, 97, 96])
     assert (step, name) == (2, "median")
     assert reason == "98 is the best up to evaluation 2, 72.5 the median there, trials: 6"
-    assert given_up(study_of(SIX), build_pruner(settings("median")), [64, 59, 54, 49]) is None
+    assert pruned_at(study_of(SIX), build_pruner(settings("median")), [64, 59, 54, 49]) is None
 
 
 def test_no_trial_is_compared_before_the_startup_trials_are_complete():
-    assert given_up(study_of(SIX[:3]), build_pruner(settings("median")), [99, 98, 97, 96]) is None
+    assert pruned_at(study_of(SIX[:3]), build_pruner(settings("median")), [99, 98, 97, 96]) is None
 
 
 def test_the_percentile_keeps_the_best_share_only():
     curve = SIX[3]
-    assert given_up(study_of(SIX), build_pruner(settings("median")), curve) is None
-    step, (name, reason) = given_up(study_of(SIX), build_pruner(settings("percentile")), curve)
+    assert pruned_at(study_of(SIX), build_pruner(settings("median")), curve) is None
+    step, (name, reason) = pruned_at(study_of(SIX), build_pruner(settings("percentile")), curve)
     assert (step, name) == (2, "percentile")
     assert reason == "70 is the best up to evaluation 2, 66.25 the bound of the best 25 % there, trials: 6"
 
 
-def test_of_a_score_to_raise_the_low_ones_are_given_up():
+def test_low_values_of_an_objective_to_maximize_are_pruned():
     study = study_of([[-score for score in curve] for curve in SIX], "maximize")
     pruner = build_pruner(settings("median", objectives=("completion",)))
-    assert given_up(study, pruner, [-99, -98])[1].reason.startswith(
+    assert pruned_at(study, pruner, [-99, -98])[1].reason.startswith(
         "-98 is the best up to evaluation 2, -72.5"
     )
-    assert given_up(study, pruner, [-64, -59]) is None
+    assert pruned_at(study, pruner, [-64, -59]) is None
 
 
-def test_hyperband_gives_up_losers_of_a_rung_and_says_it_again():
+def test_hyperband_prunes_losers_of_a_rung_and_repeats_its_decision():
     study = study_of([])
     pruner = build_pruner(settings("hyperband", warmup_evaluations=0), evaluations=9)
-    ends = [given_up(study, pruner, [50 - number + step for step in range(9)]) for number in range(12)]
+    ends = [pruned_at(study, pruner, [50 - number + step for step in range(9)]) for number in range(12)]
     assert all(end is None for end in ends)  # each is the best so far
-    ends = [given_up(study, pruner, [90 + number + step for step in range(9)]) for number in range(12)]
+    ends = [pruned_at(study, pruner, [90 + number + step for step in range(9)]) for number in range(12)]
     assert {step for step, _ in ends} <= {1, 3, 9}
-    assert {verdict.name for _, verdict in ends} == {"hyperband"}
+    assert {decision.name for _, decision in ends} == {"hyperband"}
     assert ends[0][1].reason.endswith("is not in the best third")
 
 
-def test_a_patient_pruner_waits_while_a_trial_still_gets_better():
+def test_a_patient_pruner_waits_while_a_trial_improves():
     better = [99, 98, 97, 96, 95, 94]
     stuck = [95, 95, 99, 99, 99, 99]
     for name in ("median", "percentile", "hyperband"):
         study = study_of(SIX)
         hasty = build_pruner(settings(name, warmup_evaluations=0), evaluations=6)
         patient = build_pruner(settings(name, warmup_evaluations=0, patience=2), evaluations=6)
-        assert given_up(study, patient, better) is None
+        assert pruned_at(study, patient, better) is None
         if name != "hyperband":  # it looks at its rungs only
-            assert given_up(study, hasty, better)[0] == 1
-            assert given_up(study, patient, stuck)[0] == 5
+            assert pruned_at(study, hasty, better)[0] == 1
+            assert pruned_at(study, patient, stuck)[0] == 5
 
 
 @pytest.mark.parametrize("rival", ["median", "percentile", "hyperband"])
 @pytest.mark.parametrize("patience", [None, 1])
-def test_entropy_goes_together_with_each_pruner_that_compares(tmp_path, rival, patience):
+def test_entropy_combines_with_each_comparing_pruner(tmp_path, rival, patience):
     pruner = build_pruner(settings("entropy", rival, patience=patience), evaluations=6)
     study = study_of(SIX)
 
@@ -286,17 +286,17 @@ def test_entropy_goes_together_with_each_pruner_that_compares(tmp_path, rival, p
         trial.set_user_attr("run_dir", str(run.path))
         for step, score in enumerate(curve, 1):
             trial.report(score, step)
-        return pruner.verdict(study, study.trials[trial.number])
+        return pruner.decide(study, study.trials[trial.number])
 
     # The entropy says why, where both would give the trial up.
     assert trial_of("bad", collapsed(), [99, 98, 99, 99]).name == "collapsed"
     assert trial_of("good", converged(), [40, 35, 30, 25]) is None
 
 
-def test_without_pruners_every_trial_goes_on(run):
+def test_without_pruners_every_trial_continues(run):
     none = build_pruner(settings())
-    assert run.begin().write(collapsed()).verdict(none) is None
-    assert given_up(study_of(SIX), none, [99, 99, 99]) is None
+    assert run.begin().write(collapsed()).decision(none) is None
+    assert pruned_at(study_of(SIX), none, [99, 99, 99]) is None
 
 
 def test_optuna_asks_the_same_pruner():
@@ -326,44 +326,41 @@ def seeded(*trials: Sequence[float], direction: str = "minimize") -> optuna.Stud
     return study
 
 
-def test_a_trial_is_beaten_when_it_loses_every_seed_so_far_and_one_is_left():
-    study = seeded([40, 42, 41], [30, 32, 31])
-    assert not is_beaten_across_seeds(study, [36])
-    assert is_beaten_across_seeds(study, [36, 35])
+FIVE = (10, 20, 30, 40, 50)
 
 
-def test_a_trial_that_wins_a_seed_goes_on():
-    study = seeded([30, 32, 31])
-    assert not is_beaten_across_seeds(study, [36, 31])
-    assert not is_beaten_across_seeds(study, [29, 31])
+@pytest.mark.parametrize(
+    ("best", "values", "is_worse"),
+    [
+        # One seed says nothing; then the trial must be worse on every seed so far, with one left.
+        ((30, 32, 31), [36], False),
+        ((30, 32, 31), [36, 35], True),
+        ((30, 32, 31), [36, 31], False),
+        ((30, 32, 31), [29, 31], False),
+        # Seed by seed and not by their mean: worse than the same seed by less than the seeds differ.
+        (FIVE, [11, 21, 31, 41], True),
+        (FIVE, [41, 31, 21, 11], False),
+        # More seeds need more lost seeds.
+        ((30, 32, 31, 33), [36, 35], False),
+        ((30, 32, 31, 33), [36, 35, 37], True),
+        ((30, 32, 31, 33, 30, 31), [36, 35, 37], False),
+        # Two seeds leave none to compare.
+        ((30, 32), [36], False),
+    ],
+)
+def test_wilcoxon_prunes_a_trial_that_is_worse_than_the_best_one_seed_by_seed(best, values, is_worse):
+    assert is_worse_across_seeds(seeded((40, 42, 41), best), values) == is_worse
 
 
-def test_seeds_are_compared_one_by_one_and_not_by_their_mean():
-    # Every seed of the trial is worse than the same seed of the best one, by less than the seeds differ.
-    study = seeded([10, 20, 30, 40, 50])
-    assert is_beaten_across_seeds(study, [11, 21, 31, 41])
-    assert not is_beaten_across_seeds(study, [41, 31, 21, 11])
-
-
-def test_more_seeds_ask_for_more_lost_seeds():
-    assert not is_beaten_across_seeds(seeded([30, 32, 31, 33]), [36, 35])
-    assert is_beaten_across_seeds(seeded([30, 32, 31, 33]), [36, 35, 37])
-    assert not is_beaten_across_seeds(seeded([30, 32, 31, 33, 30, 31]), [36, 35, 37])
-
-
-def test_with_two_seeds_or_no_complete_trial_nobody_is_beaten():
-    assert not is_beaten_across_seeds(seeded([30, 32]), [36])
-    assert not is_beaten_across_seeds(seeded(), [36, 35])
-
-
-def test_of_values_to_raise_the_lower_one_is_beaten():
+def test_wilcoxon_prunes_low_values_of_an_objective_to_maximize():
     study = seeded([90, 92, 91], direction="maximize")
-    assert is_beaten_across_seeds(study, [60, 70])
-    assert not is_beaten_across_seeds(study, [95, 96])
+    assert is_worse_across_seeds(study, [60, 70])
+    assert not is_worse_across_seeds(study, [95, 96])
 
 
-def test_with_several_objectives_nobody_is_beaten_and_the_pruner_is_no_error():
+def test_wilcoxon_prunes_nothing_without_a_best_trial():
+    assert not is_worse_across_seeds(seeded(), [36, 35])
     study = optuna.create_study(directions=["minimize", "maximize"])
     study.add_trial(create_trial(values=[30, 90]))
-    assert not is_beaten_across_seeds(study, [36, 35])
+    assert not is_worse_across_seeds(study, [36, 35])
     build_pruner(settings("entropy", "wilcoxon", objectives=("lap_time", "completion")))

@@ -12,11 +12,11 @@ import psutil
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.run_files import read_metrics, read_object
+from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.tracking.store import Store
-from sweeps.ray_launch import refuse_files
+from sweeps.ray_launcher import refuse_files
 
-from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, slots  # noqa: TID252
+from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, claims  # noqa: TID252
 
 pytestmark = pytest.mark.timeout(600)
 _MEMORY = 80 * 2**20
@@ -46,7 +46,7 @@ class TwoNodes:
         self.second()
 
     def second(self):
-        """Return the second node, started anew if it was killed."""
+        """Return the second node, started again if it was killed."""
         if not self._cluster.worker_nodes:
             self._cluster.add_node(**self._options)
         (node,) = self._cluster.worker_nodes
@@ -69,7 +69,7 @@ class TwoNodes:
         return [
             one
             for one in psutil.process_iter(["cmdline"])
-            if "ray::Place" in " ".join(one.info["cmdline"] or ())
+            if "ray::WorkerActor" in " ".join(one.info["cmdline"] or ())
         ]
 
     def shutdown(self):
@@ -96,34 +96,34 @@ def two_nodes():
 
 
 @pytest.mark.slow
-def test_a_sweep_goes_on_when_a_node_is_gone(two_nodes, start, tmp_path):
+def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
     running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
 
     def held_by_the_second():
         if not known(tmp_path):
             return None
         pids = {process.pid for process in two_nodes.of_the_second()}
-        held = [slot for slot in slots(tmp_path) if slot.state == "claimed" and slot.progress]
-        return next((slot for slot in held if int(slot.owner.split(":")[-2]) in pids), None)
+        held = [claim for claim in claims(tmp_path) if claim.state == "claimed" and claim.progress]
+        return next((claim for claim in held if int(claim.owner.split(":")[-2]) in pids), None)
 
     lost = wait_for(running, held_by_the_second, "trial on the second node")
     two_nodes.kill_the_second()
     ended = running.end(240)
     assert ended.code == 0, ended.stderr
     assert_every_trial_is_accounted_for_once(tmp_path)
-    assert next(slot for slot in slots(tmp_path) if slot.slot == lost.slot).attempt > 1
+    assert next(claim for claim in claims(tmp_path) if claim.index == lost.index).attempt > 1
     assert not two_nodes.actors()
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_go_on(two_nodes, start, tmp_path):
+def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_resume(two_nodes, start, tmp_path):
     two_nodes.second()
     running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
-    wait_for(running, lambda: known(tmp_path) and any(slot.progress for slot in slots(tmp_path)), "trial")
+    wait_for(running, lambda: known(tmp_path) and any(claim.progress for claim in claims(tmp_path)), "trial")
     running.popen.send_signal(signal.SIGINT)
     assert running.end(240).code == 130
     assert not two_nodes.actors()
-    assert all(slot.expired or slot.outcome for slot in slots(tmp_path))
+    assert all(claim.expired or claim.result for claim in claims(tmp_path))
     assert start("sweep", "study=s", "sweep.workers=2").end(240).code == 0
     assert_every_trial_is_accounted_for_once(tmp_path)
 
@@ -161,9 +161,7 @@ def without_clocks(row):
 
 
 @pytest.mark.slow
-def test_what_a_reward_function_says_and_does_wrong_far_away_is_in_the_run_folder(
-    two_nodes, run_at, tmp_path
-):
+def test_prints_and_errors_of_a_remote_reward_function_are_in_the_run_folder(two_nodes, run_at, tmp_path):
     two_nodes.second()
     (tmp_path / "mine.py").write_text(
         "def reward_function(params):\n"
@@ -178,7 +176,7 @@ def test_what_a_reward_function_says_and_does_wrong_far_away_is_in_the_run_folde
 
 
 @pytest.mark.slow
-def test_a_collector_that_is_killed_far_away_is_named(two_nodes, start, tmp_path):
+def test_a_killed_remote_collector_is_named(two_nodes, start, tmp_path):
     two_nodes.second()
     running = start(*_TINY, "collector=ray", "budget.env_steps=100000000")
     wait_for(running, lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration")

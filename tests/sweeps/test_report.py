@@ -4,7 +4,7 @@ import pytest
 from optuna.distributions import FloatDistribution
 
 from deepracer_exp.errors import BadInput
-from sweeps.report import fates, headline, report, write_report
+from sweeps.report import outcomes, study_page, study_summary, write_study_page
 from tests.browser import browser, needs_chromium
 from tests.page_html import Html
 
@@ -16,8 +16,8 @@ def study(tmp_path_factory):
     return season(tmp_path_factory.mktemp("runs"), 60)
 
 
-def test_the_page_holds_everything_and_loads_nothing(study, tmp_path):
-    path = write_report(study, tmp_path / "report.html")
+def test_the_page_is_complete_and_loads_nothing(study, tmp_path):
+    path = write_study_page(study, tmp_path / "report.html")
     html = path.read_text(encoding="utf-8")
     page = Html(html)
     assert page.loads == []
@@ -33,7 +33,7 @@ def test_the_page_holds_everything_and_loads_nothing(study, tmp_path):
 
 @needs_chromium
 def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, tmp_path):
-    path = write_report(study, tmp_path / "report.html")
+    path = write_study_page(study, tmp_path / "report.html")
     with browser(tmp_path / "profile") as tab:
         tab.open(path)
         tab.draw_all()
@@ -55,9 +55,11 @@ def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_three_megaby
         values = [9 + number % 97 / 50, 80 + number % 89 / 10]
         add(study, values, params=params, distributions=wide, reason="a reason " * 30)
     write_metrics(tmp_path / "lr_entropy" / "run-0", 250)
-    for trial in study.get_trials(deepcopy=False):  # all of them learn alike, which saves a thousand files
+    for trial in study.get_trials(
+        deepcopy=False
+    ):  # all of them have the same curve, which saves a thousand files
         trial.user_attrs["runs"] = [{"run_dir": str(tmp_path / "lr_entropy" / "run-0")}]
-    html = report(study)
+    html = study_page(study)
     assert len(html.encode()) < 3_000_000
     assert "The last 700 in this order are left out" in Html(html).text
 
@@ -76,23 +78,23 @@ def test_nothing_that_a_study_holds_becomes_part_of_the_page(tmp_path):
             add(study, [score], reason=word, overrides=[word], metrics=3)
         add(study, None, "failed", reason=word, traceback=word)
         study.set_user_attr("reranked", [{"trial": 0, "values": [9.5], "interval": [9.0, 10.0]}])
-    assert Html(report(nasty)).tags == Html(report(clean)).tags
-    assert Html(report(nasty)).text.count(NASTY) >= 6
+    assert Html(study_page(nasty)).tags == Html(study_page(clean)).tags
+    assert Html(study_page(nasty)).text.count(NASTY) >= 6
 
 
-def test_the_fates_add_up_to_all_trials_and_all_steps(study):
-    found = fates(study.trials)
+def test_the_outcomes_add_up_to_all_trials_and_all_steps(study):
+    found = outcomes(study.trials)
     assert sum(one["count"] for one in found) == len(study.trials)
     assert sum(one["trials_share"] for one in found) == pytest.approx(100)
     assert sum(one["steps_share"] for one in found) == pytest.approx(100)
 
 
-def test_the_headline_tells_the_steps_of_trials_that_came_to_nothing(tmp_path):
+def test_the_headline_has_the_steps_of_trials_that_were_pruned_or_failed(tmp_path):
     study = new_study(tmp_path)
     add(study, [9.5], env_steps=750_000)
     add(study, None, "collapsed", env_steps=200_000)
     add(study, None, "failed", env_steps=50_000)
-    assert headline(study) == [
+    assert study_summary(study) == [
         "Trial 0 is the best: race score 9.50 s.",
         "3 of 60 trials ended, 1 of them complete; they drove 1.0 M control steps, 25 % of them in trials that were "
         "pruned or failed.",
@@ -102,23 +104,23 @@ def test_the_headline_tells_the_steps_of_trials_that_came_to_nothing(tmp_path):
 def test_a_best_trial_without_a_lap_says_so(tmp_path):
     study = new_study(tmp_path)
     add(study, [75.0], lap_time_s=None, completion=40.0)
-    assert "It completed no lap." in headline(study)
+    assert "It completed no lap." in study_summary(study)
 
 
 def test_a_study_without_a_complete_trial_has_a_page(tmp_path):
     study = new_study(tmp_path)
-    assert "No trial is complete" in Html(report(study)).text
+    assert "No trial is complete" in Html(study_page(study)).text
     add(study, None, "not_learning", seen=80.0)
-    page = Html(report(study))
+    page = Html(study_page(study))
     assert "No trial is complete" in page.text
     assert "to paste" not in page.text
 
 
-def test_failures_of_one_reason_are_told_once_the_most_frequent_first(tmp_path):
+def test_failures_are_grouped_by_reason_the_most_frequent_first(tmp_path):
     study = new_study(tmp_path)
     for reason in ("rare", "often", "often"):
         add(study, None, "failed", reason=f"{reason} error", traceback=f"Traceback of {reason}")
-    text = Html(report(study)).text
+    text = Html(study_page(study)).text
     found = re.findall(r"(\d) × (\w+) error", text)  # noqa: RUF001
     assert found == [("2", "often"), ("1", "rare")]
     assert text.count("Traceback of often") == 1
@@ -130,18 +132,18 @@ def test_the_table_begins_with_the_best_and_ends_with_the_failed(tmp_path):
     add(study, [10.0], reason="tenth")
     add(study, None, "median", seen=20.0, reason="pruned one")
     add(study, [9.0], reason="ninth")
-    text = Html(report(study)).text
+    text = Html(study_page(study)).text
     order = [text.rindex(word) for word in ("ninth", "tenth", "pruned one", "failed: for a reason")]
     assert order == sorted(order)
 
 
-def test_the_winners_on_fresh_laps_stand_with_interval_and_old_value(tmp_path):
+def test_the_winners_on_fresh_laps_have_an_interval_and_the_value_before(tmp_path):
     study = new_study(tmp_path)
     add(study, [9.0])
     add(study, [9.1])
     again = [{"trial": 0, "values": [9.87], "interval": [9.61, 10.23]}, {"trial": 1, "values": [9.3]}]
     study.set_user_attr("reranked", again)
-    text = Html(report(study)).text
+    text = Html(study_page(study)).text
     assert "Trial 1 is the best: race score 9.30 s on fresh laps." in text
     assert "9.61 s to 10.23 s" in text
 
@@ -152,5 +154,5 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(study, tmp_path):
     study = season(tmp_path / "runs", 3)
     study.set_user_attr("objectives", ["theirs"])
     with pytest.raises(BadInput, match="no objectives"):
-        write_report(study, path)
+        write_study_page(study, path)
     assert path.read_text() == "old"

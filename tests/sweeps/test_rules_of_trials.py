@@ -28,12 +28,12 @@ MEDIAN = "sweep.pruners=[median]"
         ),
     ],
 )
-def test_a_rule_is_asked_for_by_the_pruner_entropy_or_by_its_name(overrides, expected):
+def test_trials_have_a_stopping_rule_if_the_pruner_entropy_or_a_rule_is_asked_for(overrides, expected):
     base = _without_rules(compose_sweep(overrides), overrides).base
     assert [line for line in base if line.startswith("stopping")] == expected
 
 
-def test_a_file_that_chooses_rule_and_pruners_is_taken_at_its_word(tmp_path, monkeypatch):
+def test_a_file_that_chooses_rule_and_pruners_keeps_both(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "conf/sweep").mkdir(parents=True)
     (tmp_path / "conf/sweep/mine.yaml").write_text(
@@ -42,7 +42,7 @@ def test_a_file_that_chooses_rule_and_pruners_is_taken_at_its_word(tmp_path, mon
     assert "stopping=plateau" in _without_rules(compose_sweep(["sweep=mine"]), ["sweep=mine"]).base
 
 
-def test_impatient_is_entropy_that_tells_sooner_that_nothing_more_is_to_gain():
+def test_impatient_is_entropy_that_decides_sooner_that_a_run_has_converged():
     patient, impatient = (
         compose_experiment([f"stopping={one}"])[0].stopping for one in ("entropy", "impatient")
     )

@@ -62,7 +62,7 @@ def standard() -> SweepConfig:
 
 
 def score(values: dict) -> float:
-    """Return what a search lowers: best at lr 1e-4 without an entropy bonus."""
+    """Return a value to minimize: best at lr 1e-4 without an entropy bonus."""
     hidden = values.get("network.hidden", 64)
     return abs(np.log10(values["algorithm.lr"]) + 4) + values["algorithm.entropy_coeff"] + hidden / 1000
 
@@ -117,7 +117,7 @@ def test_workers_that_begin_together_try_different_values_and_the_same_at_each_s
 
 
 @pytest.mark.parametrize("name", ["tpe", "random", "qmc"])
-def test_a_trial_draws_by_its_slot_whatever_number_it_has(name):
+def test_a_trial_draws_by_its_index_whatever_its_number(name):
     def drawn(others: int) -> dict:
         study = optuna.create_study(sampler=build_sampler(settings(name), Space()))
         for _ in range(others):
@@ -128,7 +128,7 @@ def test_a_trial_draws_by_its_slot_whatever_number_it_has(name):
     assert drawn(others=0) == drawn(others=3)
 
 
-def test_tpe_keeps_away_from_what_a_running_trial_tries():
+def test_tpe_keeps_away_from_the_values_of_running_trials():
     space = {one.key: one.distribution for one in Space.dimensions if one.key.startswith("algorithm")}
     center = {"algorithm.lr": 1e-4, "algorithm.entropy_coeff": 0.01}
 
@@ -223,7 +223,7 @@ def real_space(*lines: str) -> SearchSpace:
     return SearchSpace.from_request(compose_sweep(list(lines)))
 
 
-def test_gp_does_not_ask_again_for_what_was_pruned():
+def test_gp_does_not_repeat_pruned_values():
     study = optuna.create_study(sampler=build_sampler(settings("gp", startup_trials=1), Space()))
     tried = []
     for _ in range(10):
@@ -231,7 +231,7 @@ def test_gp_does_not_ask_again_for_what_was_pruned():
         trial = study.ask()
         tried.append(tuple(Space().suggest(trial).values()))
         trial.report(100.0, 1)
-        # The best guess of a model that never hears of them would stay the same.
+        # The best guess of a model that ignores them would stay the same.
         done = trial.number < 1
         study.tell(
             trial, 9.0 + trial.number if done else None, TrialState.COMPLETE if done else TrialState.PRUNED

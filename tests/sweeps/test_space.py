@@ -79,7 +79,7 @@ def test_a_space_can_be_sent_to_another_process():
 # --- Conditions
 
 
-def test_a_key_of_a_searched_group_counts_only_with_the_options_that_have_it():
+def test_a_key_of_a_searched_group_counts_only_for_the_options_that_have_it():
     searched = space(*GRIDS)
     values = {"action_space.speed_levels": 3, "algorithm.lr": 0.002}
     without = searched.suggest(FixedTrial({"action_space": "discrete", **values}))
@@ -93,7 +93,7 @@ def test_a_key_that_all_options_have_always_counts():
     assert [one.options for one in searched.dimensions] == [None, None]
 
 
-def test_a_constant_counts_only_with_the_reward_functions_that_have_it():
+def test_a_constant_counts_only_for_the_reward_functions_that_have_it():
     searched = space(
         *("reward.constants.SPEED_WEIGHT=interval(1,2)", "reward.constants.EDGE_COST=interval(0,1)"),
         "reward=racing_line,progress_gain",
@@ -163,7 +163,7 @@ def test_a_base_may_be_complete_only_with_what_is_searched():
 # --- Clones
 
 
-def test_values_are_tried_as_the_given_check_does():
+def test_values_are_checked_by_the_given_function():
     parent, composition = compose_experiment(["action_space=grid"])
     tried = []
 
@@ -187,7 +187,7 @@ def test_values_are_tried_as_the_given_check_does():
 # --- Comparison
 
 
-def test_the_same_space_in_other_words_is_no_difference():
+def test_equal_spaces_written_differently_do_not_differ():
     one = space("algorithm.lr=interval(0.1, 1)", "network=glob(mlp_sm*)", "algorithm.epochs=range(3,9,2)")
     other = space(
         "algorithm.epochs=range(3,8,2)",
@@ -221,8 +221,8 @@ def test_a_grid_is_all_values():
     }
 
 
-def test_a_grid_has_neither_endless_values_nor_conditions():
-    with pytest.raises(BadInput, match=r"grid: algorithm\.lr=interval\(0\.1,1\) has values without end"):
+def test_a_grid_has_neither_infinite_values_nor_conditions():
+    with pytest.raises(BadInput, match=r"grid: algorithm\.lr=interval\(0\.1,1\) has infinitely many values"):
         space("algorithm.lr=interval(0.1,1)", "algorithm.epochs=3,5").grid()
-    with pytest.raises(BadInput, match=r"speed_levels counts only with action_space=grid"):
+    with pytest.raises(BadInput, match=r"speed_levels counts only for action_space=grid"):
         space(*GRIDS).grid()

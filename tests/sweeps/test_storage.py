@@ -12,8 +12,8 @@ import pytest
 import sqlalchemy as sa
 
 from deepracer_exp.errors import BadInput, RunFailed
+from sweeps.claims import TrialClaims
 from sweeps.database import resolve_database
-from sweeps.ledger import Ledger
 from sweeps.storage import open_storage, patiently
 
 HOUR_S = 3600.0
@@ -40,7 +40,7 @@ def test_the_default_is_a_file_in_the_folder_of_the_runs_whatever_its_name(tmp_p
         assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
-def test_processes_that_begin_together_share_one_study_and_number_their_trials_once(url, race):
+def test_processes_that_start_together_share_one_study_and_number_each_trial_once(url, race):
     lines = race("storage", url, ("anna", "ben", "cleo"), 2).lines()
     assert sorted(int(line) for printed in lines for line in printed) == list(range(6))
     trials = optuna.load_study(study_name="study", storage=open_storage(url, Path()).optuna).trials
@@ -57,10 +57,10 @@ def test_a_process_killed_while_it_makes_the_tables_leaves_nothing_in_the_way(ur
     storage = open_storage(url, Path())
     study = optuna.create_study(study_name="study", storage=storage.optuna, load_if_exists=True)
     study.tell(study.ask(), 1.0)
-    assert Ledger(storage.engine, "study").claim("next", 1, HOUR_S).slot == 0
+    assert TrialClaims(storage.engine, "study").claim("next", 1, HOUR_S).index == 0
 
 
-def test_half_a_file_of_a_killed_process_is_made_anew(tmp_path):
+def test_an_incomplete_file_of_a_killed_process_is_replaced(tmp_path):
     (tmp_path / "sweeps.db").touch()
     (tmp_path / "sweeps.db.new").write_bytes(b"half a file")
     (tmp_path / "sweeps.db.new-wal").write_bytes(b"and its journal")
@@ -82,7 +82,7 @@ def test_a_file_that_optuna_made_is_taken_as_it_is(tmp_path):
         ("postgresql://racer:s3cret@host:port/db", ["not the URL of a database"]),
         ("s3cret", ["not the URL of a database"]),
         ("postgres://racer:s3cret@host/db", ["did you mean postgresql?"]),
-        ("oracle://racer:s3cret@host/db", ["no database for sweeps", "accepted: "]),
+        ("oracle://racer:s3cret@host/db", ["not a kind of database that holds sweeps", "accepted: "]),
         ("postgresql+nope://racer:s3cret@host/db", ["no such driver"]),
         ("sqlite+aiosqlite:///x.db", ["asynchronous"]),
         ("mysql+mysqldb://racer:s3cret@host/db", ["pip install 'mysqlclient'"]),
@@ -96,7 +96,7 @@ def test_a_file_that_optuna_made_is_taken_as_it_is(tmp_path):
         ("postgresql://racer@127.0.0.1:1/db?password=s3cret", ["refused"]),
     ],
 )
-def test_what_can_never_work_is_refused_in_one_line_without_the_password(url, words, tmp_path):
+def test_an_impossible_address_is_refused_in_one_line_without_the_password(url, words, tmp_path):
     message = _refused(url, tmp_path)
     for word in words:
         assert word in message
@@ -148,7 +148,7 @@ def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
     url = postgres_server.new_database()
     storage = open_storage(url, Path())
     optuna.create_study(study_name="study", storage=storage.optuna).ask()
-    Ledger(storage.engine, "study").claim("one", 1, HOUR_S)
+    TrialClaims(storage.engine, "study").claim("one", 1, HOUR_S)
     name = sa.make_url(url).database
     count = f"SELECT count(*) FROM pg_stat_activity WHERE datname = '{name}'"
     until = time.monotonic() + 60.0
@@ -168,14 +168,14 @@ def test_a_stopped_process_holds_a_row_of_postgresql_for_a_minute_at_most(postgr
 def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
     storage = open_storage(url := postgres.new_database(), Path())
     study = optuna.create_study(study_name="study", storage=storage.optuna)
-    ledger = Ledger(storage.engine, "study")
-    claim = ledger.claim("one", 2, HOUR_S)
+    claims = TrialClaims(storage.engine, "study")
+    claim = claims.claim("one", 2, HOUR_S)
     trial = study.ask()
     postgres.stop(signal.Signals[how])
     done = []
     calls = [
-        lambda: ledger.renew(claim, HOUR_S),
-        lambda: ledger.note(claim, trial_id=trial._trial_id),
+        lambda: claims.renew(claim, HOUR_S),
+        lambda: claims.record(claim, trial_id=trial._trial_id),
         lambda: study.tell(trial, 1.0, skip_if_finished=True).state.name,
         lambda: open_storage(url, Path(), patience_s=HOUR_S).optuna.get_n_trials(study._study_id),
     ]
@@ -191,14 +191,14 @@ def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
     for thread in threads:
         thread.join(120.0)
     assert sorted(map(str, done)) == ["1", "COMPLETE", "True", "True"]
-    assert ledger.slots()[0].trial_id == trial._trial_id
+    assert claims.all()[0].trial_id == trial._trial_id
 
 
 def test_a_server_that_stays_away_ends_the_wait_in_one_line(postgres):
-    ledger = Ledger(open_storage(postgres.new_database(), Path()).engine, "study")
+    claims = TrialClaims(open_storage(postgres.new_database(), Path()).engine, "study")
     postgres.stop()
     with pytest.raises(RunFailed, match=r"has not answered for 0\.3 s") as failed:
-        patiently(ledger.slots, 0.3)
+        patiently(claims.all, 0.3)
     assert "s3cr" not in str(failed.value)
     assert "\n" not in str(failed.value)
     with pytest.raises(BadInput, match="refused"):
@@ -209,31 +209,31 @@ def test_a_locked_file_is_waited_for(tmp_path):
     url = f"sqlite:///{tmp_path}/sweeps.db"
     study = _make_study(url)
     impatient = sa.create_engine(url, connect_args={"timeout": 0.0})
-    ledger = Ledger(impatient, "study")
+    claims = TrialClaims(impatient, "study")
     other = sqlite3.connect(tmp_path / "sweeps.db", isolation_level=None, check_same_thread=False)
     other.execute("BEGIN IMMEDIATE")
     with pytest.raises(RunFailed, match="locked"):
-        patiently(lambda: ledger.claim("one", 1, HOUR_S), 0.0)
+        patiently(lambda: claims.claim("one", 1, HOUR_S), 0.0)
     end = threading.Timer(0.5, lambda: other.execute("COMMIT"))
     end.start()
-    assert patiently(lambda: ledger.claim("one", 1, HOUR_S), HOUR_S).slot == 0
+    assert patiently(lambda: claims.claim("one", 1, HOUR_S), HOUR_S).index == 0
     assert patiently(study.ask, HOUR_S).number == 0
     end.join()
     other.close()
 
 
-def test_what_no_waiting_changes_is_told_at_once(tmp_path):
+def test_an_error_that_waiting_does_not_change_is_raised_at_once(tmp_path):
     storage = open_storage(None, tmp_path)
-    ledger = Ledger(storage.engine, "study")
+    claims = TrialClaims(storage.engine, "study")
     study = optuna.create_study(study_name="study", storage=storage.optuna)
     with storage.engine.begin() as connection:
         connection.execute(sa.text("DROP TABLE deepracer_slots"))
         connection.execute(sa.text("DROP TABLE trials"))
-    for call in (ledger.slots, study.ask):
+    for call in (claims.all, study.ask):
         with pytest.raises(RunFailed, match="cannot be used: no such table"):
             patiently(call, HOUR_S)
 
 
-def test_other_errors_are_not_the_databases():
+def test_other_errors_are_raised_unchanged():
     with pytest.raises(ZeroDivisionError):
         patiently(lambda: 1 / 0, HOUR_S)

@@ -9,7 +9,7 @@ import yaml
 from optuna.trial import TrialState
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.formats.run_files import read_config, read_object
+from deepracer_exp.runs.files import read_config, read_object
 from sweeps.storage import open_storage
 
 TINY = (
@@ -43,7 +43,7 @@ def assert_nothing_begun(ended):
         ((LR, "seed=0,1"), ("sweep.seeds",)),
         ((LR, "study=../evil"), ("study",)),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
-        ((LR, "--storage", "sqlite:///x.db"), ("--storage", "sweep.storage=URL")),
+        ((LR, "--storage", "sqlite:///x.db"), ("--storage", "sweep.storage=sqlite:///x.db")),
         ((LR, "reward.file=missing.py"), ("missing.py",)),
         (
             (LR, "sweep.storage=postgresql+psycopg://me:secret@127.0.0.1:1/none"),
@@ -53,7 +53,7 @@ def assert_nothing_begun(ended):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
-def test_what_cannot_be_swept_is_refused_before_anything_is_made(call, overrides, words):
+def test_an_impossible_sweep_is_refused_before_anything_is_created(call, overrides, words):
     ended = call("sweep", *overrides)
     assert ended.code == 2, ended.stderr
     for word in words:
@@ -74,13 +74,13 @@ def swept(tmp_path_factory, run_at):
 def test_the_printed_line_trains_the_winner(swept):
     (line,) = [line for line in swept.stdout.splitlines() if line.startswith("  deepracer-exp train ")]
     study = load(swept.cwd, "s")
-    told = read_object(swept.cwd / "runs" / "s" / "best_of_sweep.json")
-    trial = study.trials[told["trial"]]
+    best = read_object(swept.cwd / "runs" / "s" / "best_of_sweep.json")
+    trial = study.trials[best["trial"]]
     assert shlex.split(line)[2:] == trial.user_attrs["overrides"]
     # It says nothing of how a worker runs a trial, and all else that it makes is the trial's experiment.
     assert not [word for word in shlex.split(line) if word.startswith(("collector=", "report=", "name="))]
     own = compose_experiment(trial.user_attrs["overrides"])[1].mapping
-    config = read_config(swept.cwd / "runs" / "s" / told["run_dir"])
+    config = read_config(swept.cwd / "runs" / "s" / best["run_dir"])
     assert config["algorithm"]["lr"] == trial.params["algorithm.lr"]
     assert {key for key in config if config[key] != own[key]} <= {"collector", "name", "report", "runs_dir"}
 
@@ -98,7 +98,7 @@ def test_a_trial_is_a_run_like_any_other(swept, call, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_there_is_not_made_again(swept, run_at):
+def test_a_finished_study_makes_no_trial_again(swept, run_at):
     before = {path: path.stat().st_mtime_ns for path in swept.cwd.glob("runs/s/*/summary.json")}
     ended = run_at(swept.cwd, "sweep", "study=s")
     assert ended.code == 0, ended.stderr
@@ -115,7 +115,7 @@ def test_another_search_under_the_same_name_is_refused_with_the_difference(swept
         assert word in ended.complaint
 
 
-def test_a_study_that_goes_on_knows_its_search_and_says_what_else_may_be_given(swept, call_at):
+def test_a_resumed_study_knows_its_search_and_names_the_keys_that_may_be_given(swept, call_at):
     shown = call_at(swept.cwd, "sweep", "study=s", "--cfg")
     assert shown.code == 0
     sweep = yaml.safe_load(shown.stdout)["sweep"]
@@ -125,7 +125,7 @@ def test_a_study_that_goes_on_knows_its_search_and_says_what_else_may_be_given(s
     load(swept.cwd, "s").set_user_attr("trials", 2)
     refused = call_at(swept.cwd, "sweep", "study=s", "sweep.pruners=[]")
     assert refused.code == 2
-    assert "study=s: exists; to go on with it only" in refused.complaint
+    assert "study=s: exists; to resume it, give only" in refused.complaint
     assert "runs_dir" in refused.complaint
 
 
@@ -134,9 +134,9 @@ def test_report_and_best_need_no_more_than_the_name(swept, call_at):
     assert "deepracer-exp train " in best.stdout
     report = call_at(swept.cwd, "sweep", "report", "s")
     assert (swept.cwd / report.stdout.strip()).is_file()
-    nobody = call_at(swept.cwd, "sweep", "best", "t")
-    assert nobody.code == 2
-    assert "studies: s" in nobody.complaint
+    missing = call_at(swept.cwd, "sweep", "best", "t")
+    assert missing.code == 2
+    assert "studies: s" in missing.complaint
 
 
 def test_a_misspelt_study_is_not_begun(swept, call_at):
@@ -161,7 +161,7 @@ def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_p
 
 
 @pytest.mark.slow
-def test_a_trial_that_takes_its_worker_with_it_each_time_fails_and_the_others_are_made(start, tmp_path):
+def test_a_trial_that_kills_its_worker_each_time_fails_and_the_others_are_made(start, tmp_path):
     (tmp_path / "deadly.py").write_text(
         "import os\n\nDEADLY = 0\n\n\n"
         "def reward_function(params):\n"

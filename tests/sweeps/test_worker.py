@@ -1,4 +1,4 @@
-"""Trials as a worker makes them in a real database, but for their trainings."""
+"""Trials made by a worker in a real database, without their trainings."""
 
 from typing import get_args
 
@@ -9,12 +9,13 @@ from optuna.trial import FrozenTrial, TrialState
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import Sampler, compose_sweep
 from deepracer_exp.training.signals import Interruption
-from sweeps.plan import Plan
+from sweeps.claims import TrialResult
 from sweeps.space import SearchSpace
 from sweeps.storage import open_storage
 from sweeps.study import open_study
-from sweeps.trial_run import Result, TrialRun
+from sweeps.trial_run import TrialRun
 from sweeps.worker import Worker
+from sweeps.worker_config import WorkerConfig
 
 SPACE = {
     "grid": ("algorithm.lr=1e-4,3e-4,1e-3", "network=mlp_small,mlp"),
@@ -24,18 +25,19 @@ MIXED = ("algorithm.lr=tag(log,interval(1e-5,1e-3))", "network=mlp_small,mlp")
 
 
 def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
-    """Make the trials of a sweep, all of them worth nearly the same and none of them trained."""
+    """Make the trials of a sweep, with nearly the same values and without training."""
 
-    def untrained(self: TrialRun, overrides, attrs) -> Result:
-        return Result(outcome="COMPLETE", values=[9.0 + len(overrides)], attrs={**attrs, "reason": "made up"})
+    def untrained(self: TrialRun, overrides) -> TrialResult:
+        attrs = {"overrides": overrides, "reason": "made up"}
+        return TrialResult(state="COMPLETE", values=[9.0 + len(overrides)], attrs=attrs)
 
     monkeypatch.setattr(TrialRun, "_result", untrained)
-    told = [*asked, "sweep.startup_trials=2", "tracking=off"]
-    request = compose_sweep([*told, "study=s"])
+    overrides = [*asked, "sweep.startup_trials=2", "tracking=off"]
+    request = compose_sweep([*overrides, "study=s"])
     space = SearchSpace.from_request(request)
     storage = open_storage(None, tmp_path)
-    open_study(request, told, space, (), storage, tmp_path)
-    plan = Plan(
+    open_study(request, overrides, space, (), storage, tmp_path)
+    config = WorkerConfig(
         study="s",
         runs_dir=tmp_path,
         config=request.entry.sweep,
@@ -47,12 +49,12 @@ def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
         evaluations=None,
         cores=1,
     )
-    Worker(plan, storage, "host:1:a").work(Interruption())
+    Worker(config, storage, "host:1:a").work(Interruption())
     return optuna.load_study(study_name="s", storage=storage.optuna).trials
 
 
 @pytest.mark.parametrize("sampler", get_args(Sampler))
-def test_with_every_sampler_all_trials_draw_their_values_and_are_told(sampler, tmp_path, monkeypatch):
+def test_with_every_sampler_all_trials_draw_their_values_and_are_reported(sampler, tmp_path, monkeypatch):
     searched = SPACE.get(sampler, MIXED)
     trials = made(tmp_path, monkeypatch, *searched, f"sweep.sampler={sampler}", "sweep.trials=5")
     assert [trial.state for trial in trials] == [TrialState.COMPLETE] * 5, trials[0].user_attrs
@@ -60,7 +62,7 @@ def test_with_every_sampler_all_trials_draw_their_values_and_are_told(sampler, t
     assert len({tuple(trial.params.values()) for trial in trials}) == 5
 
 
-def test_what_is_drawn_again_is_trained_with_the_next_seed(tmp_path, monkeypatch):
+def test_values_drawn_again_are_trained_with_the_next_seed(tmp_path, monkeypatch):
     asked = ("network=mlp_small,mlp", "seed=7", "sweep.sampler=random", "sweep.trials=6", "sweep.seeds=2")
     seeds: dict[str, list[int]] = {}
     for trial in made(tmp_path, monkeypatch, *asked):

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from mlflow import MlflowClient
 
-from deepracer_exp.formats.checkpoint_files import write_hashes
+from deepracer_exp.runs.checkpoint_files import write_hashes
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import Store, resolve_store
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.formats.checkpoint_files import pin
-from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, remove, survey
-from deepracer_exp.tracking.overview import look_over
+from deepracer_exp.runs.checkpoint_files import pin
+from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, look_over, remove, survey
 from deepracer_exp.tracking.registry import promote
 
 from .conftest import FEATURES
@@ -69,7 +68,7 @@ def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(seas
     season.recorded(season.run("1"), client)
     season.run("2")
     assert listed(season) == [("2", CHECKPOINTS, ["000010"])]
-    assert "--tracking-uri" in kept(season)["1"]
+    assert "tracking.uri" in kept(season)["1"]
     assert len(listed(season, look_over(None, season.runs_dir))) == 2
     (season.runs_dir / "season" / "1" / "tracking.json").write_text(json.dumps({"run_id": "0" * 32}))
     assert len(listed(season, look_over(None, season.runs_dir))) == 1
@@ -96,7 +95,7 @@ def test_runs_of_a_deleted_experiment_can_go(season, client):
     assert listed(season, look_over(None, season.runs_dir)) == [("1", DELETED, ["1"])]
 
 
-def test_a_deleted_run_that_is_needed_stays_and_the_reason_is_told(season, client):
+def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
     cloned, registered = season.run("1"), season.run("2")
     season.clone("3", cloned)
     ids = [season.recorded(run, client) for run in (cloned, registered)]
@@ -114,14 +113,14 @@ def test_a_run_that_a_training_holds_stays_until_it_lets_go(season):
     with (run / ".running").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         assert listed(season) == []
-        assert kept(season) == {"1": "a training goes on in it"}
+        assert kept(season) == {"1": "a training is running in it"}
     assert [what for _, what, _ in listed(season)] == [CHECKPOINTS, TRACE]
 
 
 def test_a_run_without_an_end_stays_for_an_hour_after_its_last_sign(season):
     run = season.run("1", status=None)
     assert listed(season) == []
-    assert "has no end" in kept(season)["1"]
+    assert "has not ended" in kept(season)["1"]
     age(run, HOUR_S - 120)
     assert listed(season) == []
     age(run, 240)
@@ -130,7 +129,7 @@ def test_a_run_without_an_end_stays_for_an_hour_after_its_last_sign(season):
     assert listed(season) == []
 
 
-def test_where_last_is_torn_the_others_stay(season):
+def test_if_last_is_corrupt_the_other_checkpoints_are_kept(season):
     run = season.run("1")
     (run / "checkpoints" / "000030" / "agent" / "state.tdz").write_text("?")
     assert listed(season) == []
@@ -164,11 +163,11 @@ def test_what_is_no_run_of_ours_is_left_alone(season, tmp_path):
 def test_apply_removes_what_was_listed_and_nothing_else(season, call):
     first, failed = season.run("1"), season.run("2", status="failed")
     before = tree(season.runs_dir)
-    shown = call("clean")
+    shown = call("runs", "clean")
     assert shown.code == 0, shown.stderr
     assert "--apply removes it" in shown.stdout
     assert tree(season.runs_dir) == before
-    ended = call("clean", "--apply")
+    ended = call("runs", "clean", "--apply")
     assert ended.code == 0, ended.stderr
     gone = before - tree(season.runs_dir)
     assert gone == {
@@ -178,7 +177,7 @@ def test_apply_removes_what_was_listed_and_nothing_else(season, call):
         if f"{path}/".startswith(f"{(run / part).relative_to(season.runs_dir).as_posix()}/")
     }
     assert not tree(season.runs_dir) - before
-    assert "nothing to remove" in call("clean").stdout
+    assert "nothing to remove" in call("runs", "clean").stdout
 
 
 def test_the_sums_are_those_of_the_files(season, call):
@@ -186,7 +185,7 @@ def test_the_sums_are_those_of_the_files(season, call):
     wanted = sum(
         path.stat().st_size for path in (run / "checkpoints" / "000010").rglob("*") if path.is_file()
     )
-    ended = call("clean")
+    ended = call("runs", "clean")
     lines = [line.split() for line in ended.stdout.splitlines()]
     assert [*str(wanted).split(), "bytes", "checkpoints", "neither", "best", "nor", "last:", "000010"] in [
         line[:8] for line in lines
@@ -203,16 +202,16 @@ def test_what_a_link_inside_leads_to_outlives_it(season, client, call, tmp_path)
     for place in (run, run / "trace", run / "checkpoints" / "000010"):
         (place / "link").symlink_to(precious)
     client.delete_run(season.recorded(run, client))
-    ended = call("clean", "--apply")
+    ended = call("runs", "clean", "--apply")
     assert ended.code == 0, ended.stderr
     assert not run.exists()
     assert (precious / "file").read_text() == "dear"
 
 
-def test_a_store_that_does_not_answer_is_told_and_its_part_left_out(season, client, call, free_port):
+def test_an_unavailable_store_is_reported_and_its_part_skipped(season, client, call, free_port):
     client.delete_run(season.recorded(season.run("1"), client))
     season.run("2")
-    ended = call("clean", "--apply", "--tracking-uri", f"http://127.0.0.1:{free_port}")
+    ended = call("runs", "clean", "--apply", f"tracking.uri=http://127.0.0.1:{free_port}")
     assert ended.code == 0
     assert "runs deleted there, and checkpoints of runs recorded there, are left out" in ended.stderr
     assert len(ended.stderr.splitlines()) == 1
@@ -238,7 +237,7 @@ def test_where_a_file_cannot_be_read_nothing_is_removed(season, call, name):
     season.run("1")
     (season.run("2") / name).write_text("{")
     before = tree(season.runs_dir)
-    ended = call("clean", "--apply")
+    ended = call("runs", "clean", "--apply")
     assert ended.code == 2
     assert name in ended.complaint
     assert tree(season.runs_dir) == before
@@ -246,9 +245,9 @@ def test_where_a_file_cannot_be_read_nothing_is_removed(season, call, name):
 
 def test_a_folder_without_runs_has_nothing_to_remove(season, call):
     season.runs_dir.mkdir()
-    assert call("clean").stdout == "nothing to remove\n"
+    assert call("runs", "clean").stdout == "nothing to remove\n"
     assert tree(season.runs_dir) == set()
     shutil.rmtree(season.runs_dir)
-    ended = call("clean")
+    ended = call("runs", "clean")
     assert ended.code == 2
-    assert "is no folder" in ended.complaint
+    assert "is not a folder" in ended.complaint

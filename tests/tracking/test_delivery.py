@@ -7,9 +7,9 @@ from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking.delivery import deliver, deliver_evaluation
-from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import Store
-from deepracer_exp.tracking.tracking_file import read_told
+from deepracer_exp.tracking.tracking_file import read_tracked_run
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, sto
     assert deliver(moved, store.uri, tmp_path) == 9
     client = MlflowClient(tracking_uri=store.uri)
     (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
-    told = read_told(moved / "tracking.json")
+    told = read_tracked_run(moved / "tracking.json")
     assert (run.info.run_name, run.info.status) == ("run", "FINISHED")
     assert (run.info.run_id, run.info.start_time, run.info.end_time) == (
         told.run_id, told.start_ms, told.end_ms,
@@ -65,21 +65,21 @@ def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, sto
     assert not [record for record in caplog.records if record.name.endswith("delivery")]
 
 
-def test_a_run_killed_before_it_told_its_end_is_ended_by_its_summary(run_dir, store, tmp_path):
+def test_a_run_killed_before_it_logged_its_end_is_ended_by_its_summary(run_dir, store, tmp_path):
     told = json.loads((run_dir / "tracking.json").read_text())
     del told["tags"]["end"]
     (run_dir / "tracking.json").write_text(json.dumps({**told, "status": None, "end_ms": None}))
     deliver(run_dir, store.uri, tmp_path)
-    run_id = read_told(run_dir / "tracking.json").run_id
+    run_id = read_tracked_run(run_dir / "tracking.json").run_id
     run = MlflowClient(tracking_uri=store.uri).get_run(run_id)
     assert (run.info.status, run.data.tags["end"]) == ("FINISHED", "hopeless: collapsed")
 
 
-def test_a_file_that_is_gone_holds_up_nothing(run_dir, store, tmp_path, caplog):
+def test_a_missing_file_does_not_block_the_rest(run_dir, store, tmp_path, caplog):
     (run_dir / "checkpoints" / "000003" / "manifest.json").unlink()
     (run_dir / "checkpoints" / "000003").rmdir()
     assert deliver(run_dir, store.uri, tmp_path) == 9
-    assert f"{run_dir}/checkpoints/000003: is gone" in caplog.text
+    assert f"{run_dir}/checkpoints/000003: no longer exists" in caplog.text
 
 
 def test_a_store_that_is_still_away_is_named_and_costs_nothing(run_dir, away, tmp_path):
@@ -92,7 +92,7 @@ def test_a_store_that_is_still_away_is_named_and_costs_nothing(run_dir, away, tm
 
 def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, tmp_path):
     deliver(run_dir, store.uri, tmp_path)
-    run_id = read_told(run_dir / "tracking.json").run_id
+    run_id = read_tracked_run(run_dir / "tracking.json").run_id
     MlflowClient(tracking_uri=store.uri).delete_run(run_id)
     with pytest.raises(BadInput, match=f"{run_id} was deleted in MLflow"):
         deliver(run_dir, store.uri, tmp_path)
@@ -111,7 +111,7 @@ def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, tmp_
     metrics = {"race/evaluate/lap_time_s": 8.765, "race/evaluate/score_s": None}
     deliver_evaluation(run_dir, store.uri, tmp_path, 300, metrics, {film: "films"})
     client = MlflowClient(tracking_uri=store.uri)
-    run_id = read_told(run_dir / "tracking.json").run_id
+    run_id = read_tracked_run(run_dir / "tracking.json").run_id
     assert client.get_run(run_id).info.status == "FINISHED"
     (point,) = client.get_metric_history(run_id, "race/evaluate/lap_time_s")
     assert (point.step, point.value) == (300, 8.765)
@@ -119,4 +119,4 @@ def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, tmp_
     caplog.clear()
     deliver_evaluation(run_dir, away, tmp_path, 300, metrics, {film: "films"})
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "does not have this evaluation" in caplog.text
+    assert "this evaluation was not recorded" in caplog.text

@@ -3,7 +3,7 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.tracking.flatten import LONGEST_PARAM, flatten, param_text
+from deepracer_exp.tracking.metadata import LONGEST_PARAM, flatten, param_text
 
 keys = st.text("abc_", min_size=1, max_size=4)
 leaves = st.none() | st.booleans() | st.integers() | st.text(max_size=5) | st.lists(st.integers(), max_size=3)
@@ -39,7 +39,7 @@ def test_values_are_written_as_in_yaml():
 
 
 @given(st.text(min_size=LONGEST_PARAM + 1, max_size=LONGEST_PARAM + 50), st.text(max_size=5))
-def test_long_values_are_cut_and_differ_when_they_differ_behind_the_cut(text, end):
+def test_long_values_are_cut_but_stay_distinguishable(text, end):
     cut = param_text(text)
     assert len(cut) == LONGEST_PARAM
     assert (param_text(text + end) == cut) == (end == "")

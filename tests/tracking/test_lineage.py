@@ -6,8 +6,8 @@ import shutil
 import pytest
 import yaml
 
-from deepracer_exp.analysis.family import best_members, family, generations
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.lineage import best_members, family, generations
 
 
 def rows(stdout: str, *words: str) -> list[str]:
@@ -41,7 +41,7 @@ def test_any_member_shows_the_whole_family_and_no_other(clan):
 
 
 def test_the_best_of_each_generation_stands_at_the_end(clan, call):
-    ended = call("lineage", "3-sib")
+    ended = call("runs", "lineage", "3-sib")
     assert ended.code == 0, ended.stderr
     last = [" ".join(line.split()) for line in ended.stdout.splitlines()[-3:]]
     assert last == [
@@ -52,7 +52,7 @@ def test_the_best_of_each_generation_stands_at_the_end(clan, call):
 
 
 def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
-    ended = call("lineage", "4-grandchild")
+    ended = call("runs", "lineage", "4-grandchild")
     assert rows(ended.stdout, "4-grandchild", "<- this run")
     assert rows(ended.stdout, "2-child", "* best by mean lap")
     assert len(rows(ended.stdout, "<- this run")) == len(rows(ended.stdout, "* best")) == 1
@@ -64,17 +64,17 @@ def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
 
 def test_a_missing_parent_is_shown_as_missing(clan, call):
     shutil.rmtree(clan.runs_dir / "season" / "2-child")
-    ended = call("lineage", "4-grandchild")
+    ended = call("runs", "lineage", "4-grandchild")
     lines = ended.stdout.splitlines()
     assert lines[0] == "2-child"
-    assert "generation 1, missing: its folder is gone" in lines[1]
+    assert "generation 1, missing: its folder was removed" in lines[1]
     assert not rows(ended.stdout, "1-root")
-    assert rows(call("lineage", "1-root").stdout, "3-sibling")
+    assert rows(call("runs", "lineage", "1-root").stdout, "3-sibling")
 
 
 def test_clones_of_one_missing_parent_are_one_family(clan, call):
     shutil.rmtree(clan.runs_dir / "season" / "1-root")
-    ended = call("lineage", "3-sibling")
+    ended = call("runs", "lineage", "3-sibling")
     assert ended.stdout.splitlines()[0] == "1-root"
     assert "generation 0, missing" in ended.stdout.splitlines()[1]
     assert rows(ended.stdout, "4-grandchild")
@@ -82,7 +82,7 @@ def test_clones_of_one_missing_parent_are_one_family(clan, call):
 
 def test_a_family_that_moved_is_still_one(clan, call, tmp_path):
     clan.runs_dir.rename(tmp_path / "moved")
-    ended = call("lineage", "--runs-dir", "moved", "4-grandchild")
+    ended = call("runs", "lineage", "4-grandchild", "runs_dir=moved")
     assert ended.code == 0, ended.stderr
     assert not rows(ended.stdout, "missing")
     assert rows(ended.stdout, "1-root")
@@ -90,7 +90,7 @@ def test_a_family_that_moved_is_still_one(clan, call, tmp_path):
 
 def test_runs_elsewhere_bring_their_relatives_along(clan, call, tmp_path):
     run = clan.runs_dir / "season" / "2-child"
-    ended = call("lineage", str(run), "--runs-dir", "nowhere")
+    ended = call("runs", "lineage", str(run), "runs_dir=nowhere")
     assert rows(ended.stdout, "4-grandchild")
 
 
@@ -98,7 +98,7 @@ def test_a_clone_on_another_track_has_a_best_of_its_own(clan, call):
     parent = clan.runs_dir / "season" / "2-child"
     there = clan.clone("5-away", parent, 2, track={"name": "bowtie", "knots": [1]})
     clan.result(there, (1, -20.0), 20.0)
-    ended = call("lineage", "1-root")
+    ended = call("runs", "lineage", "1-root")
     assert rows(ended.stdout, "5-away", "* best on bowtie by mean lap")
     assert rows(ended.stdout, "2-child", "* best on oval by mean lap")
     assert rows(ended.stdout, "track oval -> bowtie")
@@ -110,7 +110,7 @@ def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
     root = season.run("1")
     season.result(root, lap_share=0.5, best_lap_time_s=12.0, last={"completion": 61.0})
     season.result(season.clone("2", root), lap_share=0.9, best_lap_time_s=13.0)
-    ended = call("lineage", "1")
+    ended = call("runs", "lineage", "1")
     assert rows(ended.stdout, "in training completion 61.0 %, best lap 12.00 s")
     assert rows(ended.stdout, "2", "* best by laps in training")
 
@@ -118,13 +118,13 @@ def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
 def test_a_run_without_an_end_says_so(season, call):
     season.clone("2", season.run("1"))
     (season.runs_dir / "season" / "2" / "summary.json").unlink()
-    assert rows(call("lineage", "1").stdout, "generation 1, from 000020, running, or was killed")
+    assert rows(call("runs", "lineage", "1").stdout, "generation 1, from 000020, running or killed")
 
 
 def test_many_changes_are_counted(season, call):
     root = season.run("1", algorithm={str(n): 0 for n in range(10)})
     season.clone("2", root, algorithm={str(n): 1 for n in range(10)})
-    assert rows(call("lineage", "1").stdout, "algorithm.5 0 -> 1, and 4 more")
+    assert rows(call("runs", "lineage", "1").stdout, "algorithm.5 0 -> 1, and 4 more")
 
 
 @pytest.mark.parametrize("length", [1, 2, 3])
@@ -133,11 +133,11 @@ def test_a_run_that_descends_from_itself_is_refused(season, call, length):
     for n, run in enumerate(runs):
         shutil.rmtree(run)
         season.clone(run.name, runs[n - 1])
-    ended = call("lineage", "0")
+    ended = call("runs", "lineage", "0")
     assert ended.code == 2
     assert "descends from itself" in ended.complaint
     season.run("apart")
-    assert call("lineage", "apart").code == 0
+    assert call("runs", "lineage", "apart").code == 0
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_a_run_that_descends_from_itself_is_refused(season, call, length):
 )
 def test_a_lineage_file_that_is_none_is_refused_in_one_line(season, call, text):
     (season.run("1") / "lineage.json").write_text(text)
-    ended = call("lineage", "1")
+    ended = call("runs", "lineage", "1")
     assert ended.code == 2
     assert "1/lineage.json" in ended.complaint
     assert len(ended.stderr.splitlines()) == 1
@@ -173,7 +173,7 @@ def test_a_wrong_value_in_a_lineage_file_is_named(season, key, value):
 
 def test_a_relatives_configuration_that_is_none_is_refused(clan, call):
     (clan.runs_dir / "season" / "3-sibling" / "config.yaml").write_text("- a")
-    ended = call("lineage", "1-root")
+    ended = call("runs", "lineage", "1-root")
     assert ended.code == 2
     assert "3-sibling/config.yaml" in ended.complaint
 
@@ -192,6 +192,6 @@ def test_a_changed_reward_is_seen_by_its_hash(season, call):
         run = season.run(name) if name == "1" else season.clone(name, season.runs_dir / "season" / "1")
         (run / "provenance.json").write_text(json.dumps({"reward": {"sha256": sha256}, "git_commit": name}))
         assert yaml.safe_load((run / "config.yaml").read_text())
-    ended = call("lineage", "1")
+    ended = call("runs", "lineage", "1")
     assert rows(ended.stdout, "reward_function.py sha256 aaaaaaaa -> sha256 bbbbbbbb")
     assert "code" not in ended.stdout

@@ -1,7 +1,7 @@
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.lookup import folder_of, is_run_id
+from deepracer_exp.tracking.store import folder_of, is_run_id
 
 
 def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client):
@@ -18,7 +18,7 @@ def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client):
 
 def test_a_foreign_run_is_refused(season, client):
     run_id = client.create_run("0").info.run_id
-    with pytest.raises(BadInput, match="no run of deepracer-exp"):
+    with pytest.raises(BadInput, match="not a run of deepracer-exp"):
         folder_of(run_id, None, season.runs_dir)
 
 

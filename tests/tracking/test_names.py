@@ -8,17 +8,16 @@ from mlflow.utils.validation import _validate_metric_name
 from deepracer_exp.agents.ppo import UpdateMetrics
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
-from deepracer_exp.tracking.names import (
+from deepracer_exp.tracking.metadata import joined, run_params
+from deepracer_exp.tracking.metrics import (
     BEST,
     METRICS,
     TRACK_METRICS,
-    joined,
     metric_name,
-    run_params,
     track_labels,
     track_metric,
 )
-from deepracer_exp.training.examination import COLUMNS
+from deepracer_exp.training.metrics import EVAL_COLUMNS
 
 awkward = st.text(st.sampled_from("aAb_-.2/ :ß"), max_size=6)
 
@@ -55,7 +54,7 @@ def test_up_to_three_tracks_are_named_and_more_are_counted(names, label):
 
 
 def test_every_column_has_a_name_of_its_own_in_a_section_and_race_is_the_first():
-    columns = [*COLUMNS, *(field.name for field in fields(UpdateMetrics)), *TRACK_METRICS]
+    columns = [*EVAL_COLUMNS, *(field.name for field in fields(UpdateMetrics)), *TRACK_METRICS]
     assert set(columns) <= set(METRICS)
     names = [metric_name(column) for column in METRICS]
     assert len(set(names)) == len(names)

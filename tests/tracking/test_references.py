@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.references import resolve
+from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.registry import promote
 
 from .conftest import FEATURES
@@ -147,12 +147,12 @@ UNKNOWN = {
     "chmpion": "(did you mean season@champion?)",
     "season@rain": "no registered model has this alias",
     "other@champion": "no registered model has this alias",
-    "season@latest": "'latest' is no alias",
-    "season@v2": "'v2' is no alias",
-    "season@": "'' is no alias",
-    "@champion": "'' is no model",
-    "..@champion": "'..' is no model",
-    "a@b@champion": "'a@b' is no model",
+    "season@latest": "'latest' is not an alias",
+    "season@v2": "'v2' is not an alias",
+    "season@": "'' is not an alias",
+    "@champion": "'' is not a model name",
+    "..@champion": "'..' is not a model name",
+    "a@b@champion": "'a@b' is not a model name",
     "2026": "no such run",
     "../champion": "no such run",
 }
@@ -179,7 +179,7 @@ def test_a_model_that_others_registered_is_refused(season, client):
     client.create_registered_model("theirs")
     client.create_model_version("theirs", "file:///somewhere", tags={"run_dir": "/", "checkpoint": "../.."})
     client.set_registered_model_alias("theirs", "champion", "1")
-    assert "was not registered by deepracer-exp promote" in refusal("champion", season)
+    assert "was not registered by deepracer-exp runs promote" in refusal("champion", season)
 
 
 def test_without_a_store_a_word_is_no_alias(season):

@@ -8,7 +8,7 @@ from mlflow import MlflowClient
 from mlflow.models import Model
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pinned
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.tracking.registry import is_alias, look_up, promote
 
 from .conftest import FEATURES
@@ -101,9 +101,9 @@ def spoil(checkpoint: Path) -> None:
             "not found",
         ),
         (lambda run, client, run_id: client.delete_run(run_id), (), "was deleted in MLflow"),
-        (None, ("--checkpoint", "77"), "000077 is not there"),
-        (None, ("--checkpoint", "../x"), "best, last or the number"),
-        (None, ("--tracking-uri", "ftp://x"), "tracking.uri=ftp://x"),
+        (None, ("checkpoint=77",), "000077 does not exist"),
+        (None, ("checkpoint=../x",), "best, last or the number"),
+        (None, ("tracking.uri=ftp://x",), "tracking.uri=ftp://x"),
     ],
 )
 def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, change, arguments, words):
@@ -111,7 +111,7 @@ def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, ch
     run_id = season.recorded(run, client)
     if change is not None:
         change(run, client, run_id)
-    ended = call("promote", "1", *arguments)
+    ended = call("runs", "promote", "1", *arguments)
     assert ended.code == 2, ended.stderr
     assert words in ended.complaint
     assert ended.stdout == ""
@@ -123,19 +123,19 @@ def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, ch
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--alias", "latest"), "'latest' is no alias"),
-        (("--alias", "Latest"), "'Latest' is no alias"),
-        (("--alias", "v12"), "'v12' is no alias"),
-        (("--alias", ""), "'' is no alias"),
-        (("--alias", "a b"), "'a b' is no alias"),
-        (("--alias", "champion\n"), "is no alias"),
-        (("--model", "a/b"), "'a/b' is no model"),
-        (("--model", ""), "'' is no model"),
-        (("--model", "a:b"), "'a:b' is no model"),
+        (("--alias", "latest"), "'latest' is not an alias"),
+        (("--alias", "Latest"), "'Latest' is not an alias"),
+        (("--alias", "v12"), "'v12' is not an alias"),
+        (("--alias", ""), "'' is not an alias"),
+        (("--alias", "a b"), "'a b' is not an alias"),
+        (("--alias", "champion\n"), "is not an alias"),
+        (("--model", "a/b"), "'a/b' is not a model name"),
+        (("--model", ""), "'' is not a model name"),
+        (("--model", "a:b"), "'a:b' is not a model name"),
     ],
 )
 def test_a_name_that_cannot_be_is_refused_before_anything_is_asked(call, arguments, words):
-    ended = call("promote", "nowhere", *arguments)
+    ended = call("runs", "promote", "nowhere", *arguments)
     assert ended.code == 2
     assert words in ended.complaint
     assert len(ended.stderr.splitlines()) == 1
@@ -143,7 +143,7 @@ def test_a_name_that_cannot_be_is_refused_before_anything_is_asked(call, argumen
 
 def test_a_server_that_does_not_answer_is_one_line_without_its_password(season, client, call, free_port):
     season.recorded(season.run("1"), client)
-    ended = call("promote", "1", "--tracking-uri", f"http://me:s3cr3t@127.0.0.1:{free_port}")
+    ended = call("runs", "promote", "1", f"tracking.uri=http://me:s3cr3t@127.0.0.1:{free_port}")
     assert ended.code == 2
     assert f"http://127.0.0.1:{free_port}" in ended.complaint
     assert "s3cr3t" not in ended.stderr
@@ -152,12 +152,12 @@ def test_a_server_that_does_not_answer_is_one_line_without_its_password(season, 
 def test_the_command_names_the_experiment_s_model_and_says_what_to_do_next(season, client, call):
     run = season.run("1")
     season.recorded(run, client)
-    ended = call("promote", "1")
+    ended = call("runs", "promote", "1")
     assert ended.code == 0, ended.stderr
     assert ended.stdout.splitlines()[0] == "season@champion: version 1"
-    assert "deepracer-exp evaluate run=season@champion" in ended.stdout
+    assert "deepracer-exp evaluate season@champion" in ended.stdout
     assert ended.stderr == ""
-    again = call("promote", "champion", "--alias", "rain")
+    again = call("runs", "promote", "champion", "--alias", "rain")
     assert again.code == 0, again.stderr
     assert client.get_model_version_by_alias("season", "rain").version == 1
 

@@ -7,10 +7,10 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.names import metric_name
-from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracking_file import read_told
+from deepracer_exp.tracking.tracking_file import read_tracked_run
 
 
 def row(iteration: int, completion: float | None = None) -> dict[str, float]:
@@ -41,7 +41,7 @@ def killed(store, identity, wait_until):
     params, tags = {"seed": 1}, {"track": "oval", "mlflow.note.content": "as it began"}
     tracker.start("run", "race", params, tags, identity)
     tell(tracker, [row(iteration) for iteration in range(1, 11)])
-    wait_until(lambda: tracker.waiting == 0 and read_told(identity).run_id is not None)
+    wait_until(lambda: tracker.waiting == 0 and read_tracked_run(identity).run_id is not None)
     return tracker
 
 
@@ -53,7 +53,7 @@ def points(client, run_id, key="completion"):
     return [(point.step, point.value) for point in client.get_metric_history(run_id, metric_name(key))]
 
 
-def test_a_resumed_run_goes_on_in_the_same_mlflow_run(store, client, identity, killed):
+def test_a_resumed_run_continues_the_same_mlflow_run(store, client, identity, killed):
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     rows = [row(iteration) for iteration in range(1, 21)]
@@ -69,11 +69,11 @@ def test_a_resumed_run_goes_on_in_the_same_mlflow_run(store, client, identity, k
 
 def test_the_times_of_points_are_those_of_the_training(client, identity, killed):
     history = client.get_metric_history(killed.run_id, "train/completion")
-    start_ms = read_told(identity).start_ms
+    start_ms = read_tracked_run(identity).start_ms
     assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 11)]
 
 
-def test_points_wait_for_a_checkpoint_and_hold_up_nothing_else(store, client, identity, wait_until, caplog):
+def test_points_wait_for_a_checkpoint_and_block_nothing_else(store, client, identity, wait_until, caplog):
     tracker = MLflowTracker(store)
     tracker.start("run", "race", {}, {}, identity)
     tell(tracker, [row(iteration) for iteration in range(1, 11)], safe=False)
@@ -88,7 +88,7 @@ def test_points_wait_for_a_checkpoint_and_hold_up_nothing_else(store, client, id
     assert not caplog.records
 
 
-def test_two_processes_that_tell_the_same_rows_record_them_once(store, client, identity, killed):
+def test_two_processes_that_log_the_same_rows_record_them_once(store, client, identity, killed):
     """A request of a killed process may be handled by a slow server after the new process has looked."""
     both = [MLflowTracker(store) for _ in range(2)]
     for tracker in both:
@@ -105,7 +105,7 @@ def test_a_run_whose_id_was_never_heard_is_found_again(store, client, identity, 
     tracker.reopen(identity)
     assert tracker.finish("FINISHED") == 0
     assert [run.info.run_id for run in runs(client)] == [killed.run_id]
-    assert read_told(identity).run_id == killed.run_id
+    assert read_tracked_run(identity).run_id == killed.run_id
 
 
 def test_a_run_that_was_never_created_begins_when_it_began(store, client, identity, free_port, tmp_path):
@@ -113,7 +113,7 @@ def test_a_run_that_was_never_created_begins_when_it_began(store, client, identi
     away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
     tell(away, [row(1)])
     away.finish("KILLED", deadline_s=0)
-    told = read_told(identity)
+    told = read_tracked_run(identity)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     tell(tracker, [row(1), row(2)])
@@ -124,7 +124,7 @@ def test_a_run_that_was_never_created_begins_when_it_began(store, client, identi
     assert points(client, run.info.run_id) == [(100, 1 / 3), (200, 2 / 3)]
 
 
-def test_a_run_that_goes_on_in_another_store_is_whole_there(
+def test_a_run_resumed_with_another_store_is_complete_there(
     store, client, identity, killed, empty_database, tmp_path
 ):
     (tmp_path / "other").mkdir()
@@ -143,7 +143,7 @@ def test_a_run_that_goes_on_in_another_store_is_whole_there(
     assert [run.info.run_id for run in runs(client)] == [killed.run_id]
 
 
-def test_a_run_that_goes_on_looks_like_one(store, client, identity, killed, wait_until):
+def test_a_resumed_run_is_shown_as_running(store, client, identity, killed, wait_until):
     killed.set_tag("end", "interrupted: by Ctrl-C")
     killed.finish("KILLED")
     client.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
@@ -172,13 +172,15 @@ def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
     assert points(client, killed.run_id)[-1] == (1000, 10 / 3)
 
 
-def test_a_repeated_iteration_that_differs_is_told_and_not_doubled(store, client, identity, killed, caplog):
+def test_a_repeated_iteration_that_differs_is_reported_and_not_doubled(
+    store, client, identity, killed, caplog
+):
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     tell(tracker, [row(iteration) for iteration in range(1, 10)] + [row(10, completion=99.0)])
     assert tracker.finish("FINISHED") == 0
     assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 11)]
-    assert "points of repeated iterations stay as they were first recorded there (1)" in caplog.text
+    assert "1 points of repeated iterations keep their first values there" in caplog.text
 
 
 def test_thousands_of_points_are_read_back(store, client, identity):
@@ -215,8 +217,8 @@ def test_a_clone_is_nested_under_its_parent(store, client, identity, killed, tmp
     [
         (None, "cannot be read"),
         ("{", "is not valid JSON"),
-        ("[]", "holds other keys"),
-        ("{}", "holds other keys"),
+        ("[]", "has unexpected keys"),
+        ("{}", "has unexpected keys"),
         ('{"run_id": 1, "run_name": "a", "experiment": "b", "start_ms": 2, "store": "c"}', "run_id: 1"),
         (
             '{"run_id": null, "run_name": "a", "experiment": "b", "start_ms": "x", "store": "c"}',

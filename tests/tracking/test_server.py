@@ -13,8 +13,8 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.tracking.delivery import deliver
-from deepracer_exp.tracking.names import metric_name
-from deepracer_exp.tracking.recorder import MLflowTracker
+from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 
 pytestmark = pytest.mark.slow
@@ -57,7 +57,7 @@ def test_a_server_down_at_the_start_gets_one_whole_run_when_it_comes(server, tmp
     assert (run.data.params, run.data.metrics) == ({"seed": "1"}, {"update/kl": 1.0})
 
 
-def test_a_server_that_hangs_blocks_nobody_and_gets_every_point_later(server, tmp_path, wait_until, identity):
+def test_a_hanging_server_blocks_nothing_and_gets_every_point_later(server, tmp_path, wait_until, identity):
     tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
     tracker.start("run", "race", {}, {}, identity)
     tracker.safe_until(300)

@@ -5,7 +5,7 @@ import pytest
 
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.recorder import open_tracker
+from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.store import resolve_store
 
 
@@ -46,7 +46,8 @@ def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
 
 def test_checking_a_uri_does_not_import_mlflow(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from deepracer_exp.tracking.recorder import *\n"
+        "import sys; from pathlib import Path; from deepracer_exp.tracking.mlflow_tracker import *\n"
+        "from deepracer_exp.tracking.store import resolve_store\n"
         f"resolve_store(None, Path({str(tmp_path)!r}))\n"
         "assert not {name for name in sys.modules if name.startswith(('mlflow', 'torch'))}"
     )

@@ -5,9 +5,9 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.config.running import TrackingOff
-from deepracer_exp.tracking.mlflow_run import MLflowRun, StoreUnavailableError
-from deepracer_exp.tracking.names import VIEW
-from deepracer_exp.tracking.store import Store
+from deepracer_exp.tracking.metadata import VIEW
+from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.store import Store, StoreUnavailableError
 from deepracer_exp.tracking.study_run import (
     Progress,
     StudyRun,
@@ -15,7 +15,7 @@ from deepracer_exp.tracking.study_run import (
     open_study_run,
     open_trial_run,
 )
-from deepracer_exp.tracking.tracking_file import Told
+from deepracer_exp.tracking.tracking_file import TrackedRun
 
 SPACE = {"algorithm.lr": "tag(log, interval(1e-5, 1e-3))"}
 BASE = ["track=reinvent_base", "+reward.constants.X=a<b"]
@@ -44,13 +44,13 @@ def runs_of(store: Store, name="spring"):
     return client.search_runs([client.get_experiment_by_name(name).experiment_id])
 
 
-def test_the_run_of_a_study_tells_its_search_its_progress_and_its_best(store, tmp_path):
+def test_the_run_of_a_study_shows_its_search_its_progress_and_its_best(store, tmp_path):
     run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     run_id = run.wait_for_id(60)
     run.update(progress())
     report = tmp_path / "report.html"
     report.write_text("<p>old</p>")
-    run.pictures([report])
+    run.log_files([report])
     assert run.finish("FINISHED", 60)
     (found,) = runs_of(store)
     assert (found.info.run_id, found.info.status, found.info.run_name) == (run_id, "FINISHED", "sweep spring")
@@ -81,7 +81,7 @@ def test_the_runs_table_of_a_study_opens_with_what_its_trials_differ_in(store):
     assert {"metrics.`trial/lap_time_s`", "metrics.`trial/completion`", "tags.`end`"} <= set(columns)
 
 
-def test_whoever_goes_on_with_a_study_goes_on_with_its_run(store):
+def test_a_continued_study_continues_its_run(store):
     first = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     first.update(progress(3))
     assert first.finish("KILLED", 60)
@@ -99,7 +99,7 @@ def test_whoever_goes_on_with_a_study_goes_on_with_its_run(store):
     assert [point.step for point in client.get_metric_history(first.run_id, "study/complete")] == [3, 4]
 
 
-def test_trials_that_began_before_the_run_of_their_study_stand_below_it_none_the_less(store, monkeypatch):
+def test_trials_that_started_before_the_run_of_their_study_are_nested_under_it(store, monkeypatch):
     is_up, connect = threading.Event(), MLflowRun.connect
 
     def connect_late(run):
@@ -110,7 +110,7 @@ def test_trials_that_began_before_the_run_of_their_study_stand_below_it_none_the
     for run, study in ((early, "spring"), (other, "autumn")):
         run.connect()
         tags = {"sweep.study": study, "sweep.trial": "0"}
-        run.create(Told(None, "trial 0", "spring", 1000, store.shown, tags=tags), again=False)
+        run.create(TrackedRun(None, "trial 0", "spring", 1000, store.shown, tags=tags), again=False)
     monkeypatch.setattr(MLflowRun, "connect", connect_late)
     study_run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     assert study_run.wait_for_id(0.1) is None
@@ -119,7 +119,7 @@ def test_trials_that_began_before_the_run_of_their_study_stand_below_it_none_the
     late = MLflowRun(store)
     late.connect()
     tags = {"sweep.study": "spring", "sweep.trial": "1"}
-    late.create(Told(None, "trial 1", "spring", 2000, store.shown, tags=tags), again=False)
+    late.create(TrackedRun(None, "trial 1", "spring", 2000, store.shown, tags=tags), again=False)
     study_run.update(progress())
     assert study_run.finish("FINISHED", 60)
     above = {run.info.run_id: run.data.tags.get("mlflow.parentRunId") for run in runs_of(store)}
@@ -136,7 +136,7 @@ def test_another_search_of_the_same_name_gets_a_run_of_its_own(store):
     assert len(ids) == 2
 
 
-def test_a_driver_that_begins_while_another_one_works_goes_on_with_its_run(store):
+def test_a_second_driver_continues_the_run_of_the_first(store):
     first = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     ids = {first.wait_for_id(120)}
     second = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
@@ -147,7 +147,7 @@ def test_a_driver_that_begins_while_another_one_works_goes_on_with_its_run(store
 
 
 def test_of_two_runs_created_at_the_same_moment_the_older_one_stays(store, monkeypatch):
-    told = Told(None, "sweep", "spring", 2000, store.shown, tags={"sweep.study": "spring"})
+    told = TrackedRun(None, "sweep", "spring", 2000, store.shown, tags={"sweep.study": "spring"})
     mine, theirs = MLflowRun(store), MLflowRun(store)
     mine.connect()
     theirs.connect()
@@ -155,7 +155,7 @@ def test_of_two_runs_created_at_the_same_moment_the_older_one_stays(store, monke
 
     def create_after_the_other(run, told, *, again):
         # The other one looked before this run was there, and created its own a little earlier.
-        create(theirs, Told(None, "sweep", "spring", 1000, store.shown, tags=told.tags), again=False)
+        create(theirs, TrackedRun(None, "sweep", "spring", 1000, store.shown, tags=told.tags), again=False)
         create(run, told, again=again)
 
     monkeypatch.setattr(MLflowRun, "create", create_after_the_other)
@@ -185,7 +185,7 @@ def test_a_store_that_comes_late_gets_the_newest_progress_only(store, monkeypatc
     assert sum("does not answer" in record.message for record in caplog.records) == 1
 
 
-def test_a_store_that_never_answers_holds_up_nothing(free_port, caplog):
+def test_a_store_that_never_answers_blocks_nothing(free_port, caplog):
     nobody = Store(f"http://127.0.0.1:{free_port}", None)
     run = StudyRun(nobody, "spring", ["race_score"], SPACE, BASE)
     run.update(progress())
@@ -196,18 +196,18 @@ def test_a_store_that_never_answers_holds_up_nothing(free_port, caplog):
     assert "trial 7 has no run there" in caplog.text
 
 
-def test_a_missing_file_stops_no_other(store, tmp_path, caplog):
+def test_a_missing_file_does_not_block_other_files(store, tmp_path, caplog):
     run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     run_id = run.wait_for_id(60)
     (tmp_path / "there.html").write_text("x")
-    run.pictures([tmp_path / "there.html", tmp_path / "missing.html"])
+    run.log_files([tmp_path / "there.html", tmp_path / "missing.html"])
     assert run.finish("FINISHED", 60)
     client = MlflowClient(tracking_uri=store.uri)
     assert [file.path for file in client.list_artifacts(run_id)] == ["there.html"]
     assert "missing.html is gone" in caplog.text
 
 
-def test_a_run_deleted_in_the_ui_is_told_once_and_holds_up_nothing(store, wait_until, caplog):
+def test_a_run_deleted_in_the_ui_is_reported_once_and_blocks_nothing(store, wait_until, caplog):
     run = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     MlflowClient(tracking_uri=store.uri).delete_run(run.wait_for_id(60))
     run.update(progress(3))
@@ -217,7 +217,7 @@ def test_a_run_deleted_in_the_ui_is_told_once_and_holds_up_nothing(store, wait_u
     assert sum("refused" in record.message for record in caplog.records) == 1
 
 
-def test_the_seeds_of_a_trial_stand_under_one_run_whoever_asks(store):
+def test_the_seeds_of_a_trial_share_one_parent_run(store):
     study = StudyRun(store, "spring", ["race_score"], SPACE, BASE)
     parent = study.wait_for_id(60)
     ids = {open_trial_run(store, "spring", 7, parent, ["algorithm.lr=0.001"]) for _ in range(2)}

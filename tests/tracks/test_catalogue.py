@@ -73,7 +73,7 @@ def test_a_file_of_knots_names_its_course(track_config, tmp_path):
         ("widths.yaml", "width_m: [1, 2]\nknots: [[0, 0], [9, 0], [9, 9], [0, 9]]", "2 values for 4 knots"),
         ("again.yaml", "width_m: 1\nknots: [[0, 0], [9, 0], [9, 0], [0, 9]]", r"knots\[2\] repeats"),
         ("shut.yaml", "width_m: 1\nknots: [[0, 0], [9, 0], [9, 9], [0, 0]]", "last knot repeats the first"),
-        ("road.txt", "", "accepted are .npy"),
+        ("road.txt", "", "accepted: .npy"),
         ("missing.npy", None, "No such file"),
     ],
 )

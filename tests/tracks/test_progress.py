@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.formats.routes import read_route
-from deepracer_exp.tracks.progress import progress
+from deepracer_exp.deepracer.routes import read_route
+from deepracer_exp.env.rules import lap_progress
 from deepracer_exp.tracks.track import Track
 
 WHEELS_M = np.array([[0.082311, 0.0796], [0.082311, -0.0796], [-0.081663, 0.08105], [-0.081663, -0.08105]])
@@ -18,7 +18,7 @@ FRONT_M = np.array([0.14, 0.0])
 def drive(ndist: list[float], start: float) -> Iterator[float]:
     previous = np.zeros(1)
     for at in ndist:
-        shown, previous = progress(np.array([at]), np.array([start]), previous)
+        shown, previous = lap_progress(np.array([at]), np.array([start]), previous)
         yield float(shown[0])
 
 
@@ -62,7 +62,7 @@ def test_every_recorded_progress_is_reproduced(recording, published):
     for step in range(number.max() + 1):
         row = np.flatnonzero(number == step)
         episode = recording["episode"].to_numpy()[row]
-        shown[row], previous[episode] = progress(found.ndist[row], start_ndist[row], previous[episode])
+        shown[row], previous[episode] = lap_progress(found.ndist[row], start_ndist[row], previous[episode])
     np.testing.assert_allclose(shown, recording["progress"], rtol=0, atol=1e-11)
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.deepracer.routes import is_first_of_equals, read_route
+from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.recording_reader import read_recording
-from deepracer_exp.formats.routes import is_first_of_equals, read_route
-from deepracer_exp.formats.worlds import find_world, leaders, worlds
 from deepracer_exp.tracks.catalogue import recognise, world_rows, world_track
 
 # The world each recording says it was driven on.

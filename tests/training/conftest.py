@@ -4,7 +4,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from deepracer_exp.commands.starting import start_workers_early
+from deepracer_exp.commands.startup import start_workers_early
 
 # As a training does: on a busy machine threads of torch wait for one another, and saving a small network took 20 s.
 torch.set_num_threads(1)

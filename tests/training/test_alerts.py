@@ -9,7 +9,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
-from deepracer_exp.training.alerts import Alerts
+from deepracer_exp.training.budget import Alerts
 
 VARIABLE = "DEEPRACER_EXP_TEST_WEBHOOK"
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from deepracer_exp.config.budget import BudgetConfig
+from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.training import budget as module
 from deepracer_exp.training.budget import Budget, refuse_spent

@@ -14,8 +14,8 @@ from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import Schedule
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
-from deepracer_exp.evaluation.run import read_run
-from deepracer_exp.formats.checkpoint_files import checkpoint_sha256, pinned
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
+from deepracer_exp.runs.resolve import resolve
 
 OFTEN = ("episode.max_steps=60", "checkpoints.every=2", "budget.env_steps=null", "budget.iterations=3")
 
@@ -29,7 +29,7 @@ def lineage(folder) -> dict:
 
 
 def agent_of(folder, name: str) -> PPO:
-    experiment = read_run(str(folder), folder.parent.parent, None).experiment
+    experiment = resolve(str(folder), folder.parent.parent, None).experiment
     networks = build_actor_critic(
         experiment.network,
         len(feature_names(experiment.observation)),
@@ -59,7 +59,7 @@ def child_of(parent, ended):
 
 def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_its_rate(parent, call):
     child = child_of(
-        parent, call("clone", f"run={parent.name}", "budget.iterations=1", "algorithm.max_grad_norm=1e-9")
+        parent, call("clone", parent.name, "budget.iterations=1", "algorithm.max_grad_norm=1e-9")
     )
     # Steps of no size: what it ends with is what it began with.
     ours, theirs = (
@@ -81,7 +81,7 @@ def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_it
 
 
 def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(parent, call):
-    child = child_of(parent, call("clone", f"run={parent.name}", "budget.iterations=1"))
+    child = child_of(parent, call("clone", parent.name, "budget.iterations=1"))
     best = (parent / "checkpoints" / "best").resolve()
     told = lineage(child)
     assert told["parent"] == parent.name
@@ -89,7 +89,7 @@ def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(p
     assert told["sha256"] == checkpoint_sha256(best)
     assert told["generation"] == 1
     assert list(pinned(parent / "checkpoints")) == [best.name]
-    ended = call("clone", f"run={child.name}", "checkpoint=last", "budget.iterations=1")
+    ended = call("clone", child.name, "checkpoint=last", "budget.iterations=1")
     assert ended.code == 0, ended.stderr
     (grandchild,) = (folder for folder in ended.folders if folder not in (parent, child))
     assert lineage(grandchild)["generation"] == 2
@@ -102,7 +102,7 @@ def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(p
     [(["algorithm.lr=3e-4"], 3e-4), (["lr_schedule=linear"], 1e-4), (["algorithm=ppo"], 1e-3)],
 )
 def test_a_rate_that_is_given_is_taken(parent, call, overrides, lr):
-    child = child_of(parent, call("clone", f"run={parent.name}", "budget.iterations=1", *overrides))
+    child = child_of(parent, call("clone", parent.name, "budget.iterations=1", *overrides))
     assert config(child)["algorithm"]["lr"] == pytest.approx(lr)
 
 
@@ -123,7 +123,7 @@ def test_a_rate_that_is_given_is_taken(parent, call, overrides, lr):
     ],
 )
 def test_what_the_parents_networks_do_not_fit_is_refused(parent, call, overrides, words):
-    ended = call("clone", f"run={parent.name}", "budget.iterations=1", *overrides)
+    ended = call("clone", parent.name, "budget.iterations=1", *overrides)
     assert ended.code == 2
     for word in words:
         assert word in ended.complaint
@@ -132,7 +132,7 @@ def test_what_the_parents_networks_do_not_fit_is_refused(parent, call, overrides
 
 def test_another_track_or_reward_is_allowed_and_warned_of(parent, call):
     changes = ("track=Oval_track", "reward=speed_on_track")
-    ended = call("clone", f"run={parent.name}", "budget.iterations=1", *changes)
+    ended = call("clone", parent.name, "budget.iterations=1", *changes)
     child = child_of(parent, ended)
     assert "warning: track is not the parent's" in ended.stderr
     assert "warning: reward is not the parent's" in ended.stderr
@@ -144,7 +144,7 @@ def test_another_track_or_reward_is_allowed_and_warned_of(parent, call):
 
 def test_without_a_run_nothing_is_begun(call):
     ended = call("clone", "algorithm.lr=1")
-    ended.assert_bad_input("run: missing")
+    ended.assert_bad_input("RUN: missing")
 
 
 def test_in_mlflow_a_clone_stands_under_its_parent(call, tmp_path):
@@ -152,7 +152,7 @@ def test_in_mlflow_a_clone_stands_under_its_parent(call, tmp_path):
     ended = call("train", *quick)
     assert ended.code == 0, ended.stderr
     parent = ended.folder
-    child = child_of(parent, call("clone", f"run={parent.name}", "budget.iterations=1"))
+    child = child_of(parent, call("clone", parent.name, "budget.iterations=1"))
     client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
     ids = [json.loads((folder / "tracking.json").read_text())["run_id"] for folder in (parent, child)]
     tags = client.get_run(ids[1]).data.tags

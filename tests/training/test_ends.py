@@ -13,8 +13,8 @@ import pytest
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.formats.own_recording import read_own_recording
-from deepracer_exp.formats.run_files import read_run
+from deepracer_exp.runs.files import read_run
+from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.training.stopping_replay import replay
 
 HOPELESS = (

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.formats.trace import PACKED, STATUS_CODE
-from deepracer_exp.training.episodes import EpisodeBook
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
+from deepracer_exp.training.metrics import EpisodeBook
 
 
 class Driven:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from deepracer_exp.config.randomization import OFF, QUANTITIES
-from deepracer_exp.formats.trace import read_trace
+from deepracer_exp.config.driving import OFF, QUANTITIES
+from deepracer_exp.deepracer.trace import read_trace
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")

@@ -1,7 +1,6 @@
 import numpy as np
 
-from deepracer_exp.training.episodes import Finished
-from deepracer_exp.training.ranking import Ranking
+from deepracer_exp.training.metrics import Finished, Ranking
 
 
 def ended(*episodes: tuple[int, float, float]) -> Finished:

@@ -3,9 +3,9 @@ import pytest
 from deepracer_exp.analysis.log_tables import headline
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.courses import build_courses
+from deepracer_exp.env.setup import build_courses
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.own_recording import read_own_recording
+from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.training.report import write_pictures
 
 PNG = b"\x89PNG\r\n\x1a\n"

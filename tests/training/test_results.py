@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from deepracer_exp.config.stopping import NoStopping, ReliableStopping
-from deepracer_exp.formats.trace import PACKED, STATUS_CODE
-from deepracer_exp.training.results import Results
-from deepracer_exp.training.stopping import Stopping
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
+from deepracer_exp.runs.convergence import Stopping
+from deepracer_exp.training.metrics import RunMetrics
 
 RULE = ReliableStopping(kind="reliable", lap_share=0.75, episodes=4)
 
 
-def drive(results: Results, track: int, laps: int, others: int = 0, steps: int = 31):
+def drive(results: RunMetrics, track: int, laps: int, others: int = 0, steps: int = 31):
     """End as many complete laps and other episodes on a track, one car each."""
     trace = np.zeros((laps + others, 1, len(PACKED)))
     row = trace[:, 0]
@@ -20,25 +20,25 @@ def drive(results: Results, track: int, laps: int, others: int = 0, steps: int =
     row[:, PACKED["progress"]] = np.where(np.arange(len(row)) < laps, 100, 40)
     status = np.where(np.arange(len(row)) < laps, STATUS_CODE["lap_complete"], STATUS_CODE["off_track"])
     row[:, PACKED["episode_status"]] = status
-    return results.book.enter(trace)[1]
+    return results.enter(trace)[1]
 
 
 def test_one_track_has_no_metrics_of_its_own():
-    results = Results(["Oval_track"], 8, 1 / 15, RULE)
+    results = RunMetrics(["Oval_track"], 8, 1 / 15, RULE)
     finished = drive(results, 0, laps=3, others=1)
-    assert results.metrics_of_tracks(finished) == {}
-    assert list(results.metrics(finished)) == [
+    assert results.row_of_tracks(finished) == {}
+    assert list(results.row(finished)) == [
         *("mean_return", "completion", "lap_share", "best_lap_time_s", "mean_lap_time_s"),
     ]
-    assert results.metrics(finished)["best_lap_time_s"] == pytest.approx(2.0)
+    assert results.row(finished)["best_lap_time_s"] == pytest.approx(2.0)
     assert results.summary() == {"lap_share": 0.75, "best_lap_time_s": pytest.approx(2.0)}
 
 
 def test_every_track_has_its_own_figures_and_the_whole_no_lap_time():
-    results = Results(["a", "b", "c"], 8, 1 / 15, RULE)
+    results = RunMetrics(["a", "b", "c"], 8, 1 / 15, RULE)
     drive(results, 0, laps=4)
     finished = drive(results, 1, laps=1, others=3, steps=46)
-    whole, each = results.metrics(finished), results.metrics_of_tracks(finished)
+    whole, each = results.row(finished), results.row_of_tracks(finished)
     assert (whole["completion"], whole["best_lap_time_s"], whole["mean_lap_time_s"]) == (55.0, None, None)
     assert each == {
         "completion/a": None,
@@ -57,9 +57,9 @@ def test_every_track_has_its_own_figures_and_the_whole_no_lap_time():
 
 
 def test_the_summary_has_each_track_by_its_name_with_what_was_known_last():
-    results = Results(["Kurs ß", "b"], 8, 1 / 15, NoStopping(kind="none"))
-    results.metrics_of_tracks(drive(results, 0, laps=1, others=1))
-    results.metrics_of_tracks(drive(results, 1, laps=2, steps=16))
+    results = RunMetrics(["Kurs ß", "b"], 8, 1 / 15, NoStopping(kind="none"))
+    results.row_of_tracks(drive(results, 0, laps=1, others=1))
+    results.row_of_tracks(drive(results, 1, laps=2, steps=16))
     summary = results.summary()
     assert summary["best_lap_time_s"] is None
     assert summary["tracks"]["Kurs ß"] == {
@@ -73,7 +73,7 @@ def test_the_summary_has_each_track_by_its_name_with_what_was_known_last():
     assert summary["tracks"]["b"]["laps"] == 2
 
 
-def reliable(results: Results) -> str | None:
+def reliable(results: RunMetrics) -> str | None:
     """Return what the stopping rule says of the results."""
     shares = {f"lap_share/{label}": None for label in results.labels}
     decision = Stopping(RULE, 5).observe({"lap_share": results.lap_share, **shares})
@@ -81,7 +81,7 @@ def reliable(results: Results) -> str | None:
 
 
 def test_reliable_is_what_is_reliable_on_every_track():
-    results = Results(["a", "b"], 8, 1 / 15, RULE)
+    results = RunMetrics(["a", "b"], 8, 1 / 15, RULE)
     drive(results, 0, laps=8)
     assert reliable(results) is None  # nothing is known of the other
     drive(results, 1, laps=2, others=2)
@@ -95,7 +95,7 @@ def test_reliable_is_what_is_reliable_on_every_track():
 
 
 def test_the_share_of_laps_is_that_of_the_track_where_it_is_lowest():
-    results = Results(["a", "b"], 8, 1 / 15, RULE)
-    assert results.metrics(drive(results, 0, laps=4))["lap_share"] is None
-    assert results.metrics(drive(results, 1, laps=1, others=3))["lap_share"] == 0.25
+    results = RunMetrics(["a", "b"], 8, 1 / 15, RULE)
+    assert results.row(drive(results, 0, laps=4))["lap_share"] is None
+    assert results.row(drive(results, 1, laps=1, others=3))["lap_share"] == 0.25
     assert results.summary()["lap_share"] == 0.25

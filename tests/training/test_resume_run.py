@@ -10,13 +10,13 @@ from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.evaluation.checkpoint import read_checkpoint
-from deepracer_exp.evaluation.run import read_run
-from deepracer_exp.formats.checkpoint_files import verify
-from deepracer_exp.formats.run_files import read_metrics
-from deepracer_exp.training.checkpoints import read_training
-from deepracer_exp.training.run import TIMES
-from deepracer_exp.training.run_folder import RunFolder
-from deepracer_exp.training.training import Training
+from deepracer_exp.runs.checkpoint_files import verify
+from deepracer_exp.runs.checkpoints import read_training
+from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.training.metrics import TIMES
+from deepracer_exp.training.trainer import Trainer
 from tests.conftest import IN_PROCESS
 
 # Reached sooner than a lap: episodes end often.
@@ -103,7 +103,7 @@ def test_a_torn_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trai
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 0, ended.stderr
     assert "000003: torn" in ended.stderr
-    assert "000002, the newest intact one, takes its place" in ended.stderr
+    assert "using 000002, the newest intact one" in ended.stderr
     assert_same_run(run, whole(trained))
 
 
@@ -114,7 +114,7 @@ def test_with_no_intact_checkpoint_nothing_is_begun(cut, call):
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 2
-    assert "none in" in ended.complaint
+    assert "is intact" in ended.complaint
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
 
 
@@ -142,10 +142,10 @@ def test_a_clone_killed_as_soon_as_it_is_one_begins_again_with_its_parents_polic
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(Training, "drive_and_learn", killed)
-        call("clone", f"run={parent.name}", "name=killed", "checkpoint=last")
+        patched.setattr(Trainer, "fit", killed)
+        call("clone", parent.name, "name=killed", "checkpoint=last")
     (run,) = (parent.parents[1] / "killed").iterdir()
-    experiment = read_run(str(run), run.parents[1], None).experiment
+    experiment = resolve(str(run), run.parents[1], None).experiment
     states = [
         read_checkpoint(experiment, folder / "checkpoints", "last").networks.state_dict()
         for folder in (run, parent)
@@ -205,7 +205,7 @@ def test_a_run_that_others_have_beaten_goes_on_if_it_is_told_which_rule_counts(t
     (stopped / "config.yaml").write_text(yaml.safe_dump(config | {"stopping": {"kind": "none"}}))
     ended = call("resume", stopped.name)
     assert ended.code == 2
-    assert "stopping=none lets it go on" in ended.complaint
+    assert "stopping=none resumes it all the same" in ended.complaint
     ended = call("resume", stopped.name, "stopping=none")
     assert ended.code == 0, ended.stderr
     assert_same_run(stopped, whole(trained))
@@ -297,7 +297,7 @@ def test_a_run_at_its_end_is_refused_with_what_can_be_done(cut, trained, call, t
     shutil.copytree(stopped.folder, copy, symlinks=True)
     ended = call("resume", copy.name, "budget.env_steps=99999")
     assert ended.code == 2
-    assert "deepracer-exp clone run=" in ended.complaint
+    assert "deepracer-exp clone " in ended.complaint
 
 
 def test_a_run_that_is_being_trained_is_left_alone(cut, call):

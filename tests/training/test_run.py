@@ -13,9 +13,10 @@ from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import Schedule
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.env.observation import Features, feature_names
-from deepracer_exp.formats.trace import read_trace
-from deepracer_exp.training.run import TIMES, train
+from deepracer_exp.training.metrics import TIMES
+from deepracer_exp.training.run import train
 
 # Reached sooner than a lap: episodes end often.
 OVERRIDES = ("reward=speed_on_track", "episode.max_steps=60")

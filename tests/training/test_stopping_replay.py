@@ -6,7 +6,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
-from deepracer_exp.formats.run_files import RunRecord, read_run
+from deepracer_exp.runs.files import RunRecord, read_run
 from deepracer_exp.training.stopping_replay import Replay, replay
 
 LENGTH = 200
@@ -138,7 +138,7 @@ def test_the_command_replays_a_real_run(trained, call):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["stopping=entropy"], ["no run given"]),
+        (["stopping=entropy"], ["RUN: missing"]),
         (["nowhere"], ["nowhere: no such run"]),
         ([NAME, "stopping=entropie"], ["no such stopping", "did you mean entropy?"]),
         ([NAME, "stopping.converged.window=4"], ["stopping.converged.window", "patience"]),

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.training.track_table import TrackTable
+from deepracer_exp.training.display import TrackTable
 
 
 @given(

@@ -7,15 +7,15 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.reward_source import load_reward_source
 from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.tracks.track import Track
 from deepracer_exp.validation import check as checking
 from deepracer_exp.validation import reward_map
-from deepracer_exp.validation.check import Check, look_closer, other_direction, read, try_scenes
-from deepracer_exp.validation.laps import Lap, action_space_laps
+from deepracer_exp.validation.check import Check, look_closer, other_direction, read, try_named_situations
+from deepracer_exp.validation.pitfalls import DrivenLap, action_space_laps
 from deepracer_exp.validation.probe import Probe
-from deepracer_exp.validation.survey import Surveyor, memory_of
+from deepracer_exp.validation.reward_grid import RewardSampler, state_of
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +34,7 @@ def against(experiment: Experiment) -> Track:
 
 
 @pytest.fixture(scope="session")
-def laps(race: RaceSetup) -> list[Lap]:
+def laps(race: RaceSetup) -> list[DrivenLap]:
     return action_space_laps(race)
 
 
@@ -52,18 +52,18 @@ def race_with(race: RaceSetup, tmp_path: Path) -> Callable[..., RaceSetup]:
 
 
 @pytest.fixture
-def surveyor_of() -> Callable[[RaceSetup], Surveyor]:
-    def build(race: RaceSetup) -> Surveyor:
-        return Surveyor(race, memory_of(race, Probe(race.reward, race.reward_time_limit_s)))
+def surveyor_of() -> Callable[[RaceSetup], RewardSampler]:
+    def build(race: RaceSetup) -> RewardSampler:
+        return RewardSampler(race, state_of(race, Probe(race.reward, race.reward_time_limit_s)))
 
     return build
 
 
 @pytest.fixture
-def coarsely(laps: list[Lap], monkeypatch: pytest.MonkeyPatch) -> None:
+def coarsely(laps: list[DrivenLap], monkeypatch: pytest.MonkeyPatch) -> None:
     """Ask fewer questions than a racer would want asked, and drive the laps once."""
 
-    def driven(setup: RaceSetup) -> list[Lap]:
+    def driven(setup: RaceSetup) -> list[DrivenLap]:
         same = (setup.track.name, setup.track.reversed, setup.actions.n) == ("reinvent_base", False, 15)
         return laps if same else action_space_laps(setup)
 
@@ -79,7 +79,7 @@ def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None
 
     def build(text: str, time_limit_s: float = 60.0) -> Check:
         check = Check(setup=race_with(text, time_limit_s), console=[])
-        try_scenes(check, against)
+        try_named_situations(check, against)
         if not check.failures:
             look_closer(check, against)
         return check

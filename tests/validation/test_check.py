@@ -3,7 +3,7 @@ import pytest
 from deepracer_exp.errors import BadInput
 from deepracer_exp.validation.check import read
 from deepracer_exp.validation.probe import NOT_CALLED, Probe
-from deepracer_exp.validation.survey import memory_of
+from deepracer_exp.validation.reward_grid import state_of
 
 
 def function(body: str, before: str = "") -> str:
@@ -39,11 +39,11 @@ def test_a_good_function_is_told_nothing(check_of):
             "raised KeyError: 'nothing' in line 4",
         ),
         ("exit(1)", "raised SystemExit: 1 in line 2"),
-        ("pass", "line 2 returned None; a finite number"),
-        ("x = 1j\nreturn x", "line 3 returned 1j; a finite number"),
-        ('return float("nan")', "line 2 returned nan; a finite number"),
-        ("return 100001", "line 2 returned 100001; a finite number from -100000 to 100000"),
-        ('return "1"', "line 2 returned '1'; a finite number"),
+        ("pass", "line 2 returned None; accepted: a finite number"),
+        ("x = 1j\nreturn x", "line 3 returned 1j; accepted: a finite number"),
+        ('return float("nan")', "line 2 returned nan; accepted: a finite number"),
+        ("return 100001", "line 2 returned 100001; accepted: a finite number from -100000 to 100000"),
+        ('return "1"', "line 2 returned '1'; accepted: a finite number"),
     ],
 )
 def test_what_would_end_a_training_is_told_with_its_line(check_of, body, words):
@@ -86,13 +86,13 @@ def test_prints_and_changed_params_do_no_harm(check_of, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_branches_that_are_never_taken_are_told_with_their_lines(check_of):
+def test_branches_that_are_never_taken_are_reported_with_their_lines(check_of):
     loop = 'for d in params["objects_distance"]:\n    r -= d'
     body = f'r = params["speed"]\nif r > 100:\n    r = 7\n    r += 1\n{loop}\nreturn r'
-    told = [line for line in check_of(function(body)).warnings if "never gets to" in line]
+    told = [line for line in check_of(function(body)).warnings if "never reaches" in line]
     assert "lines 4 to 5 in 406 situations: r = 7" in told[0]
     assert "line 7" in told[1]
-    assert told[1].endswith("(there are no objects on the road here)")
+    assert told[1].endswith("(there are no objects on the track here)")
 
 
 CONDITIONS = [
@@ -111,12 +111,12 @@ CONDITIONS = [
 def test_what_happens_in_a_training_is_no_unreachable_branch(check_of):
     branches = "".join(f"if {condition}:\n    r += {i}\n" for i, condition in enumerate(CONDITIONS))
     told = check_of(function(f'r = params["speed"]\n{branches}return r')).warnings
-    assert not any("never gets to" in line for line in told)
+    assert not any("never reaches" in line for line in told)
 
 
-def test_a_constant_is_told_in_one_line(check_of):
+def test_a_constant_reward_is_reported_in_one_line(check_of):
     (told,) = check_of(function("return 1.0")).warnings
-    assert "pays 1 whatever the car does" in told
+    assert "always returns 1, whatever the car does" in told
 
 
 def test_a_reward_of_chance_is_told(check_of):
@@ -131,7 +131,7 @@ def test_a_function_that_divides_by_the_length_between_waypoints_is_warned_of_th
     )
     check = check_of(function(body, "import math\n"))
     assert check.failures == []
-    assert "which are one place: raised ZeroDivisionError" in check.warnings[0]
+    assert "between the last waypoint and the first: raised ZeroDivisionError" in check.warnings[0]
 
 
 def test_a_module_that_cannot_be_run_is_bad_input(check_of):
@@ -150,12 +150,12 @@ def test_a_reward_batch_that_fails_is_a_failure(check_of):
         (GOOD, "none"),
         (DELTA, "earlier calls"),
         ("n = [0]\n" + function("n[0] += 1\nreturn n[0]"), "earlier calls"),
-        (function("return random.random()", "import random\n"), "chance"),
+        (function("return random.random()", "import random\n"), "randomness"),
     ],
 )
-def test_memory_and_chance_are_told_apart(race_with, text, memory):
+def test_stateful_and_random_rewards_are_distinguished(race_with, text, memory):
     race = race_with(text)
-    assert memory_of(race, Probe(race.reward, 60.0)) == memory
+    assert state_of(race, Probe(race.reward, 60.0)) == memory
 
 
 def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with, monkeypatch):

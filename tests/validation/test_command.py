@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from deepracer_exp.env.reward_source import zoo_names
+from deepracer_exp.rewards.source import zoo_names
 from deepracer_exp.validation import check as checking
 from deepracer_exp.validation.check import read
 
@@ -22,7 +22,7 @@ def write(folder: Path, pay: str, name: str = "mine.py") -> str:
 def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
     ended = call("validate", "reward=progress_gain")
     assert ended.code == 0
-    assert "AWS console: would take it" in ended.stdout
+    assert "AWS console: would accept it" in ended.stdout
     assert ended.stdout.splitlines()[-1].startswith("Verdict: can be trained")
     picture = tmp_path / "runs/validate/progress_gain-reinvent_base.png"
     assert picture.name in ended.stdout
@@ -33,7 +33,7 @@ def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
 def test_waypoint_numbers_that_no_world_has_are_noted(call, tmp_path, track, own):
     (tmp_path / "square.yaml").write_text("width_m: 0.8\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
     ended = call("validate", "reward=speed_on_track", track)
-    assert ("not as in any world of the service" in ended.stdout) == own
+    assert ("not as in a track of the service" in ended.stdout) == own
     assert {path.parent.name for path in tmp_path.rglob("*.png")} == {"validate"}
 
 
@@ -47,13 +47,13 @@ def test_pictures_of_other_rewards_are_other_pictures(call, tmp_path):
         assert np.ptp(picture[..., :3]) > 0.5
 
 
-def test_what_aws_would_refuse_is_told_and_refused_if_asked(call, tmp_path):
+def test_what_aws_would_reject_is_reported_and_fails_with_strict(call, tmp_path):
     (tmp_path / "mine.py").write_text("import os\n\n\n" + REWARD.format(pay="params['speed'] + len(os.sep)"))
     for extra, code in ((), 0), (("--strict",), 2):
         ended = call("validate", "reward.file=mine.py", *extra)
         assert ended.code == code
         assert "line 1: import of os" in ended.stdout
-        assert "the AWS console would refuse it: 1 finding" in ended.stdout.splitlines()[-1]
+        assert "the AWS console would reject it: 1 finding" in ended.stdout.splitlines()[-1]
 
 
 def test_what_cannot_be_used_here_exits_with_2_and_draws_nothing(call, tmp_path):
@@ -110,7 +110,7 @@ def test_a_continuous_action_space_and_a_single_action_are_fine(call, tmp_path):
 
 
 @pytest.mark.parametrize("name", zoo_names())
-def test_the_console_would_take_every_reward_of_the_zoo(name):
+def test_the_console_would_accept_every_reward_of_the_zoo(name):
     from deepracer_exp.config.compose import compose_experiment
 
     assert read(compose_experiment([f"reward={name}"])[0]).console == []
@@ -119,12 +119,12 @@ def test_the_console_would_take_every_reward_of_the_zoo(name):
 @pytest.mark.parametrize("name", zoo_names())
 def test_every_reward_of_the_zoo_can_be_trained(race_of_zoo, against, name):
     check = race_of_zoo(name)
-    checking.try_scenes(check, against)
+    checking.try_named_situations(check, against)
     checking.look_closer(check, against)
     assert check.failures == []
-    assert not any("reward_batch" in line or "one place" in line for line in check.warnings)
+    assert not any("reward_batch" in line or "the last waypoint" in line for line in check.warnings)
     if name != "progress_delta":
-        assert check.memory == "none"
+        assert check.state == "none"
 
 
 @pytest.fixture
@@ -132,7 +132,7 @@ def race_of_zoo(race):
     import dataclasses
 
     from deepracer_exp.config.driving import RewardConfig
-    from deepracer_exp.env.reward_source import load_reward_source
+    from deepracer_exp.rewards.source import load_reward_source
 
     def build(name: str) -> checking.Check:
         source = load_reward_source(RewardConfig(name=name, file=None, constants={}, time_limit_s=60.0))
@@ -142,7 +142,7 @@ def race_of_zoo(race):
     return build
 
 
-def test_a_trial_trains_and_says_whether_anything_rises(call, tmp_path):
+def test_a_short_training_reports_whether_anything_improves(call, tmp_path):
     ended = call(
         *("validate", write(tmp_path, "params['speed'] - 9 * params['is_offtrack']"), "trial=3s"),
         *("experiment=tiny", "collector=in_process", "collector.threads=1"),
@@ -151,4 +151,4 @@ def test_a_trial_trains_and_says_whether_anything_rises(call, tmp_path):
     assert "Trial: " in ended.stdout
     assert "runs/validate/" in ended.stdout
     assert len(list(tmp_path.glob("runs/validate/*/metrics.jsonl"))) == 1
-    assert "rise" in ended.stdout
+    assert "improve" in ended.stdout

@@ -1,7 +1,6 @@
 import pytest
 
-from deepracer_exp.validation.console import BUILTINS, WORDS, console_findings
-from deepracer_exp.validation.style import style_findings
+from deepracer_exp.validation.console import BUILTINS, WORDS, console_findings, style_findings
 
 GOOD = '''\
 import math
@@ -64,7 +63,7 @@ def test_a_word_inside_a_longer_one_is_refused_and_shown():
 def test_code_beyond_140_000_characters_is_refused():
     most = GOOD + "#" * (140_000 - len(GOOD) - 1) + "\n"
     assert not any("characters of code" in line for line in findings(most))
-    assert findings(most + "\n\n")[0] == "140,002 characters of code; at most 140,000 are taken"
+    assert findings(most + "\n\n")[0] == "140,002 characters of code; at most 140,000 are accepted"
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.validation import pitfalls
-from deepracer_exp.validation.survey import survey
+from deepracer_exp.validation.reward_grid import sample_reward_grid
 
 CENTER = """\
 def reward_function(params):
@@ -42,20 +42,20 @@ def reward_function(params):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (EDGE, "pays more off the road than on it"),
-        (LEFT_GRASS, "pays more off the road than on it: 2 a step"),
-        (SPEED, "pays as much off the road as on it: 2 a step"),
+        (EDGE, "pays more off the track than on it"),
+        (LEFT_GRASS, "pays more off the track than on it: 2 per step"),
+        (SPEED, "pays as much off the track as on it: 2 per step"),
     ],
 )
-def test_pay_off_the_road_is_told(race_with, surveyor_of, text, words):
+def test_reward_off_the_track_is_reported(race_with, surveyor_of, text, words):
     race = race_with(text)
-    (told,) = pitfalls.pays_off_the_road(survey(race, surveyor_of(race), 0.25))
+    (told,) = pitfalls.pays_off_the_road(sample_reward_grid(race, surveyor_of(race), 0.25))
     assert words in told
 
 
 def test_the_side_that_pays_is_named(race_with, surveyor_of):
     race = race_with(LEFT_GRASS)
-    (told,) = pitfalls.pays_off_the_road(survey(race, surveyor_of(race), 0.25))
+    (told,) = pitfalls.pays_off_the_road(sample_reward_grid(race, surveyor_of(race), 0.25))
     assert "m left of the centre line" in told
 
 
@@ -64,7 +64,7 @@ def test_the_side_that_pays_is_named(race_with, surveyor_of):
 )
 def test_a_function_that_prefers_the_road_is_left_alone(race_with, surveyor_of, text):
     race = race_with(text)
-    assert not list(pitfalls.pays_off_the_road(survey(race, surveyor_of(race), 0.25)))
+    assert not list(pitfalls.pays_off_the_road(sample_reward_grid(race, surveyor_of(race), 0.25)))
 
 
 @pytest.mark.parametrize(
@@ -105,9 +105,9 @@ def test_one_lap_alone_is_not_compared(race_with, laps):
     assert not list(pitfalls.pays_for_slowness(race_with(CENTER), []))
 
 
-def test_a_constant_is_told_and_a_single_other_value_is_none():
+def test_only_a_constant_reward_is_reported_as_constant():
     assert list(pitfalls.constant_reward(np.full(9, 3.0))) == [
-        "pays 3 whatever the car does: there is nothing to learn"
+        "always returns 3, whatever the car does: there is nothing to learn"
     ]
     assert not list(pitfalls.constant_reward(np.r_[np.full(9, 3.0), 3.1]))
 
@@ -115,8 +115,8 @@ def test_a_constant_is_told_and_a_single_other_value_is_none():
 @pytest.mark.parametrize(("factor", "warned"), [("1", False), ("2", True)])
 def test_a_reward_batch_that_pays_otherwise_is_told(race_with, laps, factor, warned):
     batch = f'\n\ndef reward_batch(params):\n    return {factor} * params["speed"]\n'
-    race, asked = race_with(SPEED + batch), laps[0].paid
-    told = list(pitfalls.batch_differs(race, asked, asked.columns["speed"]))
+    race, sampled = race_with(SPEED + batch), laps[0].paid
+    told = list(pitfalls.batch_differs(race, sampled, sampled.columns["speed"]))
     assert bool(told) == warned
     if told:
-        assert f"in {len(asked)} of {len(asked)}" in told[0]
+        assert f"in {len(sampled)} of {len(sampled)}" in told[0]

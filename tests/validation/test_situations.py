@@ -1,12 +1,11 @@
 import numpy as np
 import pytest
 
-from deepracer_exp.validation.laps import drive_laps
-from deepracer_exp.validation.scenes import sample, scenes, seam
-from deepracer_exp.validation.situations import poses, situations
+from deepracer_exp.validation.pitfalls import drive_laps
+from deepracer_exp.validation.situations import named_situations, poses, sample, seam, situations
 
 
-def test_situations_are_where_they_were_asked_for(race):
+def test_situations_are_where_they_were_requested(race):
     at = poses(race, [0.25, 0.5], [0.2, -0.3], [0.1, 0.0], 2.0, 10.0)
     columns = situations(race, at).columns
     np.testing.assert_allclose(columns["distance_from_center"], [0.2, 0.3], atol=0.02)
@@ -20,7 +19,9 @@ def test_situations_are_where_they_were_asked_for(race):
 
 
 def test_the_named_situations_are_what_they_are_called(race, against):
-    named = {scene.name: {k: v[0] for k, v in scene.now.columns.items()} for scene in scenes(race, against)}
+    named = {
+        case.name: {k: v[0] for k, v in case.now.columns.items()} for case in named_situations(race, against)
+    }
     assert list(named) == ["start", "mid-lap", "off the track", "finish", "wrong way", "reversed track"]
     assert named["start"]["steps"] == 2
     assert named["start"]["progress"] < 2
@@ -30,15 +31,15 @@ def test_the_named_situations_are_what_they_are_called(race, against):
     assert named["finish"]["progress"] == 100
     turned = abs(named["wrong way"]["heading"] - named["mid-lap"]["heading"])
     assert turned == pytest.approx(180)
-    reverse = {scene.name: scene.now.road for scene in scenes(race, against)}
+    reverse = {case.name: case.now.road for case in named_situations(race, against)}
     assert reverse["reversed track"].is_reversed
     assert reverse["reversed track"].waypoints == reverse["mid-lap"].waypoints[::-1]
 
 
 def test_the_step_before_is_a_step_behind(race, against):
-    scene = scenes(race, against)[1]
-    assert scene.before is not None
-    now, before = scene.now.columns, scene.before.columns
+    case = named_situations(race, against)[1]
+    assert case.before is not None
+    now, before = case.now.columns, case.before.columns
     assert now["steps"] - before["steps"] == 1
     moved_m = np.hypot(now["x"] - before["x"], now["y"] - before["y"])
     assert moved_m == pytest.approx(now["speed"] / 15, rel=0.05)

@@ -1,0 +1,47 @@
+"""The moving picture at the head of the README: a film of a lap as an animated WebP.
+
+deepracer-exp train experiment=fast_lap name=season
+deepracer-exp evaluate best:season evaluation.held_out=null --video lap.mp4
+python -m benchmarks.lap_picture lap.mp4
+"""
+
+import argparse
+from pathlib import Path
+
+from imageio_ffmpeg import read_frames
+from PIL import Image
+
+OUTPUT = Path(__file__).parents[1] / "docs" / "images" / "lap.webp"
+WIDTH, FRAMES_PER_S, QUALITY = 720, 15, 55
+
+
+def main() -> None:
+    """Write the picture and say how large it is."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("film", help="an .mp4 of `deepracer-exp evaluate --video`")
+    parser.add_argument("--output", type=Path, default=OUTPUT)
+    args = parser.parse_args()
+    frames = moving_picture(args.film, args.output)
+    print(f"{args.output}: {frames} frames, {args.output.stat().st_size / 1e6:.2f} MB")
+
+
+def moving_picture(film: str, output: Path) -> int:
+    """Write a film as an endless animated WebP of `WIDTH` pixels; returns its number of frames."""
+    reader = read_frames(film, output_params=["-r", str(FRAMES_PER_S)])
+    size = next(reader)["source_size"]
+    height = round(size[1] * WIDTH / size[0])
+    frames = [Image.frombytes("RGB", size, frame).resize((WIDTH, height)) for frame in reader]
+    frames[0].save(
+        output,
+        save_all=True,
+        append_images=frames[1:],
+        duration=round(1000 / FRAMES_PER_S),
+        loop=0,
+        quality=QUALITY,
+        method=6,
+    )
+    return len(frames)
+
+
+if __name__ == "__main__":
+    main()

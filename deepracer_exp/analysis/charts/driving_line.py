@@ -1,0 +1,314 @@
+"""The line that the car drives: the fastest lap, sectors, speed and steering, the racing line, acceleration, slide."""
+
+import numpy as np
+import pandas as pd
+
+from deepracer_exp.analysis.log_course import waypoint_positions
+from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_waypoints
+from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
+from deepracer_exp.analysis.sectors import sectors_of, theoretical_best_s, times_by_sector
+from deepracer_exp.analysis.statistics import Values, means, quantiles, subsample
+
+from .figure import Chart, Layer, Panel, band, bars, colored_points, line, note, points
+from .maps import LEAST_STEPS, Grid, map_panel, waypoint_panel
+from .style import BLUE, CATEGORIES, INK, ORANGE, PALE, VERMILION
+
+GRIP_SHARE = 0.95
+"""Quantile of the lateral acceleration in complete laps that counts as the grip of the car."""
+LEAST_GRIP_MPS2 = 0.5
+SLIDE_LEAST_MPS = 0.3
+"""Below this speed the direction of travel is mostly noise."""
+_ROWS = 200_000
+"""Rows beyond which quantiles are those of an evenly spaced part of them."""
+
+
+def lap_line(view: LogView) -> Chart | None:
+    """Draw the fastest lap on the course, coloured by speed."""
+    columns = (
+        "X",
+        "Y",
+        "steps",
+        "closest_waypoint",
+        "progress",
+        "lap_position",
+        "tstamp",
+        "steer",
+        "throttle",
+    )
+    motion = ("track_speed_mps", "acceleration_mps2", "braking_mps2", "slide_deg", "reward")
+    lap = view.fastest_lap(*columns, *motion)
+    if lap is None or view.course is None:
+        return None
+    row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()].to_dict()
+    known = lap[lap["track_speed_mps"].notna()]
+    hover = [
+        f"step {step.steps:.0f}, waypoint {step.closest_waypoint}, {step.progress:.1f} %\n"
+        f"driven {step.track_speed_mps:.2f} m/s, commanded {step.throttle:.2f} m/s, steering {step.steer:.1f}°"
+        for step in known.itertuples()
+    ]
+    speed = known["track_speed_mps"]
+    dots = colored_points(known["X"], known["Y"], speed, "speed along the track, m/s", size=5.5, hover=hover)
+    mean_mps = view.course.length_m / float(row["lap_time_s"])
+    whose = f"iteration {row['iteration']}" if view.trained else str(row["stream"])
+    return Chart(
+        name="lap_line",
+        title=f"The fastest lap: {row['lap_time_s']:.3f} s, {whose}, episode {row['episode']}",
+        caption="One dot for each control step of the fastest complete lap, coloured by the speed of the car; "
+        f"at a constant {mean_mps:.2f} m/s the centre line would take as long. Dots close together are slow: find "
+        "where the car slows down and ask whether the bend requires it.",
+        rows=[[map_panel(view.course, [line(lap["X"], lap["Y"], PALE, width=1.0), dots])]],
+        table=lap.reset_index(drop=True),
+    )
+
+
+def sector_times(view: LogView) -> Chart | None:
+    """Draw the time lost in each sector: by the fastest lap and by the median lap, to the best time of the sector."""
+    if view.course is None or not len(view.steps):
+        return None
+    sectors = sectors_of(view.course)
+    times = times_by_sector(view.steps, sectors)
+    times = times[np.isfinite(times).all(axis=1)]
+    if not len(times):
+        return None
+    best = times.min()
+    median, fastest = times.median() - best, times.loc[times.sum(axis=1).idxmin()] - best
+    names = list(times.columns)
+    x = np.arange(len(names))
+    hover = [
+        f"{name}: {lost:.3f} s behind the best {own:.3f} s"
+        for name, lost, own in zip(names, fastest, best, strict=True)
+    ]
+    lost = Panel(
+        layers=[
+            bars(x, median, PALE, f"median of {len(times)} complete laps"),
+            points(x, fastest, VERMILION, "fastest lap", size=9.0, symbol="diamond", hover=hover),
+        ],
+        x_names=names,
+        x_label="sector, in driving direction",
+        y_label="s behind the best of the sector",
+    )
+    lines: list[Layer] = []
+    notes: list[Layer] = []
+    for number, sector in enumerate(sectors.parts):
+        places = view.course.points_at(np.linspace(sector.begin, sector.end, 60))
+        lines.append(line(places[:, 0], places[:, 1], CATEGORIES[number % 6], width=4.0))
+        notes.append(note(places[30].tolist(), f"{sector.name}\n{best[sector.name]:.2f} s"))
+    best_s, driven_s = theoretical_best_s(times), float(times.sum(axis=1).min())
+    return Chart(
+        name="sector_times",
+        title=f"Sectors: the best times of all add up to {best_s:.3f} s, the fastest lap took {driven_s:.3f} s",
+        caption="Sectors begin and end where the curvature of the centre line changes; the map shows the best "
+        "time driven in each of them, in any complete lap. The height of a bar is what the median lap loses there, "
+        "the diamond what even the fastest lap lost.",
+        rows=[[map_panel(view.course, [*lines, *notes], numbers=False)], [lost]],
+        table=pd.DataFrame(
+            {
+                "sector": names,
+                "best_s": best.to_numpy(),
+                "median_s": times.median().to_numpy(),
+                "fastest_lap_s": (fastest + best).to_numpy(),
+            }
+        ),
+    )
+
+
+def speed_steering_by_waypoint(view: LogView) -> Chart | None:
+    """Draw speed and steering at each waypoint, beside those of the racing line and of the centre line."""
+    columns = ("closest_waypoint", "track_speed_mps", "yaw_rate_dps", "steer", "throttle", "steps")
+    rows, which = _laps_or_recent(view, *columns)
+    rows = rows[rows["steps"].to_numpy() > STARTING_STEPS]
+    if not len(rows):
+        return None
+    n = view.waypoint_count
+    at, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), _ROWS)
+    lap = view.fastest_lap(*columns)
+    table = pd.DataFrame({"waypoint": at})
+    speed: list[Layer] = []
+    steering: list[Layer] = []
+    for column, layers in (("track_speed_mps", speed), ("steer", steering)):
+        values = rows[column].to_numpy(np.float64)
+        low, high = quantiles(waypoint[part], values[part], n, (0.1, 0.9))
+        mean = means(waypoint, values, n)
+        table = table.assign(**{f"{column}_mean": mean, f"{column}_p10": low, f"{column}_p90": high})
+        layers.append(band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"))
+        layers.append(line(at, mean, BLUE, "mean", width=2.0))
+        if column == "track_speed_mps":
+            layers.append(
+                line(at, means(waypoint, rows["throttle"], n), PALE, "mean speed commanded", width=1.4)
+            )
+        if lap is not None:
+            driven = lap[lap["steps"] > STARTING_STEPS]
+            # Control steps of uneven length make the speed of a single one jump.
+            smooth = driven[column].rolling(3, center=True, min_periods=1).mean()
+            best = _without_gaps(means(closest_waypoints(driven), smooth, n))
+            layers.append(line(at, best, INK, "fastest lap, mean of three steps", width=1.2))
+    if view.course is not None:
+        places = waypoint_positions(view.course)
+        known = np.minimum(at, len(places) - 1)
+        grip_mps2, top_mps = _grip(rows.iloc[part]), float(rows["throttle"].max())
+        for ideal, name, color in (
+            (minimum_curvature_line(view.course), "racing line", VERMILION),
+            (center_line(view.course), "centre line", ORANGE),
+        ):
+            ideal_mps = ideal.at(places, ideal.speed_mps(grip_mps2, top_mps))
+            ideal_deg = ideal.at(places, ideal.steering_deg)
+            x, words = np.arange(len(places)), f"{name}, cornering at {grip_mps2:.1f} m/s²"
+            speed.append(line(x, ideal_mps, color, words, dashed=True))
+            steering.append(line(x, ideal_deg, color, name, dashed=True))
+            key = name.replace(" ", "_")
+            found = {f"{key}_speed_mps": ideal_mps[known], f"{key}_steering_deg": ideal_deg[known]}
+            table = table.assign(**found)
+    return Chart(
+        name="speed_steering_by_waypoint",
+        title="Speed and steering by waypoint",
+        caption="Driven speed and commanded steering; the dashed lines are those of a car on the racing line and on "
+        "the centre line with the lateral acceleration that this car reached (standing starts left out), without "
+        "room for braking. Where the driven speed stays far below the dashed lines, time can be gained; steering "
+        "that swings where they are flat is weaving.",
+        rows=[
+            [waypoint_panel(speed, "speed along the track, m/s", n)],
+            [waypoint_panel(steering, "steering, ° (left is positive)", n)],
+        ],
+        share_x=True,
+        table=table,
+    )
+
+
+def racing_line(view: LogView) -> Chart | None:
+    """Draw how far from the racing line the car drives."""
+    if view.course is None:
+        return None
+    columns = ("closest_waypoint", "lap_position", "offset_m", "X", "Y")
+    rows, which = _laps_or_recent(view, *columns)
+    rows = rows[np.isfinite(rows["offset_m"].to_numpy(np.float64))]
+    if not len(rows):
+        return None
+    ideal, course = minimum_curvature_line(view.course), view.course
+    n = view.waypoint_count
+    at = np.arange(n)
+    rows = rows.iloc[subsample(len(rows), _ROWS)]
+    offset_m, waypoint = rows["offset_m"].to_numpy(np.float64), closest_waypoints(rows)
+    away_m = offset_m - ideal.at(rows["lap_position"], ideal.offset_m)
+    low, middle, high = quantiles(waypoint, away_m, n, (0.1, 0.5, 0.9))
+    median_xy = _beside(
+        course.waypoints, quantiles(waypoint, offset_m, n, (0.5,))[0][: len(course.waypoints)]
+    )
+    layers: list[Layer] = [
+        line(at, np.zeros(n), VERMILION, "racing line", dashed=True),
+        band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"),
+        line(at, middle, BLUE, "median", width=2.0),
+    ]
+    paths: list[Layer] = [
+        line(ideal.xy[:, 0], ideal.xy[:, 1], VERMILION, "racing line", width=1.8, dashed=True),
+        line(median_xy[:, 0], median_xy[:, 1], BLUE, f"{which}, median", width=2.0),
+    ]
+    lap = view.fastest_lap(*columns)
+    if lap is not None:
+        own_m = lap["offset_m"] - ideal.at(lap["lap_position"], ideal.offset_m)
+        own = _without_gaps(means(closest_waypoints(lap), own_m, n))
+        paths.append(line(lap["X"], lap["Y"], INK, "fastest lap", width=1.2))
+        layers.append(line(at, own, INK, "fastest lap", width=1.2))
+    mean_m = float(np.nanmean(np.abs(away_m)))
+    return Chart(
+        name="racing_line",
+        title=f"The racing line: the car drives {100 * mean_m:.0f} cm from it on average",
+        caption="The racing line is the one of minimum curvature that keeps all wheels on the road; the lower panel "
+        "shows how far to the left (positive) or to the right of it the car is. A line that cuts in before the bend "
+        "and runs wide behind it crosses zero twice: the car turns in too early.",
+        rows=[[map_panel(course, paths)], [waypoint_panel(layers, "m left of the racing line", n)]],
+        table=pd.DataFrame({"waypoint": at, "median_m": middle, "p10_m": low, "p90_m": high}),
+    )
+
+
+def acceleration_map(view: LogView) -> Chart | None:
+    """Draw where the car accelerates and where it brakes."""
+    rows = view.recent("X", "Y", "acceleration_mps2", "braking_mps2", "steps")
+    rows = rows[rows["steps"].to_numpy() > STARTING_STEPS]
+    if view.course is None or not len(rows):
+        return None
+    grid = Grid.over(view.course, 8_000)
+    change = rows["acceleration_mps2"] - rows["braking_mps2"]
+    mean = means(grid.of(rows["X"], rows["Y"]), change, grid.count, LEAST_STEPS)
+    return Chart(
+        name="acceleration_map",
+        title="Where the car accelerates and where it brakes",
+        caption="Mean change of the speed along the track in each cell, in the last third of the iterations, without "
+        "standing starts: positive where the car gets faster. A car should brake before a bend and accelerate in its "
+        "second half; braking on a straight is time lost.",
+        rows=[[map_panel(view.course, [grid.cells(mean, "change of speed, m/s²", diverging=True)])]],
+        table=grid.table({"change_mps2": mean}),
+    )
+
+
+def slide_map(view: LogView) -> Chart | None:
+    """Draw where the car slides: the angle between its heading and its direction of travel."""
+    rows = view.recent("X", "Y", "slide_deg", "track_speed_mps")
+    if view.course is None or not len(rows):
+        return None
+    slide = rows["slide_deg"].abs().where(rows["track_speed_mps"] >= SLIDE_LEAST_MPS)
+    grid = Grid.over(view.course, 8_000)
+    mean = means(grid.of(rows["X"], rows["Y"]), slide, grid.count, LEAST_STEPS)
+    if not np.isfinite(mean).any():
+        return None
+    return Chart(
+        name="slide_map",
+        title="Where the car slides",
+        caption="Mean angle between the direction in which the rear axle moved and the heading of the car, in the "
+        "last third of the iterations; 0 is rolling without slip. Bright cells are bends taken at the limit of grip: "
+        "only another line can be faster there.",
+        rows=[[map_panel(view.course, [grid.cells(mean, "slide, degrees")])]],
+        table=grid.table({"slide_deg": mean}),
+    )
+
+
+def waypoint_map(view: LogView) -> Chart | None:
+    """Draw the course with its waypoints numbered."""
+    if view.course is None:
+        return None
+    course = view.course
+    x, y = course.waypoints.T
+    hover = [f"waypoint {k}: x {a:.2f}, y {b:.2f} m" for k, (a, b) in enumerate(zip(x, y, strict=True))]
+    tenth = np.arange(0, len(x) - course.closed, 10)
+    ahead = course.start_pose(np.array([0.5 * course.width_m / course.length_m]))
+    layers: list[Layer] = [
+        points(x, y, BLUE, size=3.0, hover=hover),
+        points(x[tenth], y[tenth], VERMILION, size=6.0),
+        note((float(ahead.x[0]), float(ahead.y[0])), "start"),
+    ]
+    return Chart(
+        name="waypoint_map",
+        title=f"{course.title}: {len(x)} waypoints, {course.length_m:.2f} m",
+        caption="The numbers are those of `closest_waypoints` in a reward function and of the waypoint axes of all "
+        "other figures; every tenth waypoint is marked. The car drives from low to high numbers and starts at "
+        "waypoint 0.",
+        rows=[[map_panel(course, layers)]],
+        table=pd.DataFrame({"waypoint": np.arange(len(x)), "x_m": x, "y_m": y}),
+    )
+
+
+def _laps_or_recent(view: LogView, *columns: str) -> tuple[pd.DataFrame, str]:
+    """Return the rows of complete laps, or without any those of the last third, and which they are."""
+    complete = view.episodes["complete"].to_numpy(bool)
+    if complete.any():
+        return view.of_episodes(complete, *columns), f"{complete.sum()} complete laps"
+    return view.recent(*columns), "last third of the iterations"
+
+
+def _grip(rows: pd.DataFrame) -> float:
+    """Return the lateral acceleration that the car reaches, m/s2: speed times yaw rate."""
+    lateral = (rows["track_speed_mps"] * np.radians(rows["yaw_rate_dps"])).abs().dropna()
+    return max(float(lateral.quantile(GRIP_SHARE)), LEAST_GRIP_MPS2) if len(lateral) else LEAST_GRIP_MPS2
+
+
+def _without_gaps(values: Values) -> Values:
+    """Return values with the gaps filled in, which are waypoints that one lap jumped over."""
+    known = np.flatnonzero(np.isfinite(values))
+    return np.interp(np.arange(len(values)), known, values[known]) if len(known) else values
+
+
+def _beside(waypoints: Values, offset_m: Values) -> Values:
+    """Return the points (n, 2) so many m to the left of the waypoints."""
+    ahead = np.gradient(waypoints, axis=0)
+    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])[: len(offset_m)]
+    return waypoints[: len(offset_m)] + offset_m[:, None] * left

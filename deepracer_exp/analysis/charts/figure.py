@@ -1,0 +1,267 @@
+"""Charts made of panels, and the traces and shapes in these, as Plotly objects in one style."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from numpy.typing import ArrayLike, NDArray
+
+from .style import DIVERGING, INK, PAPER, SCALE, VEIL, escaped
+
+_MANY = 500
+"""Points from which on they are drawn half transparent."""
+
+Layer: TypeAlias = Any
+"""Plotly's Scatter, Bar, Heatmap, layout.Shape or layout.Annotation."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """One pair of axes; the layers refer to them as `x` and `y`."""
+
+    layers: Sequence[Layer]
+    x_label: str = ""
+    y_label: str = ""
+    title: str = ""
+    map: bool = False
+    """Both axes in m on the same scale and without numbers; a map has both ranges."""
+    x_names: Sequence[str] = ()
+    """Shown at 0, 1, 2, ... instead of numbers; likewise `y_names`, from top to bottom."""
+    y_names: Sequence[str] = ()
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chart:
+    """One figure of a page."""
+
+    name: str
+    """Slug, as in links."""
+    title: str
+    caption: str
+    """Two or three sentences on what to see."""
+    rows: Sequence[Sequence[Panel]]
+    """Panels row by row."""
+    share_x: bool = False
+    """Whether the panels of a column zoom together along x."""
+    table: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """The data that is drawn."""
+
+
+def in_rows(panels: Sequence[Panel], columns: int = 2) -> list[Sequence[Panel]]:
+    """Return panels in rows of so many."""
+    return [panels[at : at + columns] for at in range(0, len(panels), columns)]
+
+
+def line(
+    x: ArrayLike,
+    y: ArrayLike,
+    color: str,
+    name: str | None = None,
+    *,
+    width: float = 1.6,
+    dashed: bool = False,
+) -> go.Scatter:
+    """Return a line through points; NaN interrupts it. Without a name it is not in the legend."""
+    x, y = _light(x), _light(y)
+    style = {"color": color, "width": 1.25 * width, "dash": "dash" if dashed else "solid"}
+    # One or two points would be hard to see as a line.
+    return go.Scatter(x=x, y=y, mode="lines" if len(x) > 2 else "lines+markers", line=style, **_named(name))
+
+
+def points(
+    x: ArrayLike,
+    y: ArrayLike,
+    color: str,
+    name: str | None = None,
+    *,
+    size: float = 5.0,
+    symbol: str = "circle",
+    hover: Sequence[str] | None = None,
+) -> go.Scatter:
+    """Return points of one colour; `size` is their diameter in points of 1/72 inch."""
+    x = _light(x)
+    marker = {
+        "size": 1.35 * size,
+        "symbol": symbol,
+        "color": color,
+        "opacity": 0.45 if len(x) > _MANY else 0.9,
+    }
+    return go.Scatter(x=x, y=_light(y), mode="markers", marker=marker, **_named(name), **_hover(hover))
+
+
+def colored_points(
+    x: ArrayLike,
+    y: ArrayLike,
+    values: ArrayLike,
+    scale: str,
+    *,
+    size: float = 5.0,
+    value_range: tuple[float, float] | None = None,
+    hover: Sequence[str] | None = None,
+) -> go.Scatter:
+    """Return points coloured by values.
+
+    Args:
+        x: places.
+        y: places.
+        values: one a point.
+        scale: what the values are, with unit: the label of the colour bar.
+        size: diameter in points of 1/72 inch.
+        value_range: values of the first and the last colour; None: the percentiles 1 and 99.
+        hover: text of each point.
+    """
+    low, high = value_range or _color_range(values)
+    marker = {"size": 1.35 * size, "color": _light(values), "cmin": low, "cmax": high, "colorscale": SCALE}
+    marker["colorbar"] = {"title": {"text": escaped(scale)}}
+    text = {"hovertemplate": f"%{{marker.color:.6~g}}<extra>{escaped(scale)}</extra>"}
+    if hover is not None:
+        text = _hover(hover)
+    return go.Scatter(x=_light(x), y=_light(y), mode="markers", marker=marker, showlegend=False, **text)
+
+
+def band(x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str | None = None) -> go.Scatter:
+    """Return the area between two lines; NaN interrupts it."""
+    x, low, high = (np.asarray(values, np.float64) for values in (x, low, high))
+    known = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    pieces = [slice(first, last) for first, last in zip(edges[::2], edges[1::2], strict=True)]
+    around_x, around_y = (
+        np.concatenate(
+            [part for piece in pieces for part in (there[piece], back[piece][::-1], [np.nan])] or [[]]
+        )
+        for there, back in ((x, x), (low, high))
+    )
+    red, green, blue = (int(color[at : at + 2], 16) for at in (1, 3, 5))
+    return go.Scatter(
+        x=_light(around_x[:-1]),
+        y=_light(around_y[:-1]),
+        mode="lines",
+        fill="toself",
+        line={"width": 0, "color": color},
+        fillcolor=f"rgba({red},{green},{blue},0.2)",
+        hoverinfo="skip",
+        **_named(name),
+    )
+
+
+def bars(
+    x: ArrayLike,
+    height: ArrayLike,
+    color: str,
+    name: str | None = None,
+    *,
+    base: ArrayLike | None = None,
+    width: float | None = None,
+    hover: Sequence[str] | None = None,
+) -> go.Bar:
+    """Return bars from `base` upwards, so wide in units of x; without a width they almost touch."""
+    x = _light(x)
+    apart = np.diff(np.unique(x))
+    width = width or (0.82 * float(apart.min()) if len(apart) else 0.82)
+    marker = {"color": color, "line": {"width": 0.5, "color": PAPER}}
+    base = None if base is None else _light(base)
+    return go.Bar(
+        x=x, y=_light(height), base=base, width=width, marker=marker, **_named(name), **_hover(hover)
+    )
+
+
+def heatmap(
+    x: ArrayLike,
+    y: ArrayLike,
+    values: ArrayLike,
+    scale: str,
+    *,
+    written: bool = False,
+    diverging: bool = False,
+    value_range: tuple[float, float] | None = None,
+) -> go.Heatmap:
+    """Return cells coloured by values; NaN leaves a cell empty.
+
+    Args:
+        x: centres (n,).
+        y: centres (m,).
+        values: (m, n).
+        scale: what the values are, with unit: the label of the colour bar.
+        written: whether each value is written into its cell.
+        diverging: whether zero is in the middle of the colours.
+        value_range: values of the first and the last colour; None: the percentiles 1 and 99.
+    """
+    low, high = value_range or _color_range(values)
+    if diverging:
+        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    return go.Heatmap(
+        x=_light(x),
+        y=_light(y),
+        z=_light(values),
+        zmin=low,
+        zmax=high,
+        colorscale=DIVERGING if diverging else SCALE,
+        colorbar={"title": {"text": escaped(scale)}},
+        hoverongaps=False,
+        hovertemplate=f"%{{z:.6~g}} {escaped(scale)}<extra></extra>",
+        texttemplate="%{z:.3~g}" if written else None,
+    )
+
+
+def mark(
+    at: float, label: str, color: str, *, horizontal: bool = False, in_legend: bool = False
+) -> go.layout.Shape:
+    """Return a dashed line across the panel, labelled at its end or in the legend; an empty label: the line alone."""
+    ends = {"xref": "x domain", "x0": 0, "x1": 1, "yref": "y", "y0": at, "y1": at}
+    if not horizontal:
+        ends = {"xref": "x", "x0": at, "x1": at, "yref": "y domain", "y0": 0, "y1": 1}
+    text = {"text": escaped(label), "textposition": "end", "font": {"size": 12, "color": INK}}
+    if not horizontal:
+        text |= {"xanchor": "right", "yanchor": "top"}  # below the upper end, to the right of the line
+    return go.layout.Shape(
+        type="line",
+        line={"color": color, "width": 1.8, "dash": "dash"},
+        name=escaped(label),
+        showlegend=in_legend,
+        label=None if in_legend or not label else text,
+        **ends,
+    )
+
+
+def note(place: Sequence[float], text: str) -> go.layout.Annotation:
+    """Return a text at a place (2,)."""
+    font = {"size": 12, "color": INK}
+    return go.layout.Annotation(
+        x=place[0],
+        y=place[1],
+        xref="x",
+        yref="y",
+        text=escaped(text),
+        showarrow=False,
+        bgcolor=VEIL,
+        font=font,
+    )
+
+
+def _light(values: ArrayLike) -> NDArray[np.float32]:
+    """Return values in half the size: nobody sees more digits."""
+    return np.asarray(values, dtype=np.float32)
+
+
+def _named(name: str | None) -> dict[str, Any]:
+    return {"name": escaped(name or ""), "showlegend": name is not None}
+
+
+def _hover(hover: Sequence[str] | None) -> dict[str, Any]:
+    if hover is None:
+        return {}
+    return {"hovertext": [text.replace("\n", "<br>") for text in hover], "hoverinfo": "text"}
+
+
+def _color_range(values: ArrayLike) -> tuple[float, float]:
+    known = np.asarray(values, np.float64)
+    known = known[np.isfinite(known)]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = (float(end) for end in np.percentile(known, [1, 99]))
+    return (low, high) if low < high else (low - 0.5, high + 0.5)

@@ -1,0 +1,163 @@
+"""Maps of a course: the road, cells over it, and numbers of waypoints beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
+from numpy.typing import ArrayLike, NDArray
+from shapely import get_coordinates, get_parts, get_rings
+
+from deepracer_exp.analysis.statistics import Values
+from deepracer_exp.tracks.track import Track
+
+from .figure import Layer, Panel, heatmap, line, note
+from .style import FAINT, ROAD_CENTER, ROAD_EDGE, ROAD_FILL
+
+LEAST_STEPS = 4
+"""Steps in a cell below which their mean is mostly chance."""
+_SIDES_M = (0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0)
+"""Sides of a cell; the smallest one that keeps the number of cells within bounds is used."""
+_RIM_M = 0.4
+"""How much of the ground around the road belongs to a grid."""
+_NUMBERED = 10
+"""Every so many waypoints have their number on a map."""
+_LABEL = 0.035
+"""Distance of a waypoint's number from the border, as a share of the longer side of the map."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Square cells over the bounding box of a road."""
+
+    low_x: float
+    low_y: float
+    side_m: float
+    columns: int
+    rows: int
+
+    @classmethod
+    def over(cls, course: Track, most: int = 20_000) -> "Grid":
+        """Lay cells over a course, at most `most`, as small as `_SIDES_M` allows."""
+        borders = np.concatenate([course.inner, course.outer])
+        low, high = borders.min(axis=0) - _RIM_M, borders.max(axis=0) + _RIM_M
+        for side_m in (*_SIDES_M, float((high - low).max() / most**0.5)):
+            columns, rows = (int(np.ceil(length / side_m)) for length in high - low)
+            if columns * rows <= most or side_m > _SIDES_M[-1]:
+                break
+        return cls(low_x=float(low[0]), low_y=float(low[1]), side_m=side_m, columns=columns, rows=rows)
+
+    def of(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.intp]:
+        """Return the cell of each point (n,): row by row from the lower left; -1 where it is outside."""
+        column = np.floor((np.asarray(x, np.float64) - self.low_x) / self.side_m)
+        row = np.floor((np.asarray(y, np.float64) - self.low_y) / self.side_m)
+        inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        return np.where(inside, row * self.columns + column, -1).astype(np.intp)
+
+    @property
+    def x(self) -> Values:
+        """Centres of the columns, m."""
+        return self.low_x + self.side_m * (np.arange(self.columns, dtype=np.float64) + 0.5)
+
+    @property
+    def y(self) -> Values:
+        """Centres of the rows, m."""
+        return self.low_y + self.side_m * (np.arange(self.rows, dtype=np.float64) + 0.5)
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return self.columns * self.rows
+
+    def cells(
+        self,
+        values: Values,
+        scale: str,
+        *,
+        diverging: bool = False,
+        value_range: tuple[float, float] | None = None,
+    ) -> go.Heatmap:
+        """Return values (count,) as the layer of a map; see `heatmap`."""
+        grid = values.reshape(self.rows, self.columns)
+        return heatmap(self.x, self.y, grid, scale, diverging=diverging, value_range=value_range)
+
+    def table(self, values: dict[str, Values]) -> pd.DataFrame:
+        """Return the cells of which anything is known: centre `x_m`, `y_m` and `values`, each (count,)."""
+        row, column = np.divmod(np.arange(self.count), self.columns)
+        table = pd.DataFrame({"x_m": self.x[column], "y_m": self.y[row], **values})
+        return table[table[list(values)].notna().any(axis=1)].reset_index(drop=True)
+
+
+def map_panel(course: Track, layers: Sequence[Layer], title: str = "", numbers: bool = True) -> Panel:
+    """Return a map: the road, `layers` on it, its borders above them, and numbers of waypoints beside it."""
+    polygons = [part for part in get_parts(course.road) if part.geom_type == "Polygon"]
+    rings = [get_coordinates(ring) for polygon in polygons for ring in get_rings(polygon)]
+    borders = [line(ring[:, 0], ring[:, 1], FAINT, width=0.8) for ring in rings]
+    ends = np.stack([course.inner[0], course.outer[0]])
+    start = line(ends[:, 0], ends[:, 1], FAINT, width=2.4)
+    notes = _waypoint_numbers(course) if numbers else []
+    shown = [*_road(rings, course.waypoints), *layers, *borders, start, *notes]
+    x_range, y_range = _extent(shown)
+    return Panel(layers=shown, title=title, map=True, x_range=x_range, y_range=y_range)
+
+
+def waypoint_panel(layers: Sequence[Layer], label: str, n: int, **more: Any) -> Panel:
+    """Return a panel along n waypoints."""
+    return Panel(layers=layers, x_label="waypoint", y_label=label, x_range=(-1.0, float(n)), **more)
+
+
+def _road(rings: Sequence[Values], center: Values) -> list[go.layout.Shape]:
+    """Return the road and its centre line as shapes, because traces stand above every heat map."""
+    common = {"type": "path", "xref": "x", "yref": "y", "layer": "below"}
+    outline = "".join(_path(ring) + "Z" for ring in rings)
+    edge, dashes = {"color": ROAD_EDGE, "width": 1.4}, {"color": ROAD_CENTER, "width": 1, "dash": "dash"}
+    return [
+        go.layout.Shape(path=outline, fillcolor=ROAD_FILL, fillrule="evenodd", line=edge, **common),
+        go.layout.Shape(path=_path(center), line=dashes, **common),
+    ]
+
+
+def _path(points: Values) -> str:
+    return "M" + "L".join(f"{x:.3f},{y:.3f}" for x, y in points)
+
+
+def _extent(layers: Sequence[Layer]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of x and y that show all lines, points and texts, with a small rim."""
+    places = [
+        np.column_stack([np.atleast_1d(layer.x), np.atleast_1d(layer.y)])
+        for layer in layers
+        if isinstance(layer, go.Scatter | go.layout.Annotation)
+    ]
+    corners = np.concatenate(places).astype(np.float64)
+    low, high = np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
+    rim = 0.03 * float((high - low).max())
+    (left, bottom), (right, top) = (low - rim).tolist(), (high + rim).tolist()
+    return (left, right), (bottom, top)
+
+
+def _waypoint_numbers(course: Track) -> list[go.layout.Annotation]:
+    """Return the numbers of waypoints, outside the road."""
+    last = len(course.waypoints) - course.closed
+    # Long courses have more waypoints than room for their numbers.
+    every = _NUMBERED * max(1, round(last / 160))
+    index = np.arange(0, last, every)
+    if len(index) > 1 and course.closed and last - index[-1] < every // 2:
+        index = index[:-1]
+    far_m = _LABEL * float(np.ptp(course.outer, axis=0).max())
+    notes: list[go.layout.Annotation] = []
+    for k in index.tolist():
+        # On the side with more room to other parts of the road.
+        sides = [_beyond(course, border, k, far_m) for border in (course.outer, course.inner)]
+        rooms = [float(np.linalg.norm(course.waypoints - side, axis=1).min()) for side in sides]
+        x, y = sides[int(rooms[1] > 1.05 * rooms[0])].tolist()
+        if all(np.hypot(other.x - x, other.y - y) > far_m for other in notes):
+            notes.append(note((x, y), str(k)))
+    return notes
+
+
+def _beyond(course: Track, border: Values, k: int, far_m: float) -> Values:
+    """Return the place beyond a border at waypoint k."""
+    aside = border[k] - course.waypoints[k]
+    return border[k] + far_m * aside / max(float(np.linalg.norm(aside)), 1e-9)

@@ -1,0 +1,358 @@
+"""The tables of a recording: columns derived from its steps, and one row an episode and an iteration."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from numba import njit
+from numpy.typing import NDArray
+
+from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.tracks.track import Track
+
+from .statistics import Values
+
+DERIVED_COLUMNS: Mapping[str, str] = {
+    "delta_time_s": "s since the row before; 0 in an episode's first row except on a flying lap; likewise the others",
+    "delta_dist_m": "m from the row before; 0 in an episode's first row",
+    "track_speed_mps": "m/s, distance over time since the row before; NaN in an episode's first row",
+    "progress_speed_pps": "per cent of the lap a second since the row before; NaN in an episode's first row",
+    "acceleration_mps2": "m/s2 of growing track speed, between the rows before and after; 0 where it falls",
+    "braking_mps2": "m/s2 of falling track speed, likewise, positive; 0 where it grows",
+    "yaw_rate_dps": "degrees a second since the row before, positive to the left",
+    "true_bearing_deg": "degrees, -180 to 180, direction in which the logged point moved since the row before",
+    "slide_deg": "degrees, direction in which the rear axle moved since the row before minus the mean of both yaws; "
+    "0 for tyres that do not slip, positive where the tail goes to the left",
+    "skew_deg": "degrees, direction of travel minus that of the centre line, positive to the left",
+    "lap_position": "0 to 1, normalised projection on the centre line in driving direction; without a course "
+    "computed from progress and the waypoint of the start",
+    "offset_m": "m from the centre line, positive to the left of the driving direction",
+    "discounted_future_reward": "reward units, of this row and all later ones of the episode, discounted",
+}
+"""Names of the columns that `add_derived` adds, with meaning and unit."""
+FRONT_TO_REAR_AXLE_M = 0.14 + 0.081663
+"""From the logged point back to the rear axle (deepracer-simapp: front point, rear wheels of the car's model)."""
+STILL_M = 0.01
+"""Below this a movement has no direction."""
+EPISODE_COLUMNS: Mapping[str, str] = {
+    "iteration": "policy update that learned from its last row",
+    "episode": "number within the stream",
+    "worker": "rollout worker of the service that drove it",
+    "steps": "control steps from the first to the last, both counted",
+    "start_at": "waypoint of its first row",
+    "progress": "per cent of the lap, the highest",
+    "time_s": "simulated seconds from the first row to the last; of a flying lap from the last row of the one before",
+    "dist_m": "m driven, between rows in a straight line",
+    "reward": "sum",
+    "speed_mps": "m/s commanded, mean of all rows",
+    "time_if_complete_s": "s, time_s * 100 / progress; NaN without progress",
+    "reward_if_complete": "reward * 100 / progress; NaN without progress",
+    "ended": "whether its last row is the end of the episode, not just of the recording",
+    "complete": "whether progress reached 100 per cent",
+    "lap_time_s": "time_s of a complete lap whose beginning is recorded; NaN of other episodes",
+    "status": "episode_status of its last row; lap_complete of a lap in a race; where the format has none, "
+    "lap_complete, off_track or empty",
+    "first_waypoint": "waypoint of its first row",
+    "last_waypoint": "waypoint of its last row",
+    "quarter": "1 to 4, of the training's episodes in their order",
+    "quintile": "1 to 5, likewise",
+}
+"""Names of the columns, with meaning and unit; the first ones equal deepracer-utils' `simulation_agg`."""
+FIRST_STEPS = 2
+"""Highest step number of an episode's first row: formats without prepare rows may begin with 2."""
+ITERATION_COLUMNS: Mapping[str, str] = {
+    "iteration": "policy update; the service counts from 0, our own runs from 1",
+    "episodes": "that ended in it",
+    "steps": "control steps driven for it",
+    "complete": "episodes that completed the lap",
+    "completion_mean": "per cent of the lap, mean over episodes",
+    "lap_share": "share of episodes that completed the lap, 0 to 1",
+    "reward_mean": "mean of the episodes' sums",
+    "lap_time_mean_s": "s, of complete laps; NaN without one; likewise the next two",
+    "lap_time_best_s": "s",
+    "lap_time_p25_s": "s, 25th percentile",
+    "speed_mps": "m/s commanded, mean over episodes",
+    "entropy": "nats, mean over the update's epochs; NaN where not logged; likewise the next ones",
+    "kl": "nats",
+    "policy_loss": "surrogate loss",
+    "value_loss": "mean squared or Huber, as the training has it",
+    "lr": "learning rate",
+    "checkpoint": "the service's name of the checkpoint that drove it; empty where the log does not name it",
+    "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
+    "held_out_completion": "per cent of the lap, the same on held-out conditions",
+}
+"""Names of the columns, with meaning and unit."""
+FINISHED = 0.75
+"""Share of the usual number of episodes below which the last iteration of a metrics file was not finished."""
+_REPORTED = ("entropy", "kl", "policy_loss", "value_loss", "lr")
+
+
+def add_derived(
+    steps: pd.DataFrame, first: NDArray[np.bool_], course: Track | None, discount: float
+) -> pd.DataFrame:
+    """Return the steps with `DERIVED_COLUMNS`.
+
+    Args:
+        steps: rows of each episode contiguous and in the order of time.
+        first: whether a row is its episode's first one.
+        course: what was driven on.
+        discount: factor on the reward of the next step.
+    """
+    x, y, yaw = (steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw"))
+    lap_position, offset_m, center_deg = _places(steps, first, course)
+    reward = steps["reward"].to_numpy(np.float64)
+    time_s, progress = (steps[name].to_numpy(np.float64) for name in ("tstamp", "progress"))
+    columns = _motion(first & ~flying_rows(steps, first), x, y, yaw, time_s)
+    passed_s = np.where(first | (columns["delta_time_s"] <= 0), np.nan, columns["delta_time_s"])
+    columns["progress_speed_pps"] = _since(progress, first) / passed_s
+    # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
+    center_turned = _wrapped(_since(center_deg, first))
+    columns["skew_deg"] = _wrapped(columns["true_bearing_deg"] - (center_deg - center_turned / 2))
+    columns["lap_position"], columns["offset_m"] = lap_position, offset_m
+    columns["discounted_future_reward"] = _discounted(np.nan_to_num(reward), first, discount)
+    return steps.assign(**{name: columns[name] for name in DERIVED_COLUMNS})
+
+
+def _motion(first: NDArray[np.bool_], x: Values, y: Values, yaw: Values, time_s: Values) -> dict[str, Values]:
+    delta_time_s = _since(time_s, first)
+    dx, dy = _since(x, first), _since(y, first)
+    delta_dist_m = np.hypot(dx, dy)
+    moving = ~first & (delta_dist_m >= STILL_M)
+    passed_s = np.where(delta_time_s > 0, delta_time_s, np.nan)
+    track_speed_mps = delta_dist_m / passed_s
+    change = _change(track_speed_mps, time_s, first)
+    turned = _wrapped(_since(yaw, first))
+    bearing = np.where(moving, np.degrees(np.arctan2(dy, dx)), np.nan)
+    heading = np.radians(yaw)
+    rear_x, rear_y = (
+        place - FRONT_TO_REAR_AXLE_M * part(heading) for place, part in ((x, np.cos), (y, np.sin))
+    )
+    rear_dx, rear_dy = _since(rear_x, first), _since(rear_y, first)
+    rear_deg = np.degrees(np.arctan2(rear_dy, rear_dx))
+    slide = np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), rear_deg - (yaw - turned / 2), np.nan)
+    return {
+        "delta_time_s": delta_time_s,
+        "delta_dist_m": delta_dist_m,
+        "track_speed_mps": track_speed_mps,
+        "acceleration_mps2": np.maximum(change, 0.0),
+        "braking_mps2": np.maximum(-change, 0.0),
+        "yaw_rate_dps": turned / passed_s,
+        "true_bearing_deg": bearing,
+        "slide_deg": _wrapped(slide),
+    }
+
+
+def _places(
+    steps: pd.DataFrame, first: NDArray[np.bool_], course: Track | None
+) -> tuple[Values, Values, Values]:
+    """Return lap position, offset and the centre line's direction in degrees."""
+    if course is not None:
+        found = course.project(steps[["X", "Y"]].to_numpy(np.float64))
+        return found.ndist, found.offset_m, np.degrees(found.heading_rad)
+    unknown = np.full(len(steps), np.nan)
+    waypoint = steps["closest_waypoint"].to_numpy(np.float64)
+    if not len(waypoint):
+        return unknown, unknown, unknown
+    start = waypoint[first][np.cumsum(first) - 1] / (waypoint.max() + 1.0)
+    progress = steps["progress"].to_numpy(np.float64)
+    started = progress[first][np.cumsum(first) - 1]
+    return (start + (progress - started) / 100.0) % 1.0, unknown, unknown
+
+
+def _since(values: Values, first: NDArray[np.bool_]) -> Values:
+    """Return the differences to the rows before, 0 in first rows."""
+    since = np.diff(values, prepend=values[:1])
+    since[first] = 0.0
+    return since
+
+
+def _change(speed_mps: Values, time_s: Values, first: NDArray[np.bool_]) -> Values:
+    """Return the speed's change a second between the rows before and after; 0 where one of them is missing.
+
+    A speed is that of the time since the row before: its moment is the middle of it. Control steps last 50 to 80 ms
+    in the service's traces, so that differences of neighbours would be mostly noise.
+    """
+    change = np.zeros(len(speed_mps))
+    if len(change) > 3:
+        passed_s = (time_s[3:] + time_s[2:-1] - time_s[1:-2] - time_s[:-3]) / 2.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change[2:-1] = (speed_mps[3:] - speed_mps[1:-2]) / passed_s
+        change[2:-1][first[3:] | first[2:-1] | first[1:-2]] = 0.0
+    return np.nan_to_num(change, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _wrapped(angle_deg: Values) -> Values:
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+@njit(cache=True, nogil=True)
+def _discounted(reward, first, discount):  # type: ignore[no-untyped-def]
+    future = np.empty(len(reward))
+    total = 0.0
+    for i in range(len(reward) - 1, -1, -1):
+        total = reward[i] + discount * total
+        future[i] = total
+        if first[i]:
+            total = 0.0
+    return future
+
+
+def first_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return which rows are the first of their episode; the rows of an episode must be contiguous."""
+    stream = steps["stream"].astype("category").cat.codes.to_numpy()
+    episode = steps["episode"].to_numpy()
+    first = np.ones(len(steps), bool)
+    first[1:] = (episode[1:] != episode[:-1]) | (stream[1:] != stream[:-1])
+    return first
+
+
+def flying_rows(steps: pd.DataFrame, first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which first rows continue the row before: laps of a race are driven without a stop."""
+    number = steps["steps"].to_numpy()
+    stream = steps["stream"].astype("category").cat.codes.to_numpy()
+    flying = first & (number > FIRST_STEPS)
+    flying[:1] = False
+    flying[1:] &= (number[1:] == number[:-1] + 1) & (stream[1:] == stream[:-1])
+    return flying
+
+
+def whole_from_start(steps: pd.DataFrame, first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return for each episode whether its beginning is recorded."""
+    begin = np.flatnonzero(first)
+    return (steps["steps"].to_numpy()[begin] <= FIRST_STEPS) | flying_rows(steps, first)[begin]
+
+
+def episode_table(steps: pd.DataFrame, first: NDArray[np.bool_]) -> pd.DataFrame:
+    """Summarise each episode in one row, `EPISODE_COLUMNS`, in the order of the steps.
+
+    Steps, start, progress, time, distance, speed, reward and completeness are defined as in deepracer-utils 1.5.6
+    (logs/log_utils.py, `simulation_agg`).
+
+    Args:
+        steps: rows of each episode contiguous and in the order of time, with the derived columns.
+        first: whether a row is its episode's first one.
+    """
+    begin = np.flatnonzero(first)
+    end = np.append(begin[1:], len(steps))[: len(begin)] - 1
+    rows = end - begin + 1
+
+    def values(name: str) -> NDArray[np.float64]:
+        return steps[name].to_numpy(np.float64)
+
+    def total(name: str) -> NDArray[np.float64]:
+        return np.add.reduceat(values(name), begin)
+
+    number, waypoint = steps["steps"].to_numpy(), steps["closest_waypoint"].to_numpy()
+    progress, time_s, reward = (
+        np.maximum.reduceat(values("progress"), begin),
+        total("delta_time_s"),
+        total("reward"),
+    )
+    complete = progress >= 100.0
+    per_lap = np.divide(100.0, progress, out=np.full(len(begin), np.nan), where=progress > 0)
+    order = np.arange(len(begin))
+    return pd.DataFrame(
+        {
+            "iteration": steps["iteration"].to_numpy()[end],
+            "episode": steps["episode"].to_numpy()[begin],
+            "worker": steps["worker"].to_numpy()[begin],
+            "steps": np.maximum.reduceat(number, begin) - np.minimum.reduceat(number, begin) + 1,
+            "start_at": waypoint[begin],
+            "progress": progress,
+            "time_s": time_s,
+            "dist_m": total("delta_dist_m"),
+            "reward": reward,
+            "speed_mps": total("throttle") / rows,
+            "time_if_complete_s": time_s * per_lap,
+            "reward_if_complete": reward * per_lap,
+            "ended": complete | steps["done"].to_numpy(bool)[end],
+            "complete": complete,
+            "lap_time_s": np.where(complete & whole_from_start(steps, first) & (time_s > 0), time_s, np.nan),
+            "status": _status(steps, end, complete),
+            "first_waypoint": waypoint[begin],
+            "last_waypoint": waypoint[end],
+            "quarter": 1 + 4 * order // len(order),
+            "quintile": 1 + 5 * order // len(order),
+        }
+    )
+
+
+def _status(steps: pd.DataFrame, end: NDArray[np.intp], complete: NDArray[np.bool_]) -> NDArray[np.object_]:
+    last = steps.iloc[end]
+    status = last["episode_status"].astype(str).to_numpy(dtype=object)
+    unknown = status == ""
+    off = unknown & last["done"].to_numpy(bool) & ~last["all_wheels_on_track"].to_numpy(bool)
+    status[complete & (unknown | (status == "in_progress"))] = "lap_complete"  # in races the next lap follows
+    status[off & ~complete] = "off_track"
+    return status
+
+
+def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame) -> pd.DataFrame:
+    """Summarise each iteration in one row, `ITERATION_COLUMNS`, also those without an episode.
+
+    Episodes whose end is not recorded are left out: those still driving when a run ended would count as bad ones.
+    """
+    groups = pd.concat([episodes[episodes["ended"]], _from_metrics_only(recording, episodes)]).groupby(
+        "iteration"
+    )
+    laps = groups["lap_time_s"]
+    table = pd.DataFrame(
+        {
+            "episodes": groups.size(),
+            "complete": groups["complete"].sum(),
+            "completion_mean": groups["progress"].mean(),
+            "lap_share": groups["complete"].mean(),
+            "reward_mean": groups["reward"].mean(),
+            "lap_time_mean_s": laps.mean(),
+            "lap_time_best_s": laps.min(),
+            "lap_time_p25_s": laps.quantile(0.25),
+            "speed_mps": groups["speed_mps"].mean(),
+        }
+    )
+    driven = np.bincount(steps["iteration"].to_numpy()) if len(steps) else np.zeros(0, np.int64)
+    updates = recording.updates.groupby("iteration")[list(_REPORTED)].mean()
+    known = pd.Index(np.flatnonzero(driven)).union(table.index).union(updates.index)
+    table = table.reindex(known).join(updates).join(_evaluated(recording))
+    table["steps"] = [int(driven[k]) if k < len(driven) else 0 for k in known]
+    counts = table[["episodes", "complete"]].fillna(0).astype(np.int64)
+    table = table.assign(episodes=counts["episodes"], complete=counts["complete"])
+    table.index.name = "iteration"
+    table["checkpoint"] = [recording.checkpoints.get(k, "") for k in known]
+    return table.reset_index()[list(ITERATION_COLUMNS)].astype({"iteration": np.int64})
+
+
+def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
+    """Return the training episodes that are in metrics files only, without a trace."""
+    rows = recording.metrics
+    rows = rows[(rows["phase"] == "training") & (rows["stream"] == "training")]
+    counts = rows.groupby("iteration").size()
+    if len(counts) > 1 and counts.iloc[-1] < FINISHED * counts.median():
+        rows = rows[rows["iteration"] != counts.index[-1]]  # the job ended within it
+    rows = rows[~rows["episode"].isin(episodes["episode"])]
+    complete = rows["completion"] >= 100.0
+    return pd.DataFrame(
+        {
+            "iteration": rows["iteration"],
+            "episode": rows["episode"],
+            "progress": rows["completion"],
+            "reward": rows["reward"],
+            "complete": complete,
+            "lap_time_s": rows["time_s"].where(complete),
+            "speed_mps": np.nan,
+        }
+    ).astype({"complete": bool})
+
+
+def _evaluated(recording: Recording) -> pd.DataFrame:
+    """Return the mean completion of each iteration's evaluation: of our own runs, or of the service's metrics."""
+    if len(recording.evaluations):
+        own = recording.evaluations.groupby("iteration")[["completion", "held_out_completion"]].last()
+        return own.rename(columns={"completion": "eval_completion"})
+    rows = recording.metrics
+    rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
+    return (
+        rows.groupby("iteration")["completion"]
+        .mean()
+        .to_frame("eval_completion")
+        .assign(held_out_completion=np.nan)
+    )

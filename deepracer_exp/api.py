@@ -1,0 +1,169 @@
+"""What the commands do, for use from Python: the names that `deepracer_exp` exports."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich.console import Console
+from tensordict.nn import TensorDictModuleBase
+
+from deepracer_exp.config.compose import Composition, compose_evaluation, compose_experiment
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.overrides import override_line
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.evaluation.checkpoint import read_checkpoint
+from deepracer_exp.evaluation.evaluate import evaluate as evaluate_run
+from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
+from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.training.run import train as train_run
+from deepracer_exp.training.trainer import Callback, Trainer, TrainResult
+
+__all__ = [
+    "Callback",
+    "ComposedExperiment",
+    "RunTables",
+    "Trainer",
+    "compose",
+    "evaluate",
+    "load_policy",
+    "make_env",
+    "read_run",
+    "train",
+]
+
+
+@dataclass(frozen=True)
+class ComposedExperiment:
+    """An experiment, validated, and where its values come from."""
+
+    config: Experiment
+    """Its values, as attributes: `config.algorithm.lr`."""
+    composition: Composition
+
+    def yaml(self) -> str:
+        """Return all values as YAML, as `deepracer-exp train --cfg` prints them."""
+        return self.composition.yaml()
+
+
+def compose(*overrides: str) -> ComposedExperiment:
+    """Compose an experiment, as `deepracer-exp train` does.
+
+    Args:
+        overrides: as on the command line, e.g. ``track=Oval_track``, ``algorithm.lr=3e-4``.
+
+    Raises:
+        BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
+    """
+    return ComposedExperiment(*compose_experiment(overrides))
+
+
+def make_env(experiment: ComposedExperiment, n_cars: int = 1, threads: int = 1) -> RaceEnv:
+    """Build the TorchRL environment of an experiment, batch size [n_cars].
+
+    Args:
+        experiment: chooses track, car, action space, observation, randomization and reward.
+        n_cars: cars stepped together.
+        threads: of the physics; 0: one a core.
+
+    Raises:
+        BadInput: a file of the experiment is missing or malformed, or the reward function cannot be used.
+    """
+    return RaceEnv(Race(build_setup(experiment.config), n_cars, threads))
+
+
+def train(
+    experiment: ComposedExperiment, callbacks: Sequence[Callback] = (), console: Console | None = None
+) -> TrainResult:
+    """Train an experiment; the run folder is `result.folder`.
+
+    Workers are started as new processes, so a script calls this below ``if __name__ == "__main__":`` unless the
+    experiment has ``collector=in_process``.
+
+    Args:
+        experiment: to train.
+        callbacks: called beside the standard ones.
+        console: shows the progress; None: nothing is shown.
+
+    Raises:
+        BadInput: before anything was started; no folder is left.
+    """
+    return train_run(experiment.config, experiment.composition, console, callbacks=callbacks)
+
+
+def evaluate(run: str | Path, *overrides: str) -> Evaluation:
+    """Race a stored policy, as `deepracer-exp evaluate` does; the results are also written into the run's folder.
+
+    Args:
+        run: its folder, its name or the beginning of it, or another name the command takes.
+        overrides: as on the command line, e.g. ``checkpoint=last``, ``evaluation=summit``, ``runs_dir=DIR``.
+
+    Raises:
+        BadInput: the run, the checkpoint, a track or a condition cannot be used.
+        RunFailed: a car's state became NaN, or a file cannot be written.
+    """
+    config, _ = compose_evaluation([*overrides, override_line("run", str(run))])
+    quiet = Console(quiet=True)
+    return evaluate_run(config, None, quiet, quiet)
+
+
+def load_policy(
+    run: str | Path, checkpoint: str | None = None, runs_dir: str | Path = "runs"
+) -> TensorDictModuleBase:
+    """Return a stored policy: a TorchRL module that reads `observation` and writes `action`.
+
+    It samples actions; within `torchrl.envs.utils.set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the
+    most likely one, as evaluations do.
+
+    Args:
+        run: as for `evaluate`.
+        checkpoint: `best`, `last` or the number of an iteration; None: the best, or that of the alias.
+        runs_dir: where runs are looked for.
+
+    Raises:
+        BadInput: there is no such run or checkpoint, or it is corrupt.
+    """
+    stored = resolve(str(run), Path(runs_dir), None)
+    policy = read_checkpoint(stored.experiment, stored.checkpoints, stored.choose_checkpoint(checkpoint))
+    return policy.networks.policy
+
+
+@dataclass(frozen=True)
+class RunTables:
+    """What a run has recorded."""
+
+    path: Path
+    config: dict[str, Any]
+    """Contents of config.yaml."""
+    summary: dict[str, Any]
+    """Contents of summary.json; empty until the run has ended."""
+
+    @cached_property
+    def metrics(self) -> pd.DataFrame:
+        """One row an iteration, the columns of metrics.jsonl."""
+        return pd.DataFrame(read_metrics(self.path / METRICS))
+
+    @cached_property
+    def steps(self) -> pd.DataFrame:
+        """One row a control step of the trace, columns `deepracer.recording.STEP_COLUMNS`."""
+        return read_own_recording(self.path).steps
+
+
+def read_run(run: str | Path, runs_dir: str | Path = "runs") -> RunTables:
+    """Read the tables of a run.
+
+    Args:
+        run: as for `evaluate`.
+        runs_dir: where runs are looked for.
+
+    Raises:
+        BadInput: there is no such run, or a file of it cannot be read.
+    """
+    path = resolve(str(run), Path(runs_dir), None).path
+    return RunTables(path, read_config(path), read_object(path / SUMMARY))

@@ -1,0 +1,121 @@
+"""What every collector of driving is."""
+
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+from tensordict import TensorDictBase
+
+from deepracer_exp.config.learning import AlgorithmConfig
+from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.errors import BadInput
+
+
+class Collector(ABC):
+    """An endless source of batches; a context manager that leaves no process behind.
+
+    Each batch is a TensorDict of batch size [cars of all processes, T], for asynchronous collection
+    [cars of one process, T], keys as in `RaceEnv` plus the policy's.
+    """
+
+    time_dim: int = 1
+    """Along which batches are joined: 1, or 0 where they come from different cars."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        while True:
+            yield self.next_batch()
+
+    def collect(self, algorithm: AlgorithmConfig) -> tuple[TensorDictBase, float]:
+        """Return what one update learns from, and the seconds it took to collect.
+
+        Args:
+            algorithm: says how many frames or episodes an iteration has.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+        chunks: list[TensorDictBase] = []
+        frames = episodes = 0
+        began = time.monotonic()
+        while True:
+            chunk = self.next_batch()
+            frames += chunk.numel()
+            episodes += int(chunk["next", "done"].sum())
+            wanted = algorithm.episodes_per_iteration
+            enough = frames >= (algorithm.frames_per_iteration or 0) if wanted is None else episodes >= wanted
+            if not enough:
+                chunks.append(chunk.clone())
+                continue
+            whole = torch.cat([*chunks, chunk], dim=self.time_dim) if chunks else chunk
+            return whole, time.monotonic() - began
+
+    @abstractmethod
+    def next_batch(self) -> TensorDictBase:
+        """Return the next batch; it is valid until the one after it.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+
+    @abstractmethod
+    def publish_policy(self) -> None:
+        """Let the next batches be driven with the policy's weights as they are now.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next batch depends on but the policy: arrays and plain values.
+
+        It is that of the last batch's end, to be asked for before the next batch is. Asynchronous workers are in the
+        middle of other batches by then: there is no such state of them, and what is returned is empty.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End every worker."""
+
+
+def cores() -> int:
+    """Return the number of cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def worker_count(config: CollectorConfig) -> int:
+    """Return the number of worker processes, 0 for collection in this process."""
+    return 0 if config.mode == "in_process" else config.processes or cores()
+
+
+def worker_name(worker: int) -> str:
+    """Return the key of a worker's part in a state: state dicts have names for keys."""
+    return f"worker-{worker}"
+
+
+def refuse_other_cars(state: Mapping[str, Any], names: set[str]) -> None:
+    """Refuse the state of other workers than those of these names; an empty one fits all.
+
+    Raises:
+        BadInput: it is of others.
+    """
+    if state and set(state) != names:
+        raise BadInput(
+            f"the checkpoint does not fit: it has the cars of {len(state)} processes that wait for one another; "
+            f"accepted by this collector: {len(names)}"
+        )

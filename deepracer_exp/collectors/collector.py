@@ -1,0 +1,346 @@
+"""Batches of driving, from cars in this process, in several, or on a Ray cluster."""
+
+import contextlib
+import functools
+import multiprocessing
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector as TorchRLCollector
+from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
+
+from deepracer_exp.config.learning import AlgorithmConfig
+from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.runs.crash_dump import read_crash_dump
+from deepracer_exp.runs.files import HEARTBEAT
+
+from .base import Collector, refuse_other_cars, worker_count, worker_name
+from .watchdog import Watchdog
+from .worker import EnvFactory
+
+_LOOK_EVERY_S = 0.2
+_CHUNK_STEPS = 32  # steps a car drives between two looks at how many episodes have ended
+
+_T = TypeVar("_T")
+
+
+class LocalCollector(Collector):
+    """Collects in this process, or in several of this machine."""
+
+    def __init__(
+        self,
+        config: CollectorConfig,
+        setup: RaceSetup,
+        policy: torch.nn.Module,
+        frames_per_batch: int,
+        run_dir: Path,
+        state: Mapping[str, Any] | None = None,
+    ):
+        """Start the cars; arguments and errors as of `open_collector`.
+
+        `frames_per_batch` is in control steps over all cars, and is rounded up to whole steps of all cars.
+        """
+        self._workers = worker_count(config)
+        self._mode = config.mode
+        self.time_dim = 0 if config.mode == "async" else 1
+        self._hang_timeout_s = config.hang_timeout_s
+        self._run_dir = run_dir
+        self._batches = 0
+        self._begun_from = state or {}
+        names = {worker_name(worker) for worker in range(max(1, self._workers))}
+        refuse_other_cars(self._begun_from, set() if config.mode == "async" else names)
+        self._watchdog: Watchdog | None = None
+        parts = self._workers if config.mode == "sync" else 1
+        steps_per_batch = -(-frames_per_batch // (parts * config.cars))
+        factory = functools.partial(EnvFactory, setup=setup, n_cars=config.cars, run_dir=run_dir)
+        options: dict[str, Any] = {
+            "frames_per_batch": steps_per_batch * parts * config.cars,
+            "total_frames": -1,
+            "use_buffers": True,
+            "trust_policy": True,
+        }
+        if self._workers == 0:
+            self._random = torch.get_rng_state()
+            with self._own_stream():
+                env = factory(worker=0, threads=config.threads, heartbeat=None)
+                self._collector: Any = TorchRLCollector(
+                    env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
+                )
+        else:
+            heartbeat = run_dir / HEARTBEAT
+            self._watchdog = Watchdog(
+                heartbeat, self._workers, config.hang_timeout_s, lockstep=config.mode == "sync"
+            )
+            envs = [
+                factory(worker=worker, threads=config.threads or 1, heartbeat=heartbeat)
+                for worker in range(self._workers)
+            ]
+            self._collector = self._start(envs, policy, options)
+            self._watchdog.workers_started(self._collector.procs)
+            if config.mode == "sync":
+                _watch_deliveries(self._collector.queue_out, self._watchdog)
+        self._source = iter(self._collector)
+        if self._begun_from:
+            with contextlib.ExitStack() as undo:
+                undo.callback(self.close)
+                self._restore_cars()
+                undo.pop_all()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None and self._watchdog is not None:
+            # TorchRL asks its workers to end and waits up to 10 s for those that are driving.
+            self._watchdog.close()
+            self._end_all()
+        self.close()
+
+    def publish_policy(self) -> None:
+        """Pass the policy's weights to the workers."""
+        if self._watchdog is None:
+            self._collector.update_policy_weights_()
+            return
+        self._ask(self._publish, lambda: f"collector worker {self._receiver} took no new weights")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the cars after the last batch."""
+        if self._mode == "async":
+            return {}
+        if not self._batches:
+            return dict(self._begun_from)
+        if self._watchdog is None:
+            with self._own_stream():
+                return {worker_name(0): self._collector.env.take_state()}
+        states = self._ask(
+            lambda: self._collector.map_fn("env.take_state"),
+            lambda: "a collector worker did not report the state of its cars",
+        )
+        return {worker_name(worker): state for worker, state in enumerate(states)}
+
+    def close(self) -> None:
+        """End every worker."""
+        if self._watchdog is not None:
+            self._watchdog.close()
+        if not self._collector.closed:
+            threads = torch.get_num_threads()
+            self._collector.shutdown()
+            # TorchRL gives this process the workers' threads, and with other threads sums have other last digits.
+            torch.set_num_threads(threads)
+        if self._workers:
+            self._close_weight_queues()
+
+    def _close_weight_queues(self) -> None:
+        """Close what weights travelled through.
+
+        TorchRL does so when its collector is garbage: after a failure that is never, and the interpreter's end would
+        wait without end for a queue that nobody empties.
+        """
+        for scheme in (self._collector._weight_sync_schemes or {}).values():
+            for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
+                for queue in (getattr(scheme, name, None) or {}).values():
+                    queue.cancel_join_thread()
+            scheme.shutdown()
+
+    def _start(self, envs: list[EnvFactory], policy: torch.nn.Module, options: dict[str, Any]) -> Any:
+        if self._mode == "sync":
+            kind, more = MultiSyncCollector, {"cat_results": "stack"}
+        else:
+            kind, more = MultiAsyncCollector, {}
+        others = len(multiprocessing.active_children())
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._give_up_starting)
+            try:
+                collector = kind(envs, policy, num_threads=torch.get_num_threads(), **more, **options)
+            except (RuntimeError, ValueError, OSError) as error:
+                verdicts = self._watchdog.verdict.items() if self._watchdog is not None else ()
+                hung = next((f"worker {worker} {verdict}" for worker, verdict in verdicts), None)
+                reason = hung or str(error).split(". ")[0].splitlines()[0]
+                if not hung and isinstance(error, BrokenPipeError):
+                    reason = f"worker {len(multiprocessing.active_children()) - others} died before it began"
+                raise RunFailed(f"collector workers did not start: {reason}") from error
+            undo.pop_all()
+        return collector
+
+    def _give_up_starting(self) -> None:
+        assert self._watchdog is not None
+        self._watchdog.close()
+        for process in multiprocessing.active_children():
+            process.kill()
+            process.join()
+
+    def _restore_cars(self) -> None:
+        """Put the cars where those of the given state were.
+
+        TorchRL tries the policy once while it starts, which draws a number: the state is put back after that.
+        """
+        states = [self._begun_from[worker_name(worker)] for worker in range(max(1, self._workers))]
+        if self._watchdog is None:
+            with self._own_stream():
+                self._collector.env.put_state(states[0])
+                self._collector.reset()
+            return
+
+        def put() -> None:
+            self._collector.map_fn("env.put_state", [(state,) for state in states])
+            self._collector.map_fn("reset")
+
+        self._ask(put, lambda: "a collector worker did not put its cars where they were")
+
+    @contextlib.contextmanager
+    def _own_stream(self) -> Iterator[None]:
+        """Sample from the stream of the cars in this process: what else draws here must not shift it."""
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._random)
+            yield
+            self._random = torch.get_rng_state()
+
+    def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
+        """Return the workers' answer; TorchRL waits for it without end, even if the worker is dead.
+
+        Args:
+            question: asks them.
+            silence: says who did not answer.
+        """
+        answer: Future[_T] = Future()
+
+        def ask() -> None:
+            try:
+                answer.set_result(question())
+            except BaseException as error:  # noqa: BLE001 - handed on to the thread that waits
+                answer.set_exception(error)
+
+        threading.Thread(target=ask, name="ask the workers", daemon=True).start()
+        for _ in range(round(self._hang_timeout_s / _LOOK_EVERY_S)):
+            try:
+                return answer.result(_LOOK_EVERY_S)
+            except TimeoutError:
+                loss = self._loss()
+            except (RuntimeError, OSError, EOFError):  # what TorchRL and a broken pipe raise
+                loss = self._loss(patience_s=2.0)
+                if loss is None:
+                    raise
+            if loss is not None:
+                self._end_all()
+                raise loss
+        self._end_all()
+        raise RunFailed(f"{silence()} for {self._hang_timeout_s:.0f} s and was ended")
+
+    def _publish(self) -> None:
+        for worker in range(self._workers):
+            self._receiver = worker
+            self._collector.update_policy_weights_(worker_ids=worker)
+
+    def next_batch(self) -> TensorDictBase:
+        """Return the next batch."""
+        self._batches += 1
+        if self._watchdog is None:
+            with self._own_stream():
+                return next(self._source)
+        self._watchdog.expect()
+        try:
+            batch = next(self._source)
+        except (RuntimeError, ValueError, OSError, EOFError) as error:  # what TorchRL and a broken pipe raise
+            loss = self._loss(patience_s=2.0)
+            if loss is None:
+                raise
+            self._end_all()
+            raise loss from error
+        finally:
+            self._watchdog.rest()
+        return batch.flatten(0, 1) if self._mode == "sync" else batch
+
+    def _loss(self, patience_s: float = 0.0) -> RunFailed | None:
+        """Return what became of the first lost worker, None if all are there after `patience_s`."""
+        give_up_at = time.monotonic() + patience_s
+        while True:
+            loss = self._loss_now()
+            if loss is not None or time.monotonic() >= give_up_at:
+                return loss
+            time.sleep(_LOOK_EVERY_S)
+
+    def _loss_now(self) -> RunFailed | None:
+        assert self._watchdog is not None
+        for worker in range(len(self._collector.procs)):
+            fault = read_crash_dump(self._run_dir, worker)
+            if fault is not None:
+                return RunFailed(fault)
+            if worker in self._watchdog.verdict:
+                return RunFailed(f"collector worker {worker} {self._watchdog.verdict[worker]}")
+        dead = self._watchdog.first_dead
+        if dead is None:
+            return None
+        process = self._collector.procs[dead]
+        process.join()
+        code = process.exitcode
+        how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+        return RunFailed(f"collector worker {dead} (process {process.pid}) died {how}")
+
+    def _end_all(self) -> None:
+        for process in self._collector.procs:
+            with contextlib.suppress(ValueError):  # a handle TorchRL has closed: that worker is gone
+                process.kill()
+                process.join()
+
+
+def _watch_deliveries(queue: Any, watchdog: Watchdog) -> None:
+    """Let the watchdog know of each worker's part that is taken from the queue of TorchRL's synchronous collector."""
+    get = queue.get
+
+    def get_and_note(*args: Any, **options: Any) -> Any:
+        message = get(*args, **options)
+        # A worker's number; the first time its buffer and its number.
+        part, _ = message
+        watchdog.delivered(part if isinstance(part, int) else part[1])
+        return message
+
+    queue.get = get_and_note
+
+
+def open_collector(
+    config: CollectorConfig,
+    algorithm: AlgorithmConfig,
+    setup: RaceSetup,
+    policy: torch.nn.Module,
+    run_dir: Path,
+    state: Mapping[str, Any] | None = None,
+) -> Collector:
+    """Start the cars where the configuration wants them.
+
+    Args:
+        config: the collector's group.
+        algorithm: says how many frames or episodes an iteration has.
+        setup: what the cars need.
+        policy: reads `observation`, writes `action` and its log-probability.
+        run_dir: where workers leave crash dumps and prints.
+        state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
+            is what that one would have returned next, bit for bit. None or empty: episodes begin.
+
+    Raises:
+        BadInput: the state is of other cars, or of another number of processes.
+        RunFailed: a worker did not start.
+    """
+    frames = frames_per_batch(config, algorithm)
+    if config.mode == "ray":
+        from .ray_collector import RayCollector
+
+        return RayCollector(config, setup, policy, frames, run_dir, state)
+    return LocalCollector(config, setup, policy, frames, run_dir, state)
+
+
+def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:
+    """Return the control steps, over all cars, to ask of a collector at a time."""
+    workers = max(1, worker_count(config))
+    frames = algorithm.frames_per_iteration
+    if frames is None:
+        return workers * config.cars * _CHUNK_STEPS
+    return -(-frames // workers) if config.mode == "async" else frames

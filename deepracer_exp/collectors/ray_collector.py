@@ -1,0 +1,201 @@
+"""Batches of driving, from cars on a Ray cluster."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.runs.crash_dump import write_crash_dump
+from deepracer_exp.runs.files import REWARD_PRINTS
+
+from . import ray_cluster
+from .base import Collector, refuse_other_cars, worker_name
+from .ray_beats import Beats
+from .ray_cars import Cars, FarEnvFactory
+
+_LOOK_EVERY_S = 0.2
+_START_TIMEOUT_S = 120.0
+_LONGEST_PRINTS = 10_000_000
+"""Bytes of the file that takes them, as on one machine."""
+
+_log = logging.getLogger("deepracer_exp")
+
+
+class RayCollector(Collector):
+    """An endless source of batches, as `LocalCollector` with `sync`: the same batches in the same order, bit for bit.
+
+    TorchRL's RayCollector is not used: it waits without end for a worker that hangs, does not say which one is
+    lost, joins the training process with all workers in a process group of torch.distributed that does not outlive
+    the loss of one, and brings home neither prints nor the cars' state after a fault.
+    """
+
+    def __init__(
+        self,
+        config: CollectorConfig,
+        setup: RaceSetup,
+        policy: torch.nn.Module,
+        frames_per_batch: int,
+        run_dir: Path,
+        state: Mapping[str, Any] | None = None,
+    ):
+        """Start the cars; arguments and errors as of `open_collector`."""
+        import ray
+
+        assert config.processes is not None
+        self._ray, self._policy, self._run_dir = ray, policy, run_dir
+        self._hang_timeout_s = config.hang_timeout_s
+        self._begun_from = state or {}
+        self._began = False
+        refuse_other_cars(self._begun_from, {worker_name(worker) for worker in range(config.processes)})
+        ray_cluster.check_collector(config)
+        self._beats = ray.remote(num_cpus=0)(Beats).remote()
+        self._asked, self._told = self._beats.steps.remote(), dict[int, int]()
+        kind = ray.remote(num_cpus=config.threads or 1, scheduling_strategy="SPREAD", max_restarts=0)(Cars)
+        self._cars = [kind.remote() for _ in range(config.processes)]
+        self._where = ["Ray cluster"] * config.processes
+        try:
+            self._start(config, setup, frames_per_batch)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, config: CollectorConfig, setup: RaceSetup, frames_per_batch: int) -> None:
+        frames = -(-frames_per_batch // (len(self._cars) * config.cars)) * config.cars
+        factories = [
+            FarEnvFactory(
+                setup=setup,
+                worker=worker,
+                n_cars=config.cars,
+                threads=config.threads or 1,
+                run_dir=self._run_dir,
+                heartbeat=None,
+            )
+            for worker in range(len(self._cars))
+        ]
+        policy = self._ray.put(self._policy)
+        built = self._ask(
+            lambda worker: self._cars[worker].build.remote(factories[worker], policy, frames, self._beats),
+            max(_START_TIMEOUT_S, self._hang_timeout_s),
+        )
+        self._where = [f"process {pid} on {address}" for address, pid in built]
+        if self._begun_from:
+            states = [self._begun_from[worker_name(worker)] for worker in range(len(self._cars))]
+            self._ask(lambda worker: self._cars[worker].put_state.remote(states[worker]))
+
+    def next_batch(self) -> TensorDictBase:
+        """Return the next batch."""
+        self._began = True
+        return self._joined(self._ask(lambda worker: self._cars[worker].drive.remote()))
+
+    def publish_policy(self) -> None:
+        """Give the workers the policy's weights as they are now.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+        # Once for each node, and not for each worker.
+        weights = self._ray.put({name: w.detach().numpy() for name, w in self._policy.state_dict().items()})
+        self._ask(lambda worker: self._cars[worker].take_weights.remote(weights))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that the next batch depends on but the policy; see `Collector`.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+        if not self._began:
+            return dict(self._begun_from)
+        states = self._ask(lambda worker: self._cars[worker].take_state.remote())
+        return {worker_name(worker): state for worker, state in enumerate(states)}
+
+    def close(self) -> None:
+        """End every worker."""
+        if not self._ray.is_initialized():
+            return
+        for actor in (*self._cars, self._beats):
+            self._ray.kill(actor)
+        ray_cluster.leave()
+
+    def _joined(self, parts: Sequence[tuple[dict[Any, np.ndarray], str]]) -> TensorDictBase:
+        self._print("".join(printed for _, printed in parts))
+        batches = [batch for batch, _ in parts]
+        # One copy: what Ray returns cannot be written.
+        whole = {
+            key: torch.from_numpy(np.concatenate([batch[key] for batch in batches])) for key in batches[0]
+        }
+        steps = whole["action"].shape[1]
+        return TensorDict(whole, batch_size=[len(whole["action"]), steps])
+
+    def _print(self, text: str) -> None:
+        file = self._run_dir / REWARD_PRINTS
+        if text and (not file.exists() or file.stat().st_size + len(text) <= _LONGEST_PRINTS):
+            with file.open("a", encoding="utf-8", errors="backslashreplace") as out:
+                out.write(text)
+
+    def _ask(self, ask: Callable[[int], Any], timeout_s: float | None = None) -> list[Any]:
+        """Return the workers' answers in the order of the workers.
+
+        Raises:
+            RunFailed: the first that is lost, hangs or fails.
+        """
+        timeout_s = timeout_s or self._hang_timeout_s
+        waiting = {ask(worker): worker for worker in range(len(self._cars))}
+        answers: dict[int, Any] = {}
+        idle_s = dict.fromkeys(waiting.values(), 0.0)
+        steps: dict[int, int] = {}
+        looked = time.monotonic()
+        while waiting:
+            ready, _ = self._ray.wait(list(waiting), num_returns=len(waiting), timeout=_LOOK_EVERY_S)
+            for reference in ready:
+                worker = waiting.pop(reference)
+                answers[worker] = self._answer(worker, reference)
+            if not waiting:
+                break
+            now = time.monotonic()
+            told = self._steps()
+            for worker in waiting.values():
+                # A longer pause was ours: the whole run stopped with Ctrl-Z.
+                moved = told.get(worker) != steps.get(worker)
+                idle_s[worker] = 0.0 if moved else idle_s[worker] + min(now - looked, 2 * _LOOK_EVERY_S)
+                if idle_s[worker] > timeout_s:
+                    raise RunFailed(
+                        f"collector worker {worker} ({self._where[worker]}) took no step for {timeout_s:.0f} s "
+                        f"(after {told.get(worker, 0)} steps) and was ended"
+                    )
+            steps, looked = told, now
+        return [answers[worker] for worker in range(len(self._cars))]
+
+    def _answer(self, worker: int, reference: Any) -> Any:
+        try:
+            return self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:
+            if not isinstance(error.cause, RunFailed):
+                raise
+            write_crash_dump(self._run_dir, error.cause, worker=worker)
+            raise RunFailed(str(error.cause)) from error
+        except self._ray.exceptions.RayError as error:
+            _log.debug("collector worker %d: %s", worker, error)
+            raise RunFailed(
+                f"collector worker {worker} ({self._where[worker]}) is lost: its process was killed or its node is gone"
+            ) from error
+
+    def _steps(self) -> dict[int, int]:
+        """Return what the workers have told last; it is never waited for."""
+        done, _ = self._ray.wait([self._asked], timeout=0)
+        if done:
+            try:
+                self._told = self._ray.get(self._asked)
+            except self._ray.exceptions.RayError as error:
+                raise RunFailed(
+                    "the process that counts the steps of the collector's workers is lost, or its node is gone"
+                ) from error
+            self._asked = self._beats.steps.remote()
+        return self._told

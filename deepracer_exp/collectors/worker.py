@@ -1,0 +1,112 @@
+"""What happens inside a collector's process."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.lifeline import end_with_owner
+from deepracer_exp.rewards.prints import RewardPrints
+from deepracer_exp.runs.crash_dump import keep_state, write_crash_dump
+from deepracer_exp.runs.files import REWARD_PRINTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvFactory:
+    """Builds the cars of one process; sent to it and called there.
+
+    `heartbeat` is a file of one int64 per worker, mapped by all of them: control steps done so far, -1 before the
+    first. A file needs no clean-up protocol: it lies in the run folder and never outlives it.
+    """
+
+    setup: RaceSetup
+    worker: int
+    n_cars: int
+    threads: int
+    run_dir: Path
+    heartbeat: Path | None
+    """None: the environment lives in the training process."""
+
+    def __call__(self) -> RaceEnv:
+        """Return the environment, with the process around it made ready."""
+        if self.heartbeat is not None:
+            # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes: the training process hears it.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            end_with_owner()
+        # Sampling of actions is a worker's own stream, whatever the other workers do.
+        torch.manual_seed(int(np.random.SeedSequence([self.setup.seed, self.worker]).generate_state(1)[0]))
+        race = Race(
+            self.setup,
+            self.n_cars,
+            threads=self.threads,
+            first_car=self.worker * self.n_cars,
+            prints=self._prints(),
+        )
+        if self.heartbeat is None:
+            return _StateKeepingEnv(race, on_step=self._sign_of_life())
+        return _WorkerEnv(race, self._beat(self.heartbeat), self.run_dir, self.worker)
+
+    def _prints(self) -> RewardPrints:
+        return RewardPrints(self.run_dir / REWARD_PRINTS)
+
+    def _sign_of_life(self) -> Callable[[], None] | None:
+        return None
+
+    def _beat(self, heartbeat: Path) -> Callable[[], None]:
+        beats = np.memmap(heartbeat, np.int64, "r+")
+        worker = self.worker
+        beats[worker] = 0
+
+        def beat() -> None:
+            beats[worker] += 1
+
+        return beat
+
+
+class _StateKeepingEnv(RaceEnv):
+    """A RaceEnv whose state can be taken and put back, and whose failure carries the cars' state."""
+
+    def take_state(self) -> dict[str, Any]:
+        """Return the cars and the process's stream of random numbers, with which actions are sampled."""
+        return {"race": self.race.state_dict(), "random": torch.get_rng_state().numpy()}
+
+    def put_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `take_state` returned; the reset that follows leaves the cars there and draws nothing."""
+        self.resume_from(state["race"])
+        torch.set_rng_state(torch.from_numpy(state["random"]))
+
+    def _step(self, tensordict):  # type: ignore[no-untyped-def]
+        try:
+            return super()._step(tensordict)
+        except RunFailed as error:
+            keep_state(error, self.race)
+            raise
+
+
+class _WorkerEnv(_StateKeepingEnv):
+    """An environment whose failure is put on disk for the training process to find; then the worker is gone."""
+
+    def __init__(self, race: Race, beat: Callable[[], None], run_dir: Path, worker: int):
+        super().__init__(race, on_step=beat)
+        self._run_dir = run_dir
+        self._worker = worker
+
+    def _step(self, tensordict):  # type: ignore[no-untyped-def]
+        try:
+            return super()._step(tensordict)
+        except RunFailed as error:
+            write_crash_dump(self._run_dir, error, worker=self._worker)
+            sys.stderr.flush()
+            # No traceback from here: the training process prints the one line and holds the exit code.
+            os._exit(RunFailed.exit_code)

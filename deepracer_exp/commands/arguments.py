@@ -1,0 +1,183 @@
+"""Arguments of a command line: RUN, overrides, where runs are, old spellings, and shell completion."""
+
+import argparse
+import glob
+import itertools
+import re
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput, nearest
+
+RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
+STORES = ("runs_dir", "tracking.uri")
+"""Where runs are, and the MLflow store in which ids and aliases are looked up."""
+
+_OVERRIDE = re.compile(r"[+~]*[A-Za-z_][\w./@-]*=.*", re.DOTALL)
+_OLD_FLAGS = {
+    "--runs-dir": "runs_dir={}",
+    "--tracking-uri": "tracking.uri={}",
+    "--uri": "tracking.uri={}",
+    "--storage": "sweep.storage={}",
+    "--checkpoint": "checkpoint={}",
+    "--out": "--output {}",
+}
+_OLD_COMMANDS = ("compare", "lineage", "promote", "clean")
+
+
+def refuse_old_spellings(arguments: Sequence[str]) -> None:
+    """Refuse a command or flag that is spelled differently now.
+
+    Raises:
+        BadInput: names the present spelling.
+    """
+    if arguments and arguments[0] in _OLD_COMMANDS:
+        raise BadInput(f"{arguments[0]}: write deepracer-exp runs {shlex.join(arguments)}")
+    for argument, following in itertools.pairwise([*arguments, ""]):
+        flag, _, value = argument.partition("=")
+        if flag in _OLD_FLAGS:
+            raise BadInput(
+                f"{flag}: write {_OLD_FLAGS[flag].format(shlex.quote(value or following or '...'))}"
+            )
+
+
+def add_run(parser: argparse.ArgumentParser, overrides: str | None = "KEY=VALUE", many: bool = False) -> None:
+    """Give a command the arguments `RUN [overrides]`, which `run_and_overrides` returns.
+
+    Args:
+        parser: of the command.
+        overrides: what they are called in the help.
+        many: the command takes several runs.
+    """
+    run = parser.add_argument("runs", nargs="*" if many else "?", metavar="RUN", help=RUN)
+    run.completer = complete_runs  # type: ignore[attr-defined]
+    add_overrides(parser, overrides, complete_runs)
+    parser.set_defaults(prog=parser.prog)
+
+
+def add_overrides(
+    parser: argparse.ArgumentParser,
+    metavar: str | None = "KEY=VALUE",
+    completer: Callable[..., list[str]] | None = None,
+) -> None:
+    """Give a command overrides in Hydra's grammar."""
+    action = parser.add_argument("overrides", nargs="*", metavar=metavar)
+    action.completer = completer or complete_overrides  # type: ignore[attr-defined]
+
+
+def runs_and_overrides(args: argparse.Namespace) -> tuple[list[str], list[str]]:
+    """Return the runs of a command line and its overrides, in whatever order they were given.
+
+    Raises:
+        BadInput: a run is given as `run=RUN`.
+    """
+    given = _words(args)
+    for word in given:
+        if word.startswith("run="):
+            raise BadInput(f"{word}: write {args.prog} {shlex.quote(word.removeprefix('run='))}")
+    return [word for word in given if not is_override(word)], [word for word in given if is_override(word)]
+
+
+def _words(args: argparse.Namespace) -> list[str]:
+    """Return runs and overrides as they were given."""
+    runs = getattr(args, "runs", None) or []
+    return [*([runs] if isinstance(runs, str) else runs), *(getattr(args, "overrides", None) or [])]
+
+
+def run_and_overrides(args: argparse.Namespace) -> tuple[str, list[str]]:
+    """Return the one run of a command line and its overrides.
+
+    Raises:
+        BadInput: no run is given, or several, or one as `run=RUN`.
+    """
+    runs, overrides = runs_and_overrides(args)
+    if not runs:
+        raise BadInput(f"RUN: missing; write {args.prog} RUN: {RUN}")
+    if len(runs) > 1:
+        raise BadInput(f"{' '.join(runs)}: {len(runs)} runs given; accepted: one")
+    return runs[0], overrides
+
+
+def is_override(word: str) -> bool:
+    """Return whether a word is an override, `KEY=VALUE`; the name of a run has no equals sign."""
+    return _OVERRIDE.fullmatch(word) is not None
+
+
+@dataclass(frozen=True)
+class Stores:
+    """Where runs are looked up."""
+
+    runs_dir: Path
+    uri: str | None
+    """MLflow store; None: the one in `runs_dir`."""
+    values: dict[str, str]
+    """Of the other keys that the command takes."""
+
+
+def read_stores(overrides: Iterable[str], keys: Sequence[str] = ()) -> Stores:
+    """Read the overrides of a command that composes no configuration.
+
+    Args:
+        overrides: `KEY=VALUE`, the last of several with the same key counts.
+        keys: that are accepted besides `STORES`.
+
+    Raises:
+        BadInput: another key, or a word that is no override.
+    """
+    accepted = [*keys, *STORES]
+    values: dict[str, str] = {}
+    for word in overrides:
+        key, equals, value = word.partition("=")
+        if not equals or key not in accepted:
+            raise BadInput(f"{word}: no such key{nearest(key, accepted)}; accepted: {', '.join(accepted)}")
+        values[key] = _unquoted(value)
+    given = {key: value for key, value in values.items() if value not in ("", "null")}
+    runs_dir = given.pop("runs_dir", "runs")
+    return Stores(_path(runs_dir), given.pop("tracking.uri", None), given)
+
+
+def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
+    """Read where runs are and return the other overrides as they are."""
+    words = list(overrides)
+    stores = [word for word in words if word.partition("=")[0] in STORES]
+    return read_stores(stores), [word for word in words if word not in stores]
+
+
+def _unquoted(value: str) -> str:
+    quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+    return value[1:-1] if quoted else value
+
+
+def _path(text: str) -> Path:
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:  # no such user
+        raise BadInput(f"runs_dir={text}: {error}") from None
+
+
+def complete_runs(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Return the names of runs that begin with what was typed."""
+    words = [word for word in _words(parsed_args) if is_override(word)]
+    folders = split_stores(words)[0].runs_dir.glob(f"*/{glob.escape(prefix)}*/config.yaml")
+    return [file.parent.name for file in folders] + complete_overrides(prefix, parsed_args)
+
+
+def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Return the groups of a command, or the options of the group that was typed."""
+    from deepracer_exp.config.options import groups, options
+
+    known = groups(getattr(parsed_args, "entry", "train"))
+    group, equals, _value = prefix.partition("=")
+    if equals:
+        return [f"{group}={name}" for name in options(group)] if group in known else []
+    return [f"{name}=" for name in known]
+
+
+def complete_groups(**_: Any) -> list[str]:
+    """Return the names of the groups."""
+    from deepracer_exp.config.options import groups
+
+    return groups()

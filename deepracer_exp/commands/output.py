@@ -1,0 +1,124 @@
+"""What commands print: consoles, warnings, and the result of a run."""
+
+import logging
+import shlex
+import shutil
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from deepracer_exp.training.trainer import TrainResult
+
+_FILES = {
+    "report.html": "findings and figures",
+    "best_lap.png": "the fastest lap",
+    "learning.png": "the learning curves",
+}
+
+
+def table_console(piped_width: int = 200) -> "Console":
+    """Return a console for tables on standard output; a pipe has no width of its own."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else piped_width, highlight=False, markup=False)
+
+
+@contextmanager
+def warnings_on_stderr() -> Iterator[None]:
+    """Write the project's warnings to standard error within the block, one line each."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setLevel(logging.WARNING)
+    handler.setFormatter(logging.Formatter("warning: %(message)s"))
+    logger = logging.getLogger("deepracer_exp")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print each note once, on standard error."""
+    for note in dict.fromkeys(notes):
+        print(note, file=sys.stderr)
+
+
+def print_start() -> None:
+    """Say that the command is running: imports take seconds, and the first start after an installation compiles."""
+    print("starting", file=sys.stderr, flush=True)
+
+
+def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
+    """Print how a run ended, where its results are, and what to do next.
+
+    Args:
+        outcome: of the run.
+        tracked_in: `runs_dir` of a run that is recorded in MLflow, None for one that is not.
+    """
+    from deepracer_exp.runs.result import result_of
+
+    summary = outcome.summary
+    if outcome.status == "failed":
+        print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
+        print(f"  details: {outcome.folder}", file=sys.stderr)
+        return
+    print(f"\n{outcome.status}: {outcome.reason}")
+    print(
+        f"  {_count(summary['iteration'], 'iteration')}, {_count(summary['env_steps'], 'step')} in "
+        f"{summary['wall_clock_s']:.0f} s; in training {_count(summary['episodes'], 'episode')}, {_laps(summary)}"
+    )
+    result = result_of(summary)
+    if result is not None and result.evaluated:
+        print(f"\n  best policy   checkpoint {result.iteration:06d}, evaluated: {result.words()}")
+    print(f"\n  results       {outcome.folder}")
+    for name, what in _FILES.items():
+        if (outcome.folder / name).exists():
+            print(f"    {name:12}  {what}")
+    if outcome.note is not None:
+        print(f"warning: {outcome.note}", file=sys.stderr)
+    if tracked_in is not None:
+        where = "" if tracked_in == "runs" else f" {shlex.quote(f'runs_dir={tracked_in}')}"
+        print(f"  compare runs  {_command()} ui{where}")
+    _print_next_steps(outcome)
+
+
+def print_results(outcomes: "Sequence[TrainResult]") -> None:
+    """Print one line per run."""
+    print(f"\n{len(outcomes)} runs:")
+    for outcome in outcomes:
+        print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
+
+
+def _print_next_steps(outcome: "TrainResult") -> None:
+    from deepracer_exp.analysis.next_steps import COMMAND, next_steps
+
+    steps = [
+        (line.replace(COMMAND, _command(), 1), what)
+        for line, what in next_steps(outcome.folder, outcome.summary)
+    ]
+    if steps:
+        print("\n  next")
+    width = max((len(line) for line, _ in steps), default=0)
+    for line, what in steps:
+        print(f"    {line:{width}}  # {what}")
+
+
+def _command() -> str:
+    # `make race` calls us by a path that a newcomer's shell does not know.
+    return "deepracer-exp" if shutil.which("deepracer-exp") else shlex.quote(sys.argv[0])
+
+
+def _laps(summary: Mapping[str, Any]) -> str:
+    tracks = summary.get("tracks")
+    if tracks is not None:
+        return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
+    best = summary["best_lap_time_s"]
+    return f"{_count(summary['laps'], 'lap')}, the fastest in {best:.2f} s" if best is not None else "no lap"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"

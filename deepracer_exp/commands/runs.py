@@ -1,0 +1,300 @@
+"""`deepracer-exp runs`: list runs, compare them, show their lineage, promote and clean them."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from string import ascii_uppercase
+from typing import TYPE_CHECKING
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.files import METRICS
+
+from .arguments import (
+    STORES,
+    add_overrides,
+    add_run,
+    is_override,
+    read_stores,
+    run_and_overrides,
+    runs_and_overrides,
+)
+from .output import table_console
+from .runs_lineage import show_lineage
+from .runs_list import list_runs
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from deepracer_exp.runs.files import RunRecord
+    from deepracer_exp.tracking.cleaning import Overview, Removable
+
+_LIST = "list"
+_EPILOG = """\
+  deepracer-exp runs                                        list the runs, newest first
+  deepracer-exp runs compare runs/default/*                 all runs of an experiment
+  deepracer-exp runs compare RUN RUN -o better.html         where the figure is written
+  deepracer-exp runs lineage RUN
+  deepracer-exp runs promote RUN                            its best checkpoint, as EXPERIMENT@champion
+  deepracer-exp runs promote best:default --alias rain      the best run of an experiment
+  deepracer-exp runs promote RUN checkpoint=120 --model season
+  deepracer-exp evaluate champion                           from then on; export and clone accept it, too
+  deepracer-exp runs clean --apply
+
+All of them accept runs_dir=DIR (default: runs) and tracking.uri=URI (default: the MLflow store in runs_dir).
+"""
+_CLEAN_EPILOG = """\
+What can be removed:
+  - checkpoints that are neither best nor last
+  - the traces of failed runs
+  - the folders of runs that were deleted in MLflow
+
+What is never removed: checkpoints that are registered (deepracer-exp runs promote), pinned or cloned from, and runs
+that have one; runs in progress; files and folders that no training wrote, and whatever links point at.
+"""
+
+
+def add_runs(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the family of commands."""
+    family = commands.add_parser(
+        "runs",
+        help="list, compare, promote and clean runs",
+        description="List runs with their state, score, laps and age; compare them, show their lineage, register and "
+        "clean them.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = family.add_subparsers(metavar="ACTION", required=True)
+    where = " | ".join(f"{key}=..." for key in STORES)
+
+    listing = actions.add_parser(_LIST, help="list the runs, newest first (the default)")
+    add_overrides(listing, "runs_dir=DIR")
+    listing.set_defaults(command=list_runs)
+
+    compare = actions.add_parser(
+        "compare",
+        help="show runs side by side",
+        description="Show how runs differ and what they achieved, and draw their learning curves and lap times.",
+    )
+    add_run(compare, where, many=True)
+    compare.add_argument(
+        "-o", "--output", default="compare.html", help="page of the figure (default: compare.html)"
+    )
+    compare.set_defaults(command=_compare)
+
+    lineage = actions.add_parser(
+        "lineage",
+        help="show a run's family tree",
+        description="Show what a run was cloned from and its clones, what each clone changed and achieved, and the "
+        "best of each generation. Reads only the folders of the runs.",
+    )
+    add_run(lineage, where)
+    lineage.set_defaults(command=show_lineage)
+
+    promote = actions.add_parser(
+        "promote",
+        help="register a checkpoint under an alias",
+        description="Register a checkpoint as a version of a model in MLflow and give it an alias, by which evaluate, "
+        "export and clone find it. From then on nothing removes it from the run's folder.",
+    )
+    add_run(promote, f"checkpoint=best|last|N | {where}")
+    promote.add_argument("--model", help="name of the model (default: the experiment's)")
+    promote.add_argument(
+        "--alias", default="champion", help="moves here from the version that has it (default: champion)"
+    )
+    promote.set_defaults(command=_promote)
+
+    clean = actions.add_parser(
+        "clean",
+        help="list what can be removed, or remove it",
+        description="List what can be removed from the folders of the runs, with sizes; with --apply, remove it.",
+        epilog=_CLEAN_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_overrides(clean, where)
+    clean.add_argument("--apply", action="store_true", help="remove what is listed")
+    clean.set_defaults(command=_clean)
+
+
+def with_default_action(arguments: list[str]) -> list[str]:
+    """Return the arguments of a command line in which `runs` without an action means `runs list`."""
+    if arguments[:1] == ["runs"] and (len(arguments) == 1 or is_override(arguments[1])):
+        return ["runs", _LIST, *arguments[1:]]
+    return arguments
+
+
+def _compare(args: argparse.Namespace) -> int:
+    from deepracer_exp.runs.files import read_run
+    from deepracer_exp.runs.resolve import resolve
+
+    if Path(args.output).suffix != ".html":
+        raise BadInput(f"--output {args.output}: accepted: the name of a page (.html)")
+    runs, overrides = runs_and_overrides(args)
+    stores = read_stores(overrides)
+    folders = dict.fromkeys(resolve(run, stores.runs_dir, stores.uri).path for run in runs)
+    if not 2 <= len(folders) <= len(ascii_uppercase):
+        raise BadInput(f"{len(folders)} runs given; accepted: 2 to {len(ascii_uppercase)} different ones")
+    records = [read_run(folder) for folder in folders]
+    for record in records:
+        if not record.rows:
+            raise BadInput(f"{record.path / METRICS}: has no iteration; there is nothing to compare")
+
+    from deepracer_exp.analysis.charts.runs import learning_curves_compared
+    from deepracer_exp.analysis.page import write_chart
+
+    chart = learning_curves_compared(dict(zip(ascii_uppercase, records, strict=False)))
+    try:
+        write_chart(Path(args.output), chart)
+    except OSError as error:
+        raise BadInput(f"--output {args.output}: cannot be written: {error}") from error
+    console = table_console()
+    for letter, record in zip(ascii_uppercase, records, strict=False):
+        console.print(f"{letter}  {record.path}", soft_wrap=True)
+    for table in _tables(records):
+        console.print()
+        console.print(table)
+    console.print(f"\n{args.output}: learning curves and lap times", soft_wrap=True)
+    return 0
+
+
+def _tables(records: "Sequence[RunRecord]") -> "list[Table]":
+    from rich.table import Table
+    from rich.text import Text
+
+    from deepracer_exp.analysis.comparison import results, value_text
+    from deepracer_exp.runs.lineage import run_differences
+
+    letters = ascii_uppercase[: len(records)]
+    found = run_differences(records)
+    chosen = Table("configuration" if found else "configuration: no difference", box=None, pad_edge=False)
+    achieved = Table("result", box=None, pad_edge=False)
+    for letter in letters:
+        if found:
+            chosen.add_column(letter, overflow="fold")
+        achieved.add_column(letter, overflow="fold", justify="right")
+    for key, values in found.items():
+        chosen.add_row(key, *map(value_text, values))
+    for name, texts, best in results(records):
+        achieved.add_row(
+            name, *(Text(text, style="bold green" if n == best else "") for n, text in enumerate(texts))
+        )
+    return [chosen, achieved]
+
+
+def _promote(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.driving import ObservationConfig
+    from deepracer_exp.config.evaluation import checked_checkpoint_name
+    from deepracer_exp.config.parse import parse_config
+    from deepracer_exp.runs.files import read_config
+    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.tracking.registry import check_alias, check_model, promote
+
+    name, overrides = run_and_overrides(args)
+    stores = read_stores(overrides, ["checkpoint"])
+    check_alias("--alias", args.alias)
+    if args.model is not None:
+        check_model("--model", args.model)
+    given = stores.values.get("checkpoint")
+    try:
+        checkpoint = given and checked_checkpoint_name(given)
+    except ValueError as error:
+        raise BadInput(f"checkpoint={given}: {error}") from None
+    run = resolve(name, stores.runs_dir, stores.uri)
+
+    from deepracer_exp.env.observation import feature_names
+
+    observation = parse_config(read_config(run.path).get("observation", {}), ObservationConfig)
+    registered = promote(
+        run.path,
+        checkpoint or run.checkpoint or "best",
+        args.model or run.path.resolve().parent.name,
+        args.alias,
+        feature_names(observation),
+        stores.uri,
+        stores.runs_dir,
+    )
+    print(f"{registered}: version {registered.version}")
+    print(f"  run         {run.path}")
+    print(f"  checkpoint  {registered.checkpoint}, sha256 {registered.sha256[:12]}")
+    print(f"\n  race it     deepracer-exp evaluate {registered}")
+    return 0
+
+
+def _clean(args: argparse.Namespace) -> int:
+    from deepracer_exp.tracking.cleaning import remove, survey, total
+
+    stores = read_stores(args.overrides)
+    runs_dir = stores.runs_dir
+    if not runs_dir.is_dir():
+        raise BadInput(f"runs_dir={runs_dir}: is not a folder; accepted: the folder that trainings write to")
+    console = table_console()
+    overview, note = _overview(stores.uri, runs_dir)
+    if note is not None:
+        print(note, file=sys.stderr)
+    found = survey(runs_dir, overview)
+    _show_removable(found.removable, runs_dir, console)
+    for reason in dict.fromkeys(reason for _, reason in found.kept):
+        runs = [str(run.relative_to(runs_dir)) for run, given in found.kept if given == reason]
+        more = f" and {len(runs) - 1} more" * (len(runs) > 1)
+        console.print(f"kept: {runs[0]}{more}: {reason}", soft_wrap=True)
+    if not found.removable:
+        print("nothing to remove")
+    elif args.apply:
+        removed = [item for item in found.removable if remove(item)]
+        print(f"removed {_bytes(total(removed))}")
+        for item in found.removable:
+            if item not in removed:
+                print(f"kept: {item.run.relative_to(runs_dir)}: a training or a clone has started meanwhile")
+    else:
+        print("--apply removes it")
+    return 0
+
+
+def _overview(uri: str | None, runs_dir: Path) -> "tuple[Overview | None, str | None]":
+    """Ask MLflow if there is a store; return what it knows, or what is skipped because it does not answer."""
+    from deepracer_exp.tracking.cleaning import look_over
+    from deepracer_exp.tracking.store import has_store, resolve_store
+
+    if not has_store(uri, runs_dir):
+        return None, None
+    resolve_store(uri, runs_dir)  # an unusable address is bad input, not a store that does not answer
+    try:
+        return look_over(uri, runs_dir), None
+    except BadInput as error:
+        return None, f"{error}; runs deleted there, and checkpoints of runs recorded there, are left out"
+
+
+def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Console") -> None:
+    from rich.table import Table
+
+    from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, total
+
+    if not items:
+        return
+    table = Table("size", "what", "run", box=None, pad_edge=False)
+    table.columns[0].justify = "right"
+    for item in items:
+        what = f"{item.what}: {_names(item)}" if item.what == CHECKPOINTS else item.what
+        table.add_row(_bytes(item.size), what, str(item.run.relative_to(runs_dir)))
+    table.add_row()
+    for kind in (CHECKPOINTS, TRACE, DELETED):
+        of_kind = [item for item in items if item.what == kind]
+        if of_kind:
+            table.add_row(
+                _bytes(total(of_kind)), kind, f"{len(of_kind)} runs" if len(of_kind) > 1 else "1 run"
+            )
+    table.add_row(_bytes(total(items)), "in all", "")
+    console.print(table)
+    console.print()
+
+
+def _names(item: "Removable") -> str:
+    names = [path.name for path in item.paths]
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]} ({len(names)})"
+
+
+def _bytes(size: int) -> str:
+    from rich.filesize import decimal
+
+    return decimal(size)

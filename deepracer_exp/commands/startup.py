@@ -1,0 +1,115 @@
+"""What a command does before the imports that take seconds: check what it was given, start the workers' server."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deepracer_exp.runs.files import read_config
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from deepracer_exp.config.experiment import Experiment
+    from deepracer_exp.config.sweep import SweepRequest
+    from deepracer_exp.runs.resolve import StoredRun
+
+
+def check_files(experiment: "Experiment") -> None:
+    """Read the files that an experiment names, without running any of them.
+
+    Raises:
+        BadInput: one is missing or malformed.
+    """
+    from deepracer_exp.env.action_space import build_action_space
+    from deepracer_exp.rewards.source import load_reward_source
+
+    load_reward_source(experiment.reward)
+    build_action_space(experiment.action_space)
+    files = [track for track in experiment.tracks.values() if track.file is not None]
+    if files:
+        from deepracer_exp.tracks.track import Track
+
+        for track in files:
+            Track.from_config(track)
+
+
+def check_run(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> "StoredRun":
+    """Find a run that has the checkpoint, or any checkpoint if none is named.
+
+    Raises:
+        BadInput: there is no such run or checkpoint, or its configuration is not one of this version.
+    """
+    from deepracer_exp.runs.checkpoint_files import find_checkpoint
+    from deepracer_exp.runs.resolve import resolve
+
+    stored = resolve(run, Path(runs_dir), tracking_uri)
+    stored.experiment  # noqa: B018 - refuses what another version wrote
+    find_checkpoint(stored.checkpoints, checkpoint or stored.checkpoint or "last")
+    return stored
+
+
+def check_changes(run_dir: Path, overrides: "Sequence[str]") -> "Experiment":
+    """Return the experiment of a stored run with overrides applied.
+
+    Raises:
+        BadInput: an override names something unknown or gives a value that is not accepted.
+    """
+    from deepracer_exp.config.parse import parse_experiment
+    from deepracer_exp.config.stored import with_overrides
+
+    return parse_experiment(with_overrides(read_config(run_dir), {}, overrides).mapping)
+
+
+def check_sweep(request: "SweepRequest") -> None:
+    """Check the files and options that all trials of a sweep share; its values are checked with its search space.
+
+    Raises:
+        BadInput: there is no such file or option.
+    """
+    from deepracer_exp.config import custom_files
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.config.options import groups
+    from deepracer_exp.config.overrides import key_of
+
+    named = [
+        line
+        for line in request.base
+        if (key := key_of(line)) in (*groups(), custom_files.KEY) or key.endswith(".file")
+    ]
+    check_files(compose_experiment(named)[0])
+
+
+def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.worker") -> None:
+    """Start the server that workers are forked from; it imports torch while this process does.
+
+    Args:
+        wanted: whether there will be workers.
+        module: imported once by the server, for all workers.
+    """
+    if not wanted or not sys.platform.startswith("linux"):
+        return
+    import multiprocessing
+    from multiprocessing import forkserver
+
+    multiprocessing.set_start_method("forkserver", force=True)
+    multiprocessing.set_forkserver_preload(["deepracer_exp.collectors.fork_server", module])
+    # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    # Signals to the process group are for the training process alone. The server inherits what is ignored now.
+    handlers = {signum: signal.signal(signum, signal.SIG_IGN) for signum in (signal.SIGINT, signal.SIGTERM)}
+    forkserver.ensure_running()
+    for signum, handler in handlers.items():
+        signal.signal(signum, handler)
+    if before is None:
+        del os.environ["OMP_NUM_THREADS"]
+    else:
+        os.environ["OMP_NUM_THREADS"] = before
+
+
+def has_workers(run_dir: Path) -> bool:
+    """Return whether a run collects in worker processes on this machine."""
+    collector = read_config(run_dir).get("collector")
+    return isinstance(collector, dict) and collector.get("mode") in ("sync", "async")

@@ -1,0 +1,169 @@
+"""Plain values to validated, frozen dataclasses; bad values are reported by their dotted keys."""
+
+import json
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from deepracer_exp.deepracer.worlds import worlds
+from deepracer_exp.errors import BadInput, nearest
+
+from .experiment import Experiment
+from .track import TrackConfig
+
+Config = TypeVar("Config")
+
+_adapters: dict[type, TypeAdapter[Any]] = {}
+
+
+def parse_experiment(mapping: dict[str, Any]) -> Experiment:
+    """Return the experiment that plain values describe; types are strict (no text for numbers, no bool for int).
+
+    Raises:
+        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
+    """
+    experiment = parse_config(mapping, Experiment)
+    _check_combinations(experiment)
+    return experiment
+
+
+def parse_config(mapping: dict[str, Any], kind: type[Config]) -> Config:
+    """Return the dataclass that plain values describe; types are strict.
+
+    Raises:
+        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
+    """
+    try:
+        # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
+        return _adapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
+    except ValidationError as error:
+        raise BadInput(_first_finding(mapping, error)) from error
+
+
+def _adapter(kind: type[Config]) -> TypeAdapter[Config]:
+    # Building an adapter takes longer than ten validations.
+    if kind not in _adapters:
+        _adapters[kind] = TypeAdapter(kind)
+    return _adapters[kind]
+
+
+def _check_combinations(experiment: Experiment) -> None:
+    """Refuse values that are accepted one by one but contradict one another.
+
+    Raises:
+        BadInput: the message names the keys, their values and what is accepted there.
+    """
+    algorithm, collector = experiment.algorithm, experiment.collector
+    if (algorithm.frames_per_iteration is None) == (algorithm.episodes_per_iteration is None):
+        raise BadInput(
+            f"algorithm.frames_per_iteration={algorithm.frames_per_iteration} and "
+            f"algorithm.episodes_per_iteration={algorithm.episodes_per_iteration}: set exactly one, the other null"
+        )
+    frames = algorithm.frames_per_iteration
+    if frames is not None and algorithm.batch_size > frames:
+        raise BadInput(
+            f"algorithm.batch_size={algorithm.batch_size} is larger than "
+            f"algorithm.frames_per_iteration={frames}: a minibatch cannot hold more steps than an iteration"
+        )
+    if frames is not None and frames < collector.cars:
+        raise BadInput(
+            f"algorithm.frames_per_iteration={frames} is smaller than collector.cars={collector.cars}: "
+            "each car takes at least one step an iteration"
+        )
+    if collector.mode == "in_process" and collector.processes not in (None, 1):
+        raise BadInput(
+            f"collector.processes={collector.processes} with collector.mode=in_process: "
+            "choose collector=sync or collector=async for several processes"
+        )
+    if collector.mode == "ray" and collector.processes is None:
+        raise BadInput(
+            "collector.processes=null with collector=ray: the size of a cluster changes; give the number of processes"
+        )
+    limit_s, hang_s = experiment.reward.time_limit_s, collector.hang_timeout_s
+    if collector.mode != "in_process" and limit_s >= hang_s:
+        raise BadInput(
+            f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}: a worker waiting for "
+            "its reward function would count as hanging"
+        )
+    delay, still = experiment.randomization.action_delay_steps[1], experiment.episode.immobilized_steps
+    if still and delay + 1 >= still:
+        raise BadInput(
+            f"randomization.action_delay_steps reaches {delay} with episode.immobilized_steps={still}: a car "
+            f"with so long a delay counts as immobilized before it moves; accepted: up to {max(0, still - 2)}"
+        )
+    for name, track in experiment.tracks.items():
+        key = f"track.{name}" if isinstance(experiment.track, dict) else "track"
+        _check_shape(key, track)
+    cars = collector.cars * (collector.processes or 1)
+    if cars < len(experiment.tracks):
+        raise BadInput(
+            f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted: "
+            f"at least {-(-len(experiment.tracks) // (collector.processes or 1))}"
+        )
+
+
+def _check_shape(key: str, track: TrackConfig) -> None:
+    knots, width_m = track.knots, track.width_m
+    if (knots is None) != (width_m is None):
+        there, missing = ("width_m", "knots") if knots is None else ("knots", "width_m")
+        raise BadInput(
+            f"{key}.{there} without {key}.{missing}: a track of your own has both, a world neither"
+        )
+    if knots is not None and isinstance(width_m, tuple) and len(width_m) != len(knots):
+        raise BadInput(
+            f"{key}.width_m has {len(width_m)} values and {key}.knots {len(knots)}: accepted: one, or one a knot"
+        )
+    if knots is None and track.file is None and track.name not in worlds():
+        raise BadInput(
+            f"{key}.name={track.name}: not a world of the service{nearest(track.name, worlds())}; a track of your own "
+            "has knots and width_m, or a file"
+        )
+
+
+def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
+    finding = error.errors(include_url=False)[0]
+    path = [str(part) for part in finding["loc"]]
+    key = _key_of(mapping, path)
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    if finding["type"] == "missing":
+        return f"{key}: missing{more}"
+    if finding["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        parent = _lookup(mapping, key.split(".")[:-1])
+        siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
+        return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
+    value = finding.get("input")
+    if finding["type"] == "union_tag_invalid":
+        context = finding["ctx"]
+        kind = context["discriminator"].strip("'")
+        return f"{key}.{kind}={context['tag']}: no such {kind}; accepted: {context['expected_tags']}{more}"
+    if finding["type"] == "value_error":
+        # The message of a dataclass whose values contradict each other names its keys.
+        at = key if isinstance(value, dict) else f"{key}={_short(value)}"
+        return f"{at}: {finding['ctx']['error']}{more}"
+    return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
+
+
+def _key_of(mapping: dict[str, Any], path: list[str]) -> str:
+    """Return the dotted key of a finding; pydantic also puts the tags of unions into its path."""
+    key: list[str] = []
+    node: Any = mapping
+    for index, part in enumerate(path):
+        if isinstance(node, dict) and part in node:
+            node = node[part]
+        elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
+            node = node[int(part)]
+        elif index + 1 < len(path) or not isinstance(node, dict):
+            continue  # a union's tag
+        key.append(part)
+    return ".".join(key)
+
+
+def _lookup(mapping: Any, path: list[str]) -> Any:
+    for part in path:
+        mapping = mapping[int(part)] if isinstance(mapping, list) else mapping[part]
+    return mapping
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,330 @@
+"""The files of a folder or an archive, and what their paths say about them."""
+
+import bz2
+import contextlib
+import gzip
+import lzma
+import re
+import stat
+import tarfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import LOG_BYTES, open_user_file
+
+from .log_blocks import READ_ERRORS
+from .recording import LogProblem, readable
+
+_ACCEPTED = "trace CSVs or logs of the service"
+
+_KIND = re.compile(r"(?:^|[-_.])(training|evaluation|leaderboard)(?=[-_.]|$)", re.IGNORECASE)
+_FOLDERS = {"training": "training", "evaluation": "evaluation", "leaderboard": "leaderboard"}
+_DRFC_EVALUATION = re.compile(r"evaluation-\d{14}")
+_WORKER = re.compile(r"(?:TrainingMetrics_|(?:worker|robomaker|simulation)[-_.]?)(\d{1,3})(?=\D|$)")
+_STAMP = re.compile(r"\d{14}|\d{4}-\d\d-\d\dT[\d:.]+Z")
+_ENDINGS = re.compile(
+    r"(?:-(?:robomaker|sagemaker|simulation|training))?(?:\.(?:log|txt|csv|json))?(?:\.\d+)?$"
+)
+LOG = re.compile(r"(?:\.(?:log|txt|out|err)(?:\.\d{1,4})?|^(?:stdout|stderr))$", re.IGNORECASE)
+"""Names of files that may be logs."""
+# The group matches for a single compressed file, not for an archive.
+_PACKED = re.compile(r"\.(?:tar|tgz|tbz2?|txz|tar\.(?:gz|bz2|xz)|(gz|bz2|xz))$", re.IGNORECASE)
+_OPEN: Mapping[str, Any] = {"gz": gzip.open, "bz2": bz2.open, "xz": lzma.open}
+_MARKS = {b"\x1f\x8b": "gz", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """One file, wherever it is."""
+
+    path: Path
+    """For messages; a member of an archive has a path below the archive's."""
+    parts: tuple[str, ...]
+    """Names of the folders it is in, as far as they matter, and its own name."""
+    opener: Callable[..., IO[bytes]]
+    given: tuple[object, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Make the names printable."""
+        object.__setattr__(self, "parts", tuple(readable(part) for part in self.parts))
+
+    def open(self) -> IO[bytes]:
+        """Open it for reading."""
+        return self.opener(*self.given)
+
+    @property
+    def name(self) -> str:
+        """Its own name."""
+        return self.parts[-1]
+
+    @property
+    def order(self) -> tuple[tuple[int, int | str], ...]:
+        """Sorts 10-iteration.csv after 9-iteration.csv."""
+        return natural("/".join(self.parts))
+
+
+@dataclass
+class LogFolder:
+    """The files found."""
+
+    files: list[LogFile] = field(default_factory=list)
+    """In the order in which they are read fastest."""
+    problems: list[LogProblem] = field(default_factory=list)
+    parallel: bool = True
+    """Whether files can be read in parallel."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """The job that a file belongs to, by its path."""
+
+    kind: str
+    """`training`, `evaluation` or `leaderboard`."""
+    root: tuple[str, ...]
+    """The folder of one training with all its workers, or of one evaluation."""
+    name: str
+    """Name of that training or evaluation."""
+    worker: int
+
+
+def natural(text: str) -> tuple[tuple[int, int | str], ...]:
+    """Return a sort key that orders numbers in names by value."""
+    pieces = re.split(r"(\d+)", text)
+    return tuple((1, int(piece)) if piece.isdigit() else (0, piece) for piece in pieces)
+
+
+def place_of(parts: tuple[str, ...]) -> Place:
+    """Return the job of a trace or log, by its folders and its name."""
+    for at in range(len(parts) - 2, -1, -1):
+        if parts[at] in ("training-simtrace", "evaluation-simtrace"):
+            kind = parts[at].partition("-")[0]
+            above = parts[:at]
+            worker = 0
+            if kind == "training" and above and above[-1].isdigit() and len(above[-1]) <= 3:
+                worker, above = int(above[-1]), above[:-1]
+            return Place(kind, above, above[-1] if above else kind, worker)
+    name = label(parts[-1])
+    named = _KIND.search(parts[-1])
+    kind = named[1].lower() if named else "training"
+    if named is None:
+        for folder in reversed(parts[:-1]):
+            if folder in _FOLDERS or _DRFC_EVALUATION.fullmatch(folder):
+                kind = folder.partition("-")[0]
+                break
+    numbered = _WORKER.search(parts[-1])
+    return Place(kind, parts[:-1], name, int(numbered[1]) if numbered and kind == "training" else 0)
+
+
+def label(name: str) -> str:
+    """Return the name of a log or metrics file without its ending and kind."""
+    return _ENDINGS.sub("", name) or name
+
+
+def same_job(one: str, other: str) -> bool:
+    """Return whether two names belong to one job, by the time stamp in them or the id after it."""
+    stamps = [set(_STAMP.findall(name)) for name in (one, other)]
+    if stamps[0] & stamps[1]:
+        return True
+    first, second = (_STAMP.split(label(name))[-1].strip("-_") for name in (one, other))
+    return bool(stamps[0] and stamps[1] and first and first == second)
+
+
+@contextlib.contextmanager
+def log_folder(path: Path) -> Iterator[LogFolder]:
+    """Find the files below a folder and in the archives there, in one archive, or the one file.
+
+    Links are not followed. Archives and compressed files are read without being unpacked.
+
+    Raises:
+        BadInput: nothing is there, or it cannot be opened.
+    """
+    try:
+        mode = path.stat().st_mode
+        if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
+            raise BadInput(
+                f"{path}: is neither a file nor a folder; accepted: logs of the service or a run's folder"
+            )
+        with contextlib.ExitStack() as opened:
+            if stat.S_ISDIR(mode):
+                yield _walk(path, opened)
+            elif _is_packed(path):
+                found = LogFolder(parallel=False)
+                archives = opened.enter_context(contextlib.closing(_Archives()))
+                _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
+                yield found
+            else:
+                yield LogFolder(
+                    [LogFile(path, path.resolve().parts[-3:], open_user_file, (path, _ACCEPTED, LOG_BYTES))]
+                )
+    except FileNotFoundError as error:
+        raise BadInput(f"{path}: no such file or folder; accepted: {_ACCEPTED}") from error
+    except (*READ_ERRORS, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
+        raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
+    found = LogFolder()
+    above = root.resolve().parts[-2:]
+    waiting, packed = [root], []
+    while waiting:
+        folder = waiting.pop()
+        try:
+            entries = list(folder.iterdir())
+        except OSError as error:
+            found.problems.append(LogProblem(str(folder), None, f"cannot be read: {error.strerror}"))
+            continue
+        for entry in entries:
+            if entry.is_symlink():
+                found.problems.append(LogProblem(str(entry), None, "a link; not followed"))
+            elif entry.is_dir():
+                waiting.append(entry)
+            elif entry.is_file() and _PACKED.search(entry.name):
+                packed.append(entry)
+            elif entry.is_file():
+                parts = (*above, *entry.relative_to(root).parts)
+                found.files.append(LogFile(entry, parts, open_user_file, (entry, _ACCEPTED, LOG_BYTES)))
+    found.files.sort(key=lambda file: file.order)
+    archives = opened.enter_context(contextlib.closing(_Archives()))
+    for path in sorted(packed):
+        folders = (*above, *path.relative_to(root).parts[:-1])
+        plain = path.with_name(_PACKED.sub("", path.name))
+        try:
+            if plain.is_file():
+                found.problems.append(LogProblem(str(path), None, f"not read: {plain.name} lies beside it"))
+            else:
+                _unpack(found, path, (*folders, path.name), folders, archives)
+        except (*READ_ERRORS, ValueError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason})"))
+    return found
+
+
+def _is_packed(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(512)
+    return head.startswith(tuple(_MARKS)) or head[257:262] == b"ustar"
+
+
+class _Archives:
+    """Opens members of archives, keeping one archive open at a time: a folder may hold very many."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._archive: tarfile.TarFile | None = None
+
+    def open(self, path: Path, member: tarfile.TarInfo) -> IO[bytes]:
+        """Open a member for reading; a member of another archive must have been read completely."""
+        if self._archive is None or self._path != path:
+            self.close()
+            self._path, self._archive = path, tarfile.open(path, "r:*")  # noqa: SIM115 - closed by the next `open` or by `close`
+        stream = self._archive.extractfile(member)
+        if stream is None:
+            raise OSError(f"{member.name} is not a regular file")
+        ending = _ending(member.name)
+        return stream if ending is None else _OPEN[ending](stream)
+
+    def close(self) -> None:
+        """Close what is open."""
+        if self._archive is not None:
+            self._archive.close()
+
+
+def _unpack(
+    found: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], archives: _Archives
+) -> None:
+    """Add the members of an archive, or a compressed file.
+
+    Args:
+        found: the files to add to.
+        path: path of the archive or compressed file.
+        inside: folders that the members are in; empty if the archive is all there is.
+        beside: folders that a compressed file is in.
+        archives: opens the members.
+
+    Raises:
+        OSError: it cannot be read, or is neither an archive nor compressed.
+    """
+    try:
+        with tarfile.open(path, "r:*") as archive:
+            members = _members(path, archive, archives)
+    except tarfile.ReadError:
+        with path.open("rb") as file:
+            head = file.read(8)
+        opener = next((_OPEN[ending] for mark, ending in _MARKS.items() if head.startswith(mark)), None)
+        if opener is None:
+            raise OSError("neither an archive nor compressed" if head else "empty") from None
+        with opener(path) as stream:
+            stream.read(1)
+        found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path,)))
+        return
+    if inside and not any(map(_may_hold_data, members.files)):
+        found.problems += members.problems
+        found.files.append(
+            LogFile(path, (*beside, path.name), open_user_file, (path, _ACCEPTED, LOG_BYTES))
+        )  # perhaps a model for the car
+        return
+    found.parallel = False
+    found.problems += members.problems
+    rest = [file for file in members.files if not inside or not _lies_beside(path, file)]
+    if len(rest) < len(members.files):
+        count = len(members.files) - len(rest)
+        reason = f"{count} of {len(members.files)} files are not read: the same are unpacked beside it"
+        found.problems.append(LogProblem(str(path), None, reason))
+    found.files += [replace(file, parts=(*inside, *file.parts)) for file in rest]
+
+
+def _lies_beside(path: Path, file: LogFile) -> bool:
+    """Return whether a member of an archive is also unpacked beside it, with the same name and size."""
+    named = (_PACKED.sub("", path.name),)
+    _, member = file.given
+    assert isinstance(member, tarfile.TarInfo)
+    for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
+        with contextlib.suppress(OSError):  # not there, or a name that no file system takes
+            if path.parent.joinpath(*place).stat().st_size == member.size:
+                return True
+    return False
+
+
+def _may_hold_data(file: LogFile) -> bool:
+    """Return whether a file may be a trace, a log or metrics."""
+    name = "/".join(file.parts).lower()
+    return (
+        name.endswith(".csv")
+        or LOG.search(file.name) is not None
+        or ("metric" in name and name.endswith(".json"))
+    )
+
+
+def _ending(name: str) -> str | None:
+    """Return the compression of a single file by its name; None for an archive and any other file."""
+    packed = _PACKED.search(name)
+    return packed[1].lower() if packed is not None and packed[1] else None
+
+
+def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFolder:
+    """List the members in their order in the archive: going back would mean reading it again."""
+    found = LogFolder(parallel=False)
+    members: dict[tuple[str, ...], tarfile.TarInfo] = {}
+    try:
+        while (member := archive.next()) is not None:
+            if member.isfile():
+                parts = tuple(
+                    part for part in PurePosixPath(member.name).parts if part not in ("/", "..", ".")
+                )
+                members.pop(parts, None)
+                members[parts] = member  # the later one counts, as in unpacking
+            elif member.islnk() or member.issym():
+                found.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
+    except (*READ_ERRORS, ValueError, OverflowError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        found.problems.append(LogProblem(str(path), None, f"cannot be read to its end ({reason})"))
+    for parts, member in members.items():
+        if parts:
+            plain = parts if _ending(parts[-1]) is None else (*parts[:-1], _PACKED.sub("", parts[-1]))
+            found.files.append(LogFile(path.joinpath(*parts), plain, archives.open, (path, member)))
+    return found

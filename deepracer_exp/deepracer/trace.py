@@ -1,0 +1,207 @@
+"""The simulation trace of a run: one row a control step, with the service's columns and our own."""
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from deepracer_exp.errors import BadInput, RunFailed
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+EPISODE_STATUS = (
+    "prepare",
+    "in_progress",
+    "lap_complete",
+    "off_track",
+    "crashed",
+    "immobilized",
+    "reversed",
+    "pause",
+    "park",
+    "time_up",
+)
+"""The service's names; the index in the list is the code in packed rows. An episode that reaches the limit of
+steps is `time_up`."""
+STATUS_CODE = {status: code for code, status in enumerate(EPISODE_STATUS)}
+
+RANDOMIZED = {
+    "friction_scale": "factor on the grip of the tyres",
+    "mass_scale": "factor on all masses",
+    "motor_scale": "factor on the motors' gain and torque",
+    "servo_scale": "factor on the steering servos' gain",
+    "battery_sag": "share of the commanded speed lost in the end",
+    "action_delay_steps": "control steps by which commands are delayed",
+    "steering_offset_deg": "degrees added to the steering, positive to the left",
+    "steering_noise_deg": "degrees, standard deviation of the noise on the steering",
+    "speed_noise": "standard deviation of the noise on the speed, as a fraction of it",
+    "observation_noise": "standard deviation of the noise on measured features",
+    "observation_dropout": "probability that the last observation is repeated",
+}
+"""Columns of the randomized quantities (`conf/randomization/`), one value an episode, with their units."""
+
+_STATUS = pa.dictionary(pa.int8(), pa.string())
+_TRACK = pa.dictionary(pa.int16(), pa.string())
+_COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
+    # The service's columns, in its order (deepracer-simapp, markov/metrics/constants.py).
+    ("episode", pa.int32(), "counted from 0 over the whole run, in the order in which episodes begin"),
+    ("steps", pa.int32(), "control step of the episode, 1 is the prepare step"),
+    ("X", pa.float64(), "m, front of the car"),
+    ("Y", pa.float64(), "m, front of the car"),
+    ("yaw", pa.float64(), "degrees, -180 to 180, counter-clockwise from +x"),
+    ("steer", pa.float64(), "degrees commanded, positive to the left"),
+    ("throttle", pa.float64(), "m/s commanded"),
+    ("action", pa.int32(), "action number; null for a continuous action space"),
+    ("reward", pa.float64(), "reward units"),
+    ("done", pa.bool_(), "last step of the episode"),
+    ("all_wheels_on_track", pa.bool_(), "every wheel centre on the road"),
+    ("progress", pa.float64(), "per cent of the lap"),
+    ("closest_waypoint", pa.int32(), "index of the nearer of the two waypoints around"),
+    ("track_len", pa.float64(), "m"),
+    ("tstamp", pa.float64(), "s, simulated time"),
+    ("episode_status", _STATUS, " ".join(EPISODE_STATUS)),
+    ("pause_duration", pa.float64(), "s of penalty left"),
+    ("obstacle_crash_counter", pa.int32(), "obstacles hit"),
+    # Ours.
+    ("car", pa.int32(), "number of the car over all processes"),
+    ("track", _TRACK, "name of the course"),
+    ("iteration", pa.int32(), "policy update that used the row, from 1"),
+    ("speed_mps", pa.float32(), "m/s measured"),
+    ("yaw_rate_radps", pa.float32(), "rad/s measured, positive to the left"),
+    ("offset_m", pa.float32(), "m from the centre line, positive to the left of the driving direction"),
+    ("heading_error_rad", pa.float32(), "rad from the centre line's direction, positive to the left"),
+    ("episode_return", pa.float64(), "sum of the episode's rewards up to here"),
+    *((name, pa.float32(), unit) for name, unit in RANDOMIZED.items()),
+)
+TRACE_COLUMNS = tuple(name for name, _, _ in _COLUMNS)
+"""Columns of a written trace."""
+PACKED_COLUMNS = tuple(
+    name for name in TRACE_COLUMNS if name not in ("pause_duration", "obstacle_crash_counter", "iteration")
+)
+"""Columns of packed rows, the float64 matrix in which a trace is passed between processes; booleans are 0 or 1,
+`episode_status` is its code, `track` the course's index in the experiment, and `action` is NaN for a continuous
+action space."""
+PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
+"""Column number of each packed column."""
+_CONTINUOUS = (
+    *("X", "Y", "yaw", "reward", "progress", "tstamp"),
+    *("speed_mps", "yaw_rate_radps", "offset_m", "heading_error_rad", "episode_return"),
+)
+# Columns with few repeated values take a quarter less space byte-split than as dictionaries (49 instead of 68 bytes
+# a row on a console training), and are written twice as fast.
+_REPEATING = [name for name in TRACE_COLUMNS if name not in _CONTINUOUS]
+SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
+
+
+def to_table(packed: NDArray[np.float64], iteration: int, tracks: Sequence[str]) -> pa.Table:
+    """Turn packed rows into a table with the types and units of `SCHEMA`.
+
+    Args:
+        packed: (n, len(PACKED_COLUMNS)).
+        iteration: policy update that used the rows, from 1.
+        tracks: names of the experiment's courses.
+
+    Raises:
+        ValueError: the shape is wrong, or a code of a status or course is unknown.
+    """
+    if packed.ndim != 2 or packed.shape[1] != len(PACKED_COLUMNS):
+        raise ValueError(f"packed rows of shape {packed.shape}; accepted: (n, {len(PACKED_COLUMNS)})")
+    rows = len(packed)
+    extra = {
+        "pause_duration": 0.0,
+        "obstacle_crash_counter": 0,
+        "iteration": iteration,
+    }
+    columns = []
+    for name, kind, _ in _COLUMNS:
+        values = packed[:, PACKED[name]] if name in PACKED else np.full(rows, extra[name])
+        if kind is _STATUS:
+            columns.append(_words(name, values, EPISODE_STATUS, np.int8))
+        elif kind is _TRACK:
+            columns.append(_words(name, values, tracks, np.int16))
+        else:
+            columns.append(_column(values, kind))
+    return pa.Table.from_arrays(columns, schema=SCHEMA)
+
+
+def _words(name: str, codes: NDArray[np.float64], words: Sequence[str], dtype: type) -> pa.Array:
+    # Arrow would accept a code out of range and fail only when it is read.
+    unknown = ~np.isin(codes, np.arange(len(words)))
+    if unknown.any():
+        raise ValueError(f"{name} code {codes[unknown][0]:g}; known: 0 to {len(words) - 1}")
+    return pa.DictionaryArray.from_arrays(codes.astype(dtype), pa.array(words, pa.string()))
+
+
+def _column(values: NDArray[np.float64], kind: pa.DataType) -> pa.Array:
+    if pa.types.is_floating(kind):
+        return pa.array(np.ascontiguousarray(values), kind)
+    missing = np.isnan(values)
+    if pa.types.is_boolean(kind):
+        return pa.array(values != 0, kind)
+    return pa.array(np.where(missing, 0, values).astype(kind.to_pandas_dtype()), kind, mask=missing)
+
+
+class TraceWriter:
+    """Writes one Parquet file an iteration, atomically."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def write(self, iteration: int, table: pa.Table) -> Path:
+        """Write the rows of one iteration and return the file, `00012-iteration.parquet`.
+
+        Raises:
+            RunFailed: the file cannot be written (disk full, folder read-only).
+        """
+        path = self.folder / f"{iteration:05d}-iteration.parquet"
+        unfinished = path.with_name(f".{path.name}")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            pq.write_table(
+                table,
+                unfinished,
+                compression="zstd",
+                use_dictionary=_REPEATING,
+                column_encoding=dict.fromkeys(_CONTINUOUS, "BYTE_STREAM_SPLIT"),
+            )
+            unfinished.replace(path)
+        except OSError as error:
+            # Where a file cannot be written, deleting one may fail, too.
+            with contextlib.suppress(OSError):
+                unfinished.unlink(missing_ok=True)
+            raise RunFailed(f"{path}: the trace cannot be written: {error.strerror or error}") from error
+        return path
+
+
+def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.DataFrame":
+    """Read the trace of a run, in the order of iterations.
+
+    An episode may continue in the next iteration: its rows need not be adjacent.
+
+    Args:
+        folder: `trace/` of a run.
+        columns: the columns to read; a chart of a million steps needs few of them.
+
+    Raises:
+        BadInput: there is no trace, or a file is incomplete or of another kind.
+    """
+    paths = sorted(path for path in folder.glob("*-iteration.parquet") if not path.name.startswith("."))
+    if not paths:
+        raise BadInput(f"{folder}: no *-iteration.parquet; accepted: the trace folder of a run")
+    schema = pa.schema([SCHEMA.field(name) for name in columns])
+    tables = []
+    for path in paths:
+        try:
+            tables.append(pq.read_table(path, columns=list(columns)).cast(schema))
+        except (OSError, pa.ArrowInvalid, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise BadInput(
+                f"{path}: not a trace ({reason}); accepted: a complete Parquet file of a run"
+            ) from error
+    return pa.concat_tables(tables).to_pandas()

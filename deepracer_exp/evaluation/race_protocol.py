@@ -1,0 +1,153 @@
+"""Race protocol: laps, resets, penalties and the race clock of cars."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.deepracer.trace import EPISODE_STATUS, STATUS_CODE
+
+Floats = NDArray[np.float64]
+Ids = NDArray[np.intp]
+
+_LAP, _UP = "lap_complete", "time_up"
+_ROUNDING_S = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One attempted lap."""
+
+    trial: int
+    """Row of the trial in its batch."""
+    begin_s: float
+    """Race clock at its start."""
+    time_s: float
+    """Lap time, penalties included."""
+    penalty_s: float
+    resets: int
+    progress: float
+    """Per cent of the lap, 100 if complete."""
+    end: str
+    """`lap_complete`, what failed it (`off_track`, `reversed`, `immobilized`), or `time_up`."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether it counts as a lap."""
+        return self.end == _LAP
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether the end of the race interrupted it."""
+        return self.end == _UP
+
+
+@dataclass(frozen=True, eq=False)
+class Resets:
+    """Cars to put back on the centre line, at rest."""
+
+    cars: Ids
+    progress: Floats
+    """Positions in per cent of the lap, (n,)."""
+
+
+class RaceProtocol:
+    """Applies a protocol to N cars, one trial each: which are put back, and which have finished.
+
+    The race clock of a trial starts with the prepare step; each control step advances it by its period, each penalty
+    by its seconds.
+
+    Attributes:
+        running: unfinished trials, (N,), bool.
+        attempts: laps attempted so far, in the order of their ends.
+        clock_s: race clock at the latest poses, (N,).
+    """
+
+    def __init__(self, config: EvaluationConfig, closed: NDArray[np.bool_], period_s: float):
+        """Start all trials.
+
+        Args:
+            config: the protocol.
+            closed: whether a completed lap leads into the next one, (N,).
+            period_s: simulated seconds of a control step.
+        """
+        n_cars = len(closed)
+        self._config, self._closed, self._period_s = config, closed, period_s
+        self._penalty_s = {
+            name: getattr(config.penalty_s, name) for name in ("off_track", "reversed", "immobilized")
+        }
+        self._steps = 0
+        self.running = np.ones(n_cars, bool)
+        self.attempts: list[Attempt] = []
+        self.clock_s = np.zeros(n_cars)
+        self._laps = np.zeros(n_cars, np.int64)
+        self._begin_s, self._lap_penalty_s, self._all_penalties_s = (np.zeros(n_cars) for _ in range(3))
+        self._resets = np.zeros(n_cars, np.int64)
+        self._progress = np.zeros(n_cars)
+
+    def step(self, status: NDArray[np.int64], progress: Floats) -> Resets:
+        """Process one control step.
+
+        Args:
+            status: `deepracer.trace.STATUS_CODE` of the poses, (N,).
+            progress: per cent of the lap, (N,).
+
+        Returns:
+            The cars to put back.
+        """
+        driven_s = self._steps * self._period_s
+        self._steps += 1
+        self.clock_s = np.where(self.running, driven_s + self._all_penalties_s, self.clock_s)
+        late = self.running & (self.clock_s > self._config.time_s + _ROUNDING_S)
+        for car in np.flatnonzero(late).tolist():
+            self.clock_s[car] = self._config.time_s
+            self._close(car, _UP, progress[car])
+            self.running[car] = False
+        back: list[tuple[int, float]] = []
+        for car in np.flatnonzero(self.running & (status > STATUS_CODE["in_progress"])).tolist():
+            self._decide(car, EPISODE_STATUS[status[car]], progress[car], back)
+        # The last progress on the track: beyond its border another section may be closer.
+        self._progress = np.where(status == STATUS_CODE[_LAP], 0.0, progress)
+        for car, percent in back:
+            self._progress[car] = percent
+        cars, percents = zip(*back, strict=True) if back else ((), ())
+        return Resets(np.array(cars, np.intp), np.array(percents))
+
+    def _decide(self, car: int, what: str, progress: float, back: list[tuple[int, float]]) -> None:
+        config = self._config
+        if what == _LAP:
+            self._close(car, what, 100.0)
+            self._laps[car] += 1
+            if self._laps[car] == config.laps:
+                self.running[car] = False
+            elif not self._closed[car]:
+                back.append((car, 0.0))
+        elif self._resets[car] < config.resets_per_lap:
+            self._resets[car] += 1
+            self._lap_penalty_s[car] += self._penalty_s[what]
+            self._all_penalties_s[car] += self._penalty_s[what]
+            back.append((car, max(0.0, self._progress[car])))
+        else:
+            self._close(car, what, progress)
+            if config.failed_lap == "ends_trial":
+                self.running[car] = False
+            else:
+                back.append((car, 0.0))
+
+    def _close(self, car: int, end: str, progress: float) -> None:
+        """Record the attempted lap and start the next one."""
+        self.attempts.append(
+            Attempt(
+                trial=car,
+                begin_s=float(self._begin_s[car]),
+                time_s=float(self.clock_s[car] - self._begin_s[car]),
+                penalty_s=float(self._lap_penalty_s[car]),
+                resets=int(self._resets[car]),
+                progress=float(np.clip(progress, 0.0, 100.0)),
+                end=end,
+            )
+        )
+        self._begin_s[car] = self.clock_s[car]
+        self._lap_penalty_s[car] = 0.0
+        self._resets[car] = 0

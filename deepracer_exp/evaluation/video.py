@@ -1,0 +1,308 @@
+"""Video of the best lap of an evaluation, rendered by MuJoCo."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from imageio_ffmpeg import write_frames
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from rich.progress import track as with_progress
+from shapely import get_coordinates, get_parts
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.deepracer.trace import PACKED
+from deepracer_exp.env.race import Race
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
+from deepracer_exp.tracks.track import Track
+
+from .evaluator import Evaluator
+from .race_protocol import Attempt, RaceProtocol
+from .result import USUAL, Evaluation
+
+View = Literal["chase", "top"]
+VIEWS: tuple[View, ...] = ("chase", "top")
+
+WIDTH, HEIGHT = 960, 544
+"""Multiples of 16, as video codecs want them."""
+_LINGER_S = 1.0
+"""The last frame is shown this long."""
+_COLUMNS = [PACKED[name] for name in ("X", "Y", "yaw", "steer", "speed_mps", "progress")]
+
+_PIXELS_PER_M, _MOST_PIXELS, _FINER = 160, 4096, 2
+_MARGIN_M = 0.5
+_HEAD = 0.2
+"""Share of the frame that the view from above leaves free at the top for the overlay."""
+_BORDER_M, _DASH_M, _DASH_WIDTH_M = 0.05, 0.15, 0.025
+_DASH_COLOR = "#f5a623"
+_MARK_RGBA = (1.0, 0.75, 0.0, 0.55)
+_SMOOTHING = 0.25
+"""Share of a heading change that the chase camera follows per step."""
+
+
+class LapRenderer:
+    """Renders a car on its track with MuJoCo.
+
+    Poses are given; nothing is simulated. A context manager that frees the graphics memory.
+    """
+
+    def __init__(self, track: Track, car: CarConfig, view: View, width: int, height: int):
+        """Draw the track and set up the renderer."""
+        self._car, self._view = car, view
+        self._low, self._high = _extent(track)
+        self._model = _build(track, car, view, (self._low, self._high), width, height)
+        self._data = mujoco.MjData(self._model)
+        self._steer = [self._model.joint(f"{name}_steer").qposadr[0] for name in STEERED]
+        self._spin = [self._model.joint(f"{name}_spin").qposadr[0] for name in WHEELS]
+        self._renderer = mujoco.Renderer(self._model, height, width)
+        self._camera = mujoco.MjvCamera()
+        self._azimuth_rad: float | None = None
+        self._aspect = width / height
+
+    def __enter__(self) -> "LapRenderer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._renderer.close()
+
+    def draw(
+        self, x_m: float, y_m: float, yaw_rad: float, steering_rad: float, driven_m: float
+    ) -> NDArray[np.uint8]:
+        """Return the image of a pose, (height, width, 3).
+
+        Args:
+            x_m: front point of the car, as in a trace.
+            y_m: likewise.
+            yaw_rad: heading.
+            steering_rad: of the front wheels, positive to the left.
+            driven_m: distance driven so far, which turns the wheels.
+        """
+        qpos, car = self._data.qpos, self._car
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        qpos[:3] = x_m - car.front_point_m * cos, y_m - car.front_point_m * sin, 0.0
+        qpos[3:7] = np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)
+        qpos[self._steer] = steering_rad
+        qpos[self._spin] = driven_m / car.wheel_radius_m
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._aim(x_m, y_m, yaw_rad)
+        self._renderer.update_scene(self._data, self._camera)
+        # Shadows of the distant light cost more than the rest of the image.
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        picture: NDArray[np.uint8] = self._renderer.render()
+        return picture
+
+    def _aim(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        camera = self._camera
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        if self._view == "top":
+            middle = 0.5 * (self._low + self._high)
+            width, height = self._high - self._low
+            seen_m = max(height / (1 - _HEAD), width / self._aspect)
+            camera.lookat[:] = middle[0], middle[1] + 0.5 * _HEAD * seen_m, 0.0
+            angle = np.radians(self._model.vis.global_.fovy)
+            camera.distance = 0.5 * seen_m / np.tan(angle / 2)
+            camera.azimuth, camera.elevation = 90.0, -90.0
+            return
+        if self._azimuth_rad is None:
+            self._azimuth_rad = yaw_rad
+        turn = (yaw_rad - self._azimuth_rad + np.pi) % (2 * np.pi) - np.pi
+        self._azimuth_rad += _SMOOTHING * turn
+        ahead = np.array([np.cos(self._azimuth_rad), np.sin(self._azimuth_rad)])
+        camera.lookat[:] = *(np.array([x_m, y_m]) + 0.25 * ahead), 0.05
+        camera.distance, camera.elevation = 1.3, -24.0
+        camera.azimuth = np.degrees(self._azimuth_rad)
+
+
+def _extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    points = np.concatenate([track.inner, track.outer])
+    return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+
+
+def _build(
+    track: Track,
+    car: CarConfig,
+    view: View,
+    extent: tuple[NDArray[np.float64], NDArray[np.float64]],
+    width: int,
+    height: int,
+) -> mujoco.MjModel:
+    low, high = extent
+    spec = build_spec(car, visual=True)
+    vis = spec.visual
+    vis.global_.offwidth, vis.global_.offheight = width, height
+    vis.headlight.ambient[:] = 0.45
+    vis.headlight.diffuse[:] = 0.35
+    vis.headlight.specular[:] = 0.0
+    vis.map.znear, vis.map.zfar = 0.01, 100.0
+    spec.stat.extent = float(np.max(high - low))
+    # The floor itself is invisible; the image of the track lies on it.
+    spec.geom("floor").rgba = [0, 0, 0, 0]
+    # Textures are shaded differently from plain shapes, so the surrounding ground is a texture, too.
+    pictures = {
+        "track": _draw(track, low, high),
+        "ground": Image.new("RGB", (4, 4), track.floor.ground_color),
+    }
+    spec.assets = {f"{name}.png": _png(picture) for name, picture in pictures.items()}
+    for name in pictures:
+        spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
+        material = spec.add_material(name=name, specular=0.0, reflectance=0.0)
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    plane, middle, half = mujoco.mjtGeom.mjGEOM_PLANE, 0.5 * (low + high), 0.5 * (high - low)
+    seen = {"contype": 0, "conaffinity": 0}
+    for name, pos, size in (
+        ("track", [*middle, 0.001], [*half, 1.0]),
+        ("ground", [0, 0, -0.01], [0, 0, 1]),
+    ):
+        spec.worldbody.add_geom(name=name, type=plane, pos=pos, size=size, material=name, **seen)
+    if view == "top":
+        # From up there the car is a few pixels long: a disc under it.
+        mark_m = 0.025 * float(np.max(high - low))
+        spec.body("chassis").add_geom(
+            name="mark",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            pos=[0, 0, 0.01],
+            size=[mark_m, 0.005, 0],
+            rgba=_MARK_RGBA,
+            mass=0,
+            **seen,
+        )
+    return spec.compile()
+
+
+def _draw(track: Track, low: NDArray[np.float64], high: NDArray[np.float64]) -> Image.Image:
+    """Draw the track from above, x to the right and y up."""
+    scale = _FINER * min(_PIXELS_PER_M, _MOST_PIXELS / float(np.max(high - low)))
+    width, height = (int(size) for size in np.ceil((high - low) * scale))
+    image = Image.new("RGB", (width, height), track.floor.ground_color)
+    draw = ImageDraw.Draw(image)
+
+    def pixels(points: NDArray[np.float64]) -> list[tuple[float, float]]:
+        at = (points - low) * scale
+        return [(x, height - y) for x, y in at.tolist()]
+
+    for part in get_parts(track.road):
+        draw.polygon(pixels(get_coordinates(part.exterior)), fill=track.floor.road_color)
+        for hole in part.interiors:
+            draw.polygon(pixels(get_coordinates(hole)), fill=track.floor.ground_color)
+    for at_m in np.arange(0.0, track.length_m - _DASH_M, 2 * _DASH_M):
+        ends = track.points_at(np.array([at_m, at_m + _DASH_M]) / track.length_m)
+        draw.line(pixels(ends), fill=_DASH_COLOR, width=max(1, round(_DASH_WIDTH_M * scale)))
+    border = max(2, round(_BORDER_M * scale))
+    for side in (track.inner, track.outer):
+        draw.line(pixels(side), fill=track.floor.line_color, width=border, joint="curve")
+    draw.line(pixels(np.stack([track.inner[0], track.outer[0]])), fill="#ffffff", width=2 * border)
+    # Drawn at a higher resolution and reduced, for smooth edges.
+    return image.reduce(_FINER)
+
+
+def _png(image: Image.Image) -> bytes:
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return file.getvalue()
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """One control step of all trials."""
+
+    rows: NDArray[np.float64]
+    """Columns `_COLUMNS`, (N, 6)."""
+    clock_s: NDArray[np.float64]
+
+
+class LapVideo:
+    """Records all trials while they are driven, then renders the best lap."""
+
+    def __init__(self, evaluator: Evaluator, file: Path, view: View):
+        """Prepare a video.
+
+        Args:
+            evaluator: that will drive.
+            file: an .mp4 to write.
+            view: from behind the car or from above.
+
+        Raises:
+            BadInput: the file is not an .mp4, or its folder does not exist.
+        """
+        if file.suffix != ".mp4" or not file.parent.is_dir():
+            raise BadInput(f"--video {file}: accepted: an .mp4 in an existing folder")
+        self.file, self._view = file, view
+        self._evaluator = evaluator
+        self._moments: list[_Moment] = []
+
+    def record(self, race: Race, protocol: RaceProtocol) -> None:
+        """Record one control step."""
+        self._moments.append(_Moment(race.trace[:, _COLUMNS], protocol.clock_s.copy()))
+
+    def write(self, evaluation: Evaluation, err: Console) -> None:
+        """Render the fastest lap on the usual conditions, or the one with the most progress if none is complete.
+
+        Raises:
+            RunFailed: the file cannot be written.
+        """
+        best = max(
+            evaluation.on(USUAL).attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress)
+        )
+        trial, setup = self._evaluator.trials[best.trial], self._evaluator.race.setup
+        course = setup.courses[trial.course]
+        hertz = setup.car.control_hz
+        rows = self._lap(best)
+        driven_m = np.cumsum(rows[:, 4]) / hertz
+        title = f"{course.tracks[0].title} · {trial.condition.replace('_', ' ')}"
+        with LapRenderer(course.tracks[0], setup.car, self._view, WIDTH, HEIGHT) as renderer:
+            writer = write_frames(str(self.file), (WIDTH, HEIGHT), fps=hertz, quality=8, macro_block_size=16)
+            try:
+                writer.send(None)
+                for at in with_progress(range(len(rows)), "rendering", console=err, transient=True):
+                    x, y, yaw_deg, steer_deg, speed_mps, progress, clock_s = rows[at]
+                    picture = renderer.draw(x, y, np.radians(yaw_deg), np.radians(steer_deg), driven_m[at])
+                    frame = _overlay(picture, title, clock_s - best.begin_s, speed_mps, progress)
+                    writer.send(frame)
+                for _ in range(round(_LINGER_S * hertz)):
+                    writer.send(frame)
+            except OSError as error:
+                raise RunFailed(f"{self.file}: cannot be written: {error.strerror or error}") from error
+            finally:
+                writer.close()
+
+    def _lap(self, lap: Attempt) -> NDArray[np.float64]:
+        """Return the rows of a lap, columns `_COLUMNS` and the race clock."""
+        rows = np.array([np.r_[m.rows[lap.trial], m.clock_s[lap.trial]] for m in self._moments])
+        clock_s = rows[:, -1]
+        # The clock of a finished trial stands still.
+        going = np.r_[True, np.diff(clock_s) > 0]
+        return rows[going & (clock_s >= lap.begin_s - 1e-9) & (clock_s <= lap.begin_s + lap.time_s + 1e-9)]
+
+
+def _overlay(
+    picture: NDArray[np.uint8], title: str, lap_s: float, speed_mps: float, progress: float
+) -> NDArray[np.uint8]:
+    """Draw lap time, speed and progress onto a frame."""
+    image = Image.fromarray(picture).convert("RGBA")
+    shade = Image.new("RGBA", image.size)
+    draw = ImageDraw.Draw(shade)
+    large, small = _font(34), _font(18)
+    right = 330
+    draw.rounded_rectangle((16, 16, right + 14, 122), 10, fill=(0, 0, 0, 150))
+    draw.text((30, 22), title, font=small, fill=(235, 235, 235, 255))
+    white = (255, 255, 255, 255)
+    # Right-aligned, so that the numbers do not jump.
+    draw.text((150, 46), f"{lap_s:.2f} s", font=large, fill=white, anchor="ra")
+    draw.text((right, 46), f"{max(speed_mps, 0.0):.2f} m/s", font=large, fill=white, anchor="ra")
+    # A flying lap starts with the last pose of the previous one, which has that lap's progress.
+    share = float(np.clip(progress, 0.0, 100.0)) / 100 if lap_s > 0 else 0.0
+    draw.rectangle((30, 98, right, 108), fill=(255, 255, 255, 60))
+    draw.rectangle((30, 98, 30 + (right - 30) * share, 108), fill=(245, 166, 35, 255))
+    framed: NDArray[np.uint8] = np.asarray(Image.alpha_composite(image, shade).convert("RGB"))
+    return np.ascontiguousarray(framed)
+
+
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)

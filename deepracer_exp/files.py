@@ -1,0 +1,191 @@
+"""Files that users give, read with limits (regular files alone), and files written atomically."""
+
+import contextlib
+import json
+import os
+import stat
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, TypeVar
+
+import yaml
+
+from deepracer_exp.errors import BadInput, reading
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+Content = TypeVar("Content")
+
+SETTINGS_BYTES = 2**20
+"""Of a file that people write: YAML, JSON, a reward function. None comes near it; a larger one is another file."""
+ROUTE_BYTES = 2**21
+"""Of a route: more than 40,000 rows, a hundred times the longest of the service."""
+RECORD_BYTES = 2**30
+"""Of a file that a training writes; metrics.jsonl has about 1 KB an iteration."""
+LOG_BYTES = 2**32
+"""Of a log or an archive, and of a file packed in it; the largest known logs have hundreds of megabytes."""
+
+_MOST_VALUES = 100_000
+_DEEPEST = 50
+
+# The parser in C takes a seventh of the time, and an experiment has hundreds of runs.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes]:
+    """Open a file for reading.
+
+    Args:
+        path: of the file.
+        accepted: what would be, for messages.
+        most_bytes: that a file of its kind can have.
+
+    Raises:
+        BadInput: it is not there, no regular file (a pipe or a device never ends), larger, or cannot be read.
+    """
+    with reading(path, accepted):
+        found = Path(path).stat()
+        if not stat.S_ISREG(found.st_mode):
+            kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no file")
+            raise BadInput(f"{path}: is {kind}; accepted: {accepted}")
+        _check_size(path, found.st_size, accepted, most_bytes)
+        return Path(path).open("rb")
+
+
+def read_bytes(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> bytes:
+    """Return what a file holds; arguments and errors as of `open_user_file`."""
+    with open_user_file(path, accepted, most_bytes) as file, reading(path, accepted):
+        raw = file.read(most_bytes + 1)
+    _check_size(path, len(raw), accepted, most_bytes)
+    return raw
+
+
+def read_text(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> str:
+    """Return the text of a file in UTF-8; arguments and errors as of `open_user_file`."""
+    raw = read_bytes(path, accepted, most_bytes)
+    with reading(path, accepted):
+        # Editors on Windows put a byte order mark at the beginning.
+        return raw.decode("utf-8-sig")
+
+
+def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
+    """Return what a JSON file holds.
+
+    Args:
+        path: of the file.
+        accepted: what would be, for messages.
+        raw: its bytes where they are known: of a member of an archive, or taken out of a log.
+
+    Raises:
+        BadInput: it cannot be read, is too large, or not JSON.
+    """
+    raw = read_bytes(path, accepted) if raw is None else raw
+    _check_size(path, len(raw), accepted, SETTINGS_BYTES)
+    with reading(f"{path}: not JSON", accepted):
+        return json.loads(raw.decode("utf-8-sig"))
+
+
+def read_yaml(
+    path: str | Path, accepted: str, load: Callable[[str], Content] | None = None, raw: bytes | None = None
+) -> Content | Any:
+    """Return what a YAML file holds, as plain values.
+
+    Args:
+        path: of the file.
+        accepted: what would be, for messages.
+        load: turns the text into something else than plain values.
+        raw: its bytes where they are known.
+
+    Raises:
+        BadInput: it cannot be read, is too large, not YAML, holds itself, or has more values, aliases counted each
+            time, or more levels than a hand-written file.
+    """
+    raw = read_bytes(path, accepted) if raw is None else raw
+    _check_size(path, len(raw), accepted, SETTINGS_BYTES)
+    with reading(f"{path}: not YAML", accepted):
+        text = raw.decode("utf-8-sig")
+        _check_structure(text)
+        return _LOADER(text).get_single_data() if load is None else load(text)
+
+
+def read_json_as(file: Path, adapter: "TypeAdapter[Content]", writer: str) -> Content | None:
+    """Read a JSON file whose keys and types are those of a dataclass; None where there is no file.
+
+    Args:
+        file: to read.
+        adapter: of the dataclass.
+        writer: who writes such files, for messages: ``a clone``.
+
+    Raises:
+        BadInput: the file cannot be read or holds something else.
+    """
+    if not os.path.lexists(file):
+        return None
+    from pydantic import ValidationError
+
+    raw = read_bytes(file, f"what {writer} writes there")
+    try:
+        return adapter.validate_json(raw, strict=True)
+    except ValidationError as error:
+        finding = error.errors(include_url=False)[0]
+        where = "".join(f" {part}:" for part in finding["loc"])
+        raise BadInput(f"{file}:{where} {finding['msg']}; accepted: what {writer} writes there") from error
+
+
+def atomic_write(path: Path, text: str) -> Path:
+    """Write a file completely or not at all; of several processes that write it at once, the last one wins."""
+    # Each in a file of its own: what another process moved into place would be missing here.
+    aside = path.with_name(f".{uuid.uuid4().hex}.tmp")
+    try:
+        aside.write_text(text, encoding="utf-8")
+        return aside.replace(path)
+    except BaseException:
+        # A disk that takes no file may refuse to delete one as well.
+        with contextlib.suppress(OSError):
+            aside.unlink(missing_ok=True)
+        raise
+
+
+def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> None:
+    if size > most_bytes:
+        raise BadInput(f"{path}: is larger than {most_bytes // 2**20} MiB; accepted: {accepted}")
+
+
+def _check_structure(text: str) -> None:
+    """Refuse what would not come to an end: a few lines of aliases can stand for billions of values."""
+    known: dict[str, tuple[int, int]] = {}
+    open_nodes: list[list[Any]] = [[None, 0, 0]]  # anchor, values and levels of each that is open
+    for event in yaml.parse(text, _LOADER):
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append([event.anchor, 1, 0])
+            if len(open_nodes) > _DEEPEST:
+                raise ValueError(f"more than {_DEEPEST} levels of lists and mappings")
+            continue
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, values, levels = open_nodes.pop()
+            levels += 1
+        elif isinstance(event, yaml.ScalarEvent):
+            anchor, values, levels = event.anchor, 1, 0
+        elif isinstance(event, yaml.AliasEvent):
+            if event.anchor not in known:
+                raise ValueError(f"alias *{event.anchor} of something that is not complete or not there")
+            anchor, (values, levels) = None, known[event.anchor]
+        else:
+            continue
+        if anchor is not None:
+            known[anchor] = values, levels
+        parent = open_nodes[-1]
+        parent[1] += values
+        parent[2] = max(parent[2], levels)
+        if parent[1] > _MOST_VALUES or len(open_nodes) + parent[2] > _DEEPEST:
+            raise ValueError(f"more than {_MOST_VALUES:,} values or {_DEEPEST} levels")

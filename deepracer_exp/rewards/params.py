@@ -1,0 +1,156 @@
+"""The params dict that a reward function gets, as AWS DeepRacer defines it."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.tracks.track import Track
+
+Waypoints = list[tuple[float, float]]
+Row = tuple[Any, ...]
+
+FLOAT_COLUMNS = (
+    "x",
+    "y",
+    "heading",
+    "distance_from_center",
+    "projection_distance",
+    "progress",
+    "steps",
+    "speed",
+    "steering_angle",
+    "track_width",
+    "sim_time",
+)
+BOOL_COLUMNS = ("all_wheels_on_track", "is_left_of_center", "is_offtrack")
+INDEX_COLUMNS = ("closest_waypoints",)
+COLUMNS = FLOAT_COLUMNS + BOOL_COLUMNS + INDEX_COLUMNS
+"""The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
+
+
+class TrackParams(NamedTuple):
+    """The keys that are constant on a course."""
+
+    waypoints: Waypoints
+    """Centre line of the direction driven, closing point included."""
+    track_length: float
+    """Metres."""
+    is_reversed: bool
+    """Whether the track is driven against its waypoint order."""
+
+    @classmethod
+    def of(cls, track: Track) -> "TrackParams":
+        """Return the constant keys of a course."""
+        return cls([(x, y) for x, y in track.waypoints.tolist()], track.length_m, track.reversed)
+
+
+_DTYPES: dict[str, type] = {
+    **dict.fromkeys(FLOAT_COLUMNS, np.float64),
+    **dict.fromkeys(BOOL_COLUMNS, np.bool_),
+    **dict.fromkeys(INDEX_COLUMNS, np.int64),
+}
+
+
+def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> dict[str, np.ndarray]:
+    """Return the columns of the given cars (None: all), each as a copy of its documented type."""
+    chosen: dict[str, np.ndarray] = {}
+    for key, dtype in _DTYPES.items():
+        column = columns[key]
+        chosen[key] = np.array(column if cars is None else column[cars], dtype=dtype)
+    return chosen
+
+
+def rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row]:
+    """Return one tuple of Python values per car, in the order of `COLUMNS`."""
+    return zip(*(selected[key].tolist() for key in COLUMNS), strict=True)
+
+
+def scalar_params(row: Row, waypoints: Waypoints, track_length: float, is_reversed: bool) -> dict[str, Any]:
+    """Build the 27 keys for one car.
+
+    Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys
+    about other objects hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py).
+
+    Args:
+        row: One tuple of `rows`; lengths in metres, angles in degrees, speed in m/s, time in seconds.
+        waypoints: Centre line of the direction driven, closing point included.
+        track_length: Metres.
+        is_reversed: Whether the track is driven against its waypoint order.
+    """
+    (
+        x,
+        y,
+        heading,
+        distance_from_center,
+        projection_distance,
+        progress,
+        steps,
+        speed,
+        steering_angle,
+        track_width,
+        sim_time,
+        all_wheels_on_track,
+        is_left_of_center,
+        is_offtrack,
+        closest_waypoints,
+    ) = row
+    return {
+        "all_wheels_on_track": all_wheels_on_track,
+        "x": x,
+        "y": y,
+        "heading": heading,
+        "distance_from_center": distance_from_center,
+        "projection_distance": projection_distance,
+        "progress": progress,
+        "steps": steps,
+        "speed": speed,
+        "steering_angle": steering_angle,
+        "track_width": track_width,
+        "track_length": track_length,
+        "waypoints": waypoints[:],
+        "closest_waypoints": closest_waypoints[:],
+        "is_left_of_center": is_left_of_center,
+        "is_reversed": is_reversed,
+        "is_crashed": False,
+        "is_offtrack": is_offtrack,
+        "closest_objects": [0, 0],
+        "objects_location": [],
+        "objects_left_of_center": [],
+        "object_in_camera": False,
+        "objects_speed": [],
+        "objects_heading": [],
+        "objects_distance_from_center": [],
+        "objects_distance": [],
+        "sim_time": sim_time,
+    }
+
+
+def batch_params(
+    selected: Mapping[str, np.ndarray], waypoints: np.ndarray, track_length: float, is_reversed: bool
+) -> dict[str, Any]:
+    """Build the same 27 keys for n cars at once, for `reward_batch`.
+
+    Args:
+        selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2); copied.
+        waypoints: Shape (W, 2); copied.
+        track_length: Metres.
+        is_reversed: Whether the track is driven against its waypoint order.
+    """
+    n = len(selected["x"])
+    return {
+        **{key: column.copy() for key, column in selected.items()},
+        "track_length": track_length,
+        "waypoints": waypoints.copy(),
+        "is_reversed": is_reversed,
+        "is_crashed": np.zeros(n, bool),
+        "closest_objects": np.zeros((n, 2), np.int64),
+        "objects_location": [],
+        "objects_left_of_center": [],
+        "object_in_camera": np.zeros(n, bool),
+        "objects_speed": [],
+        "objects_heading": [],
+        "objects_distance_from_center": [],
+        "objects_distance": [],
+    }

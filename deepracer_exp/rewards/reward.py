@@ -1,0 +1,314 @@
+"""Calls reward functions for many cars, guarded and checked."""
+
+import itertools
+import math
+import reprlib
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from types import CodeType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.errors import BadInput, RunFailed
+
+from .guard import CtrlC, DeadlinePassed, Guard, Misconduct
+from .params import TrackParams, batch_params, rows, scalar_params, select
+from .prints import RewardPrints
+from .source import RewardSource, source_with_constants
+
+MAX_REWARD = 1e5
+"""Larger absolute rewards end the job on the service (deepracer-simapp rollout_agent_ctrl.py)."""
+
+
+class RewardFailed(RunFailed):
+    """A reward function raised, timed out or returned something that is not a reward."""
+
+    def __init__(
+        self,
+        message: str,
+        params: dict[str, Any] | None = None,
+        car: int | None = None,
+        what: str = "",
+        hung: bool = False,
+    ) -> None:
+        super().__init__(message)
+        self.what = what
+        """Part of the message: what the function did, and in which line."""
+        self.hung = hung
+        self.params = params
+        """The params of the call (`reward_batch`: of all cars, if the car is not known)."""
+        self.car = car
+
+
+class RewardFunction:
+    """One reward module, run for `n_cars` cars.
+
+    Each car has its own module namespace, as on the service, where a process has one car: global variables persist
+    from call to call and are not shared between cars. They are not part of a checkpoint. A module with
+    `reward_batch(params)` is loaded once and called once a step for all cars of a course instead.
+
+    Args:
+        source: The module; its overriding constants are set.
+        n_cars: Number of cars.
+        time_limit_s: Seconds of CPU for all calls of one step (see `Guard` for where it holds).
+        prints: Where `print` goes; None discards it.
+        scalar: Call `reward_function` even where the module has `reward_batch`.
+
+    Raises:
+        BadInput: The module cannot be run or has no callable `reward_function` or `reward_batch`.
+    """
+
+    def __init__(
+        self,
+        source: RewardSource,
+        n_cars: int,
+        time_limit_s: float,
+        prints: RewardPrints | None,
+        scalar: bool = False,
+    ) -> None:
+        self.source = source
+        self.n_cars = n_cars
+        self.time_limit_s = time_limit_s
+        code = compile(source_with_constants(source), source.path, "exec", dont_inherit=True)
+        # Names that the module binds at its top level are listed in its code.
+        self._is_batch = not scalar and "reward_batch" in code.co_names
+        name = "reward_batch" if self._is_batch else "reward_function"
+        cars = [None] if self._is_batch else list(range(n_cars))
+        try:
+            with Guard(time_limit_s):
+                self._functions = [self._load(code, name, prints, car) for car in cars]
+        except CtrlC:
+            raise
+        except BaseException as error:  # noqa: BLE001 - raised again as one of ours
+            what, cause = self.what_happened(error)
+            how = "" if isinstance(error, Unusable) else "cannot be run: "
+            raise BadInput(f"{source.path}: {how}{what}") from cause
+        self._track_params: Sequence[TrackParams] = ()
+        self._waypoints: list[np.ndarray] = []
+
+    def __call__(
+        self,
+        columns: Mapping[str, np.ndarray],
+        track_params: Sequence[TrackParams],
+        active: NDArray[np.bool_] | None = None,
+        track_index: NDArray[np.intp] | None = None,
+    ) -> NDArray[np.float64]:
+        """Return the reward of every car, shape (n_cars,); 0 for the cars that are not active.
+
+        A module with `reward_batch` takes any number of cars.
+
+        Args:
+            columns: `params.COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
+            track_params: Params that are constant on each of the courses.
+            active: Cars to reward, shape (n_cars,); None: all.
+            track_index: Index in `track_params` of each car's course, shape (n_cars,); None: all drive on the first.
+
+        Raises:
+            RewardFailed: The function raised, timed out, or returned no finite number within +-`MAX_REWARD`.
+        """
+        n = len(columns["x"])
+        rewards = np.zeros(n)
+        cars = np.arange(n) if active is None else np.flatnonzero(active)
+        if len(cars):
+            track_of = np.zeros(len(cars), np.intp) if track_index is None else track_index[cars]
+            if len(track_params) > 1:
+                order = np.argsort(track_of, kind="stable")
+                cars, track_of = cars[order], track_of[order]
+            call = self._call_batch if self._is_batch else self._call_each
+            rewards[cars] = call(select(columns, cars), track_params, track_of, cars.tolist())
+        return rewards
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether `reward_batch` is called for all cars at once."""
+        return self._is_batch
+
+    @property
+    def functions(self) -> Sequence[Callable[[dict[str, Any]], object]]:
+        """The modules' own functions, without checks and time limit."""
+        return self._functions
+
+    def pay(self, params: dict[str, Any]) -> float:
+        """Return the reward of the first car's module (`scalar`) for given params; call it inside a `Guard`.
+
+        Raises:
+            RewardFailed: The function raised, timed out, or returned no finite number within +-`MAX_REWARD`.
+        """
+        given = dict(params)
+        try:
+            return _as_reward(self._functions[0](params))
+        except CtrlC:
+            raise
+        except BaseException as error:  # noqa: BLE001 - raised again as one of ours
+            failure, cause = self._failure(error, 0, given)
+            raise failure from cause
+
+    def _load(
+        self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
+    ) -> Callable[[dict[str, Any]], object]:
+        printer = _discard if prints is None else prints.printer(car)
+        namespace: dict[str, Any] = {
+            "__name__": "reward_function",
+            "__file__": self.source.path,
+            "print": printer,
+        }
+        exec(code, namespace)
+        function = namespace.get(name)
+        if not callable(function):
+            raise Unusable(f"{name} is {_short(function)}; accepted: a function")
+        return function
+
+    def _call_each(
+        self,
+        selected: dict[str, np.ndarray],
+        track_params: Sequence[TrackParams],
+        track_of: NDArray[np.intp],
+        cars: list[int],
+    ) -> list[float]:
+        functions = self._functions
+        rewards: list[float] = []
+        table, own_params = list(rows(selected)), [track_params[place] for place in track_of.tolist()]
+        try:
+            with Guard(self.time_limit_s):
+                for car, road, row in zip(cars, own_params, table, strict=True):
+                    reward = functions[car](scalar_params(row, *road))
+                    # A float within the bounds needs no further check; NaN fails the comparison.
+                    if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
+                        reward = _as_reward(reward)
+                    rewards.append(reward)
+        except CtrlC:
+            raise
+        except BaseException as error:  # noqa: BLE001 - raised again as one of ours
+            # There is a reward for each car so far; the time limit may be exceeded right after the last one.
+            at = min(len(rewards), len(cars) - 1)
+            failure, cause = self._failure(error, cars[at], scalar_params(table[at], *own_params[at]))
+            raise failure from cause
+        return rewards
+
+    def _call_batch(
+        self,
+        selected: dict[str, np.ndarray],
+        track_params: Sequence[TrackParams],
+        track_of: NDArray[np.intp],
+        cars: list[int],
+    ) -> NDArray[np.float64]:
+        """Call the function once per course; the cars of a course are adjacent."""
+        if track_params is not self._track_params:
+            self._track_params = track_params
+            self._waypoints = [np.array(road.waypoints, dtype=float).reshape(-1, 2) for road in track_params]
+        rewards = np.empty(len(cars))
+        bounds = [0, *(np.flatnonzero(np.diff(track_of)) + 1).tolist(), len(cars)]
+
+        def params(first: int, last: int) -> dict[str, Any]:
+            part = {key: column[first:last] for key, column in selected.items()}
+            place = track_of[first]
+            _, length, is_reversed = track_params[place]
+            return batch_params(part, self._waypoints[place], length, is_reversed)
+
+        at = (0, len(cars))
+        try:
+            with Guard(self.time_limit_s):
+                for at in itertools.pairwise(bounds):
+                    rewards[slice(*at)] = _as_rewards(self._functions[0](params(*at)), at[1] - at[0])
+        except CtrlC:
+            raise
+        except BaseException as error:  # noqa: BLE001 - raised again as one of ours
+            failure, cause = self._failure(error, None, params(*at))
+            raise failure from cause
+        bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
+        if len(bad):
+            row, road = list(rows(selected))[bad[0]], track_params[track_of[bad[0]]]
+            no_reward = Unusable(_no_reward(float(rewards[bad[0]])))
+            raise self._failure(no_reward, cars[bad[0]], scalar_params(row, *road))[0]
+        return rewards
+
+    def _failure(
+        self, error: BaseException, car: int | None, params: dict[str, Any]
+    ) -> tuple[RewardFailed, Exception | None]:
+        """Return the exception to raise for an error of the function, and its cause."""
+        function = "reward_batch" if self._is_batch else "reward_function"
+        where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
+        what, cause = self.what_happened(error)
+        message = f"reward {self.source.name}: {function} {what} ({where})"
+        return RewardFailed(message, params, car, what, isinstance(error, DeadlinePassed)), cause
+
+    def what_happened(self, error: BaseException) -> tuple[str, Exception | None]:
+        """Describe an error of the module's code in one line with its place; also return its traceback as a cause.
+
+        The error itself is not passed on: printing it would run code of the module (`__str__`, `__repr__`) without a
+        guard.
+        """
+        if isinstance(error, Unusable):
+            return str(error), None
+        line, trace = 0, error.__traceback__
+        while trace is not None:
+            if trace.tb_frame.f_code.co_filename == self.source.path:
+                line = trace.tb_lineno
+            trace = trace.tb_next
+        place = f" in line {line} of {self.source.path}" if line else ""
+        try:
+            with Guard(self.time_limit_s):
+                if isinstance(error, Misconduct):
+                    said = str(error)
+                else:
+                    message = _one_line(str(error))
+                    said = f"raised {type(error).__name__}{': ' + message if message else ''}"
+                return said + place, _Traceback("".join(traceback.format_exception(error)))
+        except CtrlC:
+            raise
+        except BaseException:  # noqa: BLE001 - of the error's own code
+            return f"raised an error that cannot be printed{place}", None
+
+
+class _Traceback(Exception):  # noqa: N818 - as `multiprocessing` has it for errors of other processes
+    """The traceback of an error in a reward function, as text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(f"\n{text}")
+
+
+class Unusable(Exception):  # noqa: N818 - reads as what it is at the raise site
+    """A reward module returned or defined something that cannot be used."""
+
+
+def _as_reward(value: object) -> float:
+    """Return `float(value)`, as AWS computes it; text is refused, although `float("1")` would work."""
+    if isinstance(value, str | bytes | bytearray):
+        raise Unusable(_no_reward(value))
+    try:
+        reward = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError) as error:
+        raise Unusable(_no_reward(value)) from error
+    if not math.fabs(reward) <= MAX_REWARD:
+        raise Unusable(_no_reward(value))
+    return reward
+
+
+def _as_rewards(value: object, n: int) -> NDArray[np.float64]:
+    try:
+        rewards = np.asarray(value)
+    except ValueError as error:  # rows of different lengths
+        raise Unusable(_no_reward(value)) from error
+    if rewards.shape != (n,) or rewards.dtype.kind not in "biuf":
+        shape = f"{rewards.dtype} of shape {rewards.shape}"
+        raise Unusable(f"returned {shape}; accepted: one number a car, shape ({n},)")
+    return rewards.astype(np.float64)
+
+
+def _no_reward(value: object) -> str:
+    return f"returned {_short(value)}; accepted: a finite number from {-MAX_REWARD:g} to {MAX_REWARD:g}"
+
+
+def _short(value: object) -> str:
+    return _one_line(reprlib.repr(value))
+
+
+def _one_line(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= 300 else f"{text[:300]}..."
+
+
+def _discard(*values: object, **options: object) -> None:
+    """Stand in for `print` where there is no log."""

@@ -1,0 +1,191 @@
+"""The source of a reward function: found, checked without being run, its constants set."""
+
+import ast
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+from deepracer_exp.config.driving import RewardConfig
+from deepracer_exp.errors import BadInput, nearest, reading
+from deepracer_exp.files import read_bytes
+
+
+@dataclass(frozen=True)
+class RewardSource:
+    """One reward function module, as text."""
+
+    name: str
+    path: str
+    text: str
+    sha256: str
+    """Of the file's bytes, before constants are set."""
+    constants: Mapping[str, int | float]
+    """The tunable constants and their values in the file."""
+    overrides: Mapping[str, int | float]
+    """The values that replace them."""
+
+
+def zoo_names() -> list[str]:
+    """Return the names of the reward functions that come with the project, sorted."""
+    files = (file.name for file in resources.files("reward_zoo").iterdir())
+    return sorted(name[:-3] for name in files if name.endswith(".py") and not name.startswith("_"))
+
+
+def load_reward_source(config: RewardConfig) -> RewardSource:
+    """Read the reward function that `config` names and check it without running it.
+
+    Raises:
+        BadInput: Unknown name; the file is missing, no file, not UTF-8, not Python, without a
+            `reward_function` of one argument; a constant that the module does not have.
+    """
+    if config.file is None:
+        name, path, data = config.name, *_zoo_file(config.name)
+    else:
+        name, path, data = Path(config.file).stem, config.file, read_bytes(config.file, "a Python file")
+    text = _decode(path, data)
+    tree = _parse(path, text)
+    _check_function(path, tree)
+    constants = {constant: ast.literal_eval(value) for constant, value in _constants(tree)}
+    overrides = {
+        key: _like(constants[key], value)
+        for key, value in config.constants.items()
+        if _known_constant(path, key, constants)
+    }
+    return RewardSource(name, path, text, hashlib.sha256(data).hexdigest(), constants, overrides)
+
+
+def named_reward_source(reward: str) -> RewardSource:
+    """Read a reward function of the zoo by its name, or any by its file.
+
+    Raises:
+        BadInput: as for `load_reward_source`.
+    """
+    is_file = reward not in zoo_names() and (reward.endswith(".py") or Path(reward).exists())
+    file = reward if is_file else None
+    return load_reward_source(RewardConfig(name=reward, file=file, constants={}, time_limit_s=1.0))
+
+
+def source_with_constants(source: RewardSource) -> str:
+    """Return the module's text with the overriding values in place; everything else is unchanged."""
+    lines = source.text.encode().split(b"\n")
+    found = [
+        (value, source.overrides[name])
+        for name, value in _constants(ast.parse(source.text))
+        if name in source.overrides
+    ]
+    # From the last to the first, so that earlier positions stay valid.
+    for node, value in reversed(found):
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        first, last = node.lineno - 1, node.end_lineno - 1
+        before, after = lines[first][: node.col_offset], lines[last][node.end_col_offset :]
+        lines[first : last + 1] = [before + repr(value).encode() + after]
+    return b"\n".join(lines).decode()
+
+
+def is_of_zoo(text: str) -> bool:
+    """Return whether a module is one of the reward zoo, up to the values of its constants; nothing is run."""
+    try:
+        asked = _without_values("reward function", text)
+    except BadInput:
+        return False
+    return any(asked == _without_values(name, _decode(*_zoo_file(name))) for name in zoo_names())
+
+
+def _without_values(path: str, text: str) -> str:
+    zeros = {name: 0 for name, _ in _constants(_parse(path, text))}
+    return source_with_constants(RewardSource(path, path, text, "", {}, zeros))
+
+
+def _zoo_file(name: str) -> tuple[str, bytes]:
+    known = zoo_names()
+    if name not in known:
+        raise BadInput(
+            f"reward.name: {name!r} is not in the reward zoo{nearest(name, known)}: {', '.join(known)}"
+        )
+    file = resources.files("reward_zoo") / f"{name}.py"
+    return str(file), file.read_bytes()
+
+
+def _decode(path: str, data: bytes) -> str:
+    with reading(path, "a Python file"):
+        text = data.decode("utf-8-sig")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _parse(path: str, text: str) -> ast.Module:
+    try:
+        # Compiling finds what parsing lets through, such as a `return` outside a function.
+        compile(text, path, "exec", dont_inherit=True)
+        return ast.parse(text, filename=path)
+    except SyntaxError as error:
+        raise BadInput(f"{path}: line {error.lineno}: {error.msg}; this is not valid Python") from error
+    except (ValueError, RecursionError, MemoryError) as error:  # null bytes; nesting too deep for the parser
+        raise BadInput(f"{path}: is not valid Python: {error or 'too deeply nested'}") from error
+
+
+def _check_function(path: str, tree: ast.Module) -> None:
+    functions = {
+        node.name: node for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }
+    function = functions.get("reward_function")
+    if function is None:
+        assigned = {
+            t.id for n in tree.body if isinstance(n, ast.Assign) for t in n.targets if isinstance(t, ast.Name)
+        }
+        # The service also accepts a callable object of that name; it is checked when the module is run.
+        if "reward_function" not in assigned:
+            hint = nearest("reward_function", functions)
+            raise BadInput(f"{path}: has no function reward_function(params){hint}")
+        return
+    where = f"{path}: line {function.lineno}"
+    if isinstance(function, ast.AsyncFunctionDef):
+        raise BadInput(f"{where}: reward_function must be a plain function, not an async one")
+    for name in ("reward_function", "reward_batch"):
+        candidate = functions.get(name)
+        if candidate is not None and not _takes_one_argument(candidate.args):
+            line = f"{path}: line {candidate.lineno}"
+            raise BadInput(
+                f"{line}: {name}({ast.unparse(candidate.args)}) must take one argument: {name}(params)"
+            )
+
+
+def _takes_one_argument(args: ast.arguments) -> bool:
+    positional = len(args.posonlyargs) + len(args.args)
+    required = positional - len(args.defaults)
+    return required <= 1 and (positional >= 1 or args.vararg is not None) and None not in args.kw_defaults
+
+
+def _constants(tree: ast.Module) -> Iterator[tuple[str, ast.expr]]:
+    """Yield name and value node of every `NAME = number` at the top level of the module."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and len(node.targets) == 1:
+            target, value = node.targets[0], node.value
+        elif isinstance(node, ast.AnnAssign) and node.value is not None:
+            target, value = node.target, node.value
+        else:
+            continue
+        if isinstance(target, ast.Name) and target.id.isupper() and target.id[0] != "_" and _is_number(value):
+            yield target.id, value
+
+
+def _is_number(node: ast.expr) -> bool:
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+        node = node.operand
+    return isinstance(node, ast.Constant) and type(node.value) in (int, float)
+
+
+def _known_constant(path: str, key: str, constants: Mapping[str, object]) -> bool:
+    if key not in constants:
+        known = ", ".join(constants) or "none; a constant is a line NAME = number with NAME in capitals"
+        raise BadInput(
+            f"reward.constants.{key}: {path} has no such constant{nearest(key.upper(), constants)}: {known}"
+        )
+    return True
+
+
+def _like(original: int | float, value: float) -> int | float:
+    """Return a whole number as an int where the file has an int, so that `range(STEPS)` keeps working."""
+    return int(value) if isinstance(original, int) and float(value).is_integer() else float(value)

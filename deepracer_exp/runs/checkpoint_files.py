@@ -1,0 +1,117 @@
+"""What stands beside the tensors of checkpoints: hashes of their files, and which of them nobody may remove."""
+
+import hashlib
+import json
+from pathlib import Path
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import atomic_write
+
+HASHES = "hashes.json"
+LINKS = ("best", "last")
+_PINNED = "pinned.json"
+
+
+def write_hashes(folder: Path) -> None:
+    """Write the SHA-256 of every file of a checkpoint into `hashes.json` beside them."""
+    hashes = {path: _sha256(folder / path) for path in _files(folder)}
+    (folder / HASHES).write_text(json.dumps(hashes, indent=1) + "\n", encoding="utf-8")
+
+
+def verify(folder: Path) -> None:
+    """Compare a checkpoint's files with its `hashes.json`.
+
+    Raises:
+        BadInput: a file is missing, was added or changed, or cannot be read.
+    """
+    try:
+        wanted = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
+        found = {path: _sha256(folder / path) for path in _files(folder)}
+    except (OSError, ValueError, TypeError) as error:
+        raise BadInput(f"{folder}: torn: {HASHES} cannot be used: {error}") from error
+    if found != wanted:
+        changed = sorted(set(found.items()) ^ set(wanted.items()))
+        raise BadInput(f"{folder}: torn: {changed[0][0]} is not as it was written")
+
+
+def find_checkpoint(folder: Path, name: str) -> Path:
+    """Return the folder of a checkpoint, or the link to it; a `last` that is missing has others in its place.
+
+    Args:
+        folder: `checkpoints/` of a run.
+        name: `best`, `last` or the number of an iteration.
+
+    Raises:
+        BadInput: there is no such checkpoint, or it lies elsewhere.
+    """
+    if not (name.isdecimal() or name in LINKS):
+        raise BadInput(f"checkpoint={name}: a checkpoint is best, last or the number of an iteration")
+    path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
+    kept = kept_checkpoints(folder)
+    if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
+        known = ", ".join(
+            [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
+        )
+        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known or 'none'}")
+    if path.exists() and path.resolve().parent != folder.resolve():
+        raise BadInput(
+            f"checkpoint={name}: {path} leads out of its folder to {path.resolve()}; give a number"
+        )
+    return path
+
+
+def kept_checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints of a run, not the links to them, newest first."""
+    if not folder.is_dir():
+        return []
+    own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
+    # `best` is a folder of its own where links were followed as the run was copied.
+    known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
+    return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
+
+
+def checkpoint_sha256(folder: Path) -> str:
+    """Return one hash for all files of a checkpoint: that of its `hashes.json`."""
+    return _sha256(folder / HASHES)
+
+
+def pin(checkpoints: Path, name: str, why: str) -> None:
+    """Note that a checkpoint must stay.
+
+    Args:
+        checkpoints: `checkpoints/` of a run.
+        name: of the checkpoint's own folder, e.g. ``000120``.
+        why: told to who wants to remove it.
+    """
+    pins = pinned(checkpoints)
+    if why in pins.setdefault(name, []):
+        return
+    pins[name].append(why)
+    atomic_write(checkpoints / _PINNED, json.dumps(pins, indent=1) + "\n")
+
+
+def pinned(checkpoints: Path) -> dict[str, list[str]]:
+    """Return the checkpoints that must stay, with the reasons.
+
+    Raises:
+        BadInput: the file that tells cannot be read.
+    """
+    file = checkpoints / _PINNED
+    if not file.exists():
+        return {}
+    try:
+        return {
+            str(name): list(reasons) for name, reasons in json.loads(file.read_text(encoding="utf-8")).items()
+        }
+    except (OSError, ValueError, AttributeError) as error:
+        raise BadInput(f"{file}: cannot be read: {error}; nothing in {checkpoints} is removed") from error
+
+
+def _files(folder: Path) -> list[str]:
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return sorted(path.relative_to(folder).as_posix() for path in found if path != folder / HASHES)
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -1,0 +1,483 @@
+"""Convergence and overfitting: the rules by which a run stops, and by which a report judges a training.
+
+`Stopping` decides row by row while a run is trained. `convergence` and `overfitting` judge a whole table of iterations,
+for reports: of a run of ours with the values of its own rule, of other logs with `LOG_RULE`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from deepracer_exp.config.stopping import (
+    CollapsedRule,
+    ConvergedRule,
+    EntropyStopping,
+    NotLearningRule,
+    OverfittingRule,
+    PlateauStopping,
+    ReliableStopping,
+    StoppingConfig,
+)
+
+Row = Mapping[str, Any]
+"""One line of metrics.jsonl."""
+
+EVALUATED = ("eval_completion", "held_out_completion")
+"""Columns that only the rows of evaluated iterations have."""
+_STEPS = 1000  # laps are counted per so many control steps: iterations differ in length
+
+
+LOG_RULE = ConvergedRule(
+    warmup=0,
+    patience=10,
+    completion_near=5.0,
+    completion_gain=2.0,
+    return_gain=0.05,
+    laps_gain=0.05,
+    entropy_change=0.1,
+    best_patience=60,
+    best_gain=0.01,
+)
+"""The values of `conf/stopping/entropy.yaml`, with the patience that suits the shorter logs of others."""
+PATIENCE_SHARE = 0.2
+"""Share of all iterations of such a log that must be without growth."""
+POOR = 50.0
+"""Completion below which a training that no longer grows has not learned to drive, per cent."""
+EVALUATION_DROP = 10.0
+"""Fall of the evaluation from its best that counts, in points of completion."""
+UNDECIDED = {"stopping.rule": "none", "stopping.hopeless": "false"}
+"""Tags of a run that is resumed after a rule had ended it; the values by which it did stay beside them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """Why a run should end."""
+
+    rule: str
+    """`reliable`, `plateau`, `converged`, `overfitting`, `collapsed` or `not_learning`."""
+    why: str
+    """The rule's reason in words."""
+    values: dict[str, float]
+    """What was compared; entropy as a share, see `entropy_share`."""
+    thresholds: dict[str, Any]
+    """The keys of the rule."""
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether more training would have led nowhere, so that the result is of no use."""
+        return self.rule in ("collapsed", "not_learning")
+
+    def __str__(self) -> str:
+        """Return rule and reason, e.g. ``reliable: 94% of the last 50 episodes completed the lap``."""
+        return f"{self.rule.replace('_', ' ')}: {self.why}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for summary.json."""
+        return {**asdict(self), "hopeless": self.hopeless}
+
+    def tags(self) -> dict[str, str]:
+        """Return it as tags of a run."""
+        numbers = [("value", self.values), ("threshold", self.thresholds)]
+        return {
+            "stopping.rule": self.rule,
+            "stopping.hopeless": str(self.hopeless).lower(),
+            **{
+                f"stopping.{kind}.{key}": f"{value:.4g}" if isinstance(value, float) else str(value)
+                for kind, found in numbers
+                for key, value in found.items()
+            },
+        }
+
+
+def entropy_share(entropy: float, at_start: float, action_count: int | None) -> float:
+    """Return a policy's entropy as a share.
+
+    Args:
+        entropy: in nats.
+        at_start: the entropy at the start of the run; looked at for a continuous policy only.
+        action_count: number of discrete actions, None for the two continuous ones.
+
+    Returns:
+        For a discrete policy its entropy over that of a choice by chance, log(n): 1 to 0. A continuous policy's
+        entropy may be negative, so no ratio has a meaning; exp((entropy - start) / 2), for two normal
+        distributions, is the ratio of their scatter (geometric mean of the standard deviations): 1 at the start.
+    """
+    if action_count is None:
+        return math.exp(min((entropy - at_start) / 2, 700.0))
+    return entropy / math.log(action_count) if action_count > 1 else 0.0
+
+
+class Stopping:
+    """A stopping rule and what it has seen of a run; the same rows give the same decisions."""
+
+    def __init__(self, config: StoppingConfig, action_count: int | None):
+        """Set up the rule.
+
+        Args:
+            config: the stopping group.
+            action_count: number of discrete actions, None for a continuous action space.
+        """
+        self._config = config
+        self._action_count = action_count
+        self._entropy_at_start: float | None = None
+        self._before = (0, 0)
+        window = config.window if isinstance(config, PlateauStopping | EntropyStopping) else 1
+        names = ("entropy", "completion", "mean_return", "laps_per_1000_steps", *EVALUATED)
+        self._seen = {name: _Average(window) for name in names}
+        self._race_scores_s: list[float] = []  # infinite where none is known
+        self._rows = 0
+
+    def observe(self, row: Row) -> Decision | None:
+        """Return why the run should end after this iteration, None to go on; rows come in their order."""
+        config = self._config
+        if isinstance(config, ReliableStopping):
+            return _reliable(config, row)
+        if not isinstance(config, PlateauStopping | EntropyStopping):
+            return None
+        self._rows += 1
+        for name, value in self._watched(row).items():
+            self._seen[name].add(value)
+        score_s = row.get("eval_race_score_s")
+        self._race_scores_s.append(math.inf if score_s is None else score_s)
+        return self._plateau(config) if isinstance(config, PlateauStopping) else self._entropy(config)
+
+    def _watched(self, row: Row) -> dict[str, float | None]:
+        entropy = row.get("entropy")
+        if self._entropy_at_start is None:
+            self._entropy_at_start = entropy
+        (laps, steps), self._before = self._before, (row["laps"], row["env_steps"])
+        share = None
+        if entropy is not None and self._entropy_at_start is not None:
+            share = entropy_share(entropy, self._entropy_at_start, self._action_count)
+        return {
+            "entropy": share,
+            "laps_per_1000_steps": _STEPS * (row["laps"] - laps) / max(row["env_steps"] - steps, 1),
+            **{name: row.get(name) for name in ("completion", "mean_return", *EVALUATED)},
+        }
+
+    def _plateau(self, config: PlateauStopping) -> Decision | None:
+        series = self._seen[config.metric]
+        if self._rows <= max(config.warmup, config.patience) or not series.known(config.patience):
+            return None
+        before, since = series.bests(config.patience)
+        if since > before + config.gain * series.range:
+            return None
+        return _decision(
+            "plateau",
+            f"{config.metric} has not grown for {config.patience} iterations",
+            {f"{config.metric}_before": before, f"{config.metric}_since": since},
+            config,
+        )
+
+    def _entropy(self, config: EntropyStopping) -> Decision | None:
+        rules: tuple[tuple[Any, Any], ...] = (
+            (config.collapsed, self._collapsed),
+            (config.not_learning, self._not_learning),
+            (config.overfitting, self._overfitting),
+            (config.converged, self._converged),
+        )
+        for rule, verdict in rules:
+            # Patience begins with the first average, so that there is something before it to compare with.
+            if rule is not None and self._rows > max(rule.warmup, rule.patience):
+                decision = verdict(rule)
+                if decision is not None:
+                    return decision
+        return None
+
+    def _collapsed(self, rule: CollapsedRule) -> Decision | None:
+        entropy, completion = self._seen["entropy"], self._seen["completion"]
+        if not (entropy.known(rule.patience) and completion.known(rule.patience)):
+            return None
+        highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
+        if highest >= rule.entropy_floor or best >= rule.completion_poor:
+            return None
+        return _decision(
+            "collapsed",
+            f"entropy at {highest:.1%} with {best:.0f} % completion",
+            {"entropy": highest, "completion": best},
+            rule,
+        )
+
+    def _not_learning(self, rule: NotLearningRule) -> Decision | None:
+        entropy, completion = self._seen["entropy"], self._seen["completion"]
+        if not (entropy.known(rule.patience) and completion.known(rule.patience)):
+            return None
+        lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
+        start = completion.first
+        moved = best - start > rule.completion_gain
+        if lowest <= rule.entropy_near or moved or best >= rule.completion_poor:
+            return None
+        return _decision(
+            "not_learning",
+            f"entropy still at {lowest:.1%}, completion {start:.1f} % at the start and {best:.1f} % since",
+            {"entropy": lowest, "completion_start": start, "completion": best},
+            rule,
+        )
+
+    def _overfitting(self, rule: OverfittingRule) -> Decision | None:
+        held_out, returns = self._seen["held_out_completion"], self._seen["mean_return"]
+        if not (held_out.known(rule.patience) and returns.known(rule.patience)):
+            return None
+        before, since = held_out.bests(rule.patience)
+        lowest_return = returns.best - rule.return_drop * returns.range
+        if since > before - rule.held_out_drop or returns.now < lowest_return:
+            return None
+        return _decision(
+            "overfitting",
+            f"held-out completion fell from {before:.0f} % to {since:.0f} % while the return holds",
+            {
+                "held_out_completion_before": before,
+                "held_out_completion_since": since,
+                "return": returns.now,
+                "return_best": returns.best,
+            },
+            rule,
+        )
+
+    def _converged(self, rule: ConvergedRule) -> Decision | None:
+        names = ("completion", "mean_return", "laps_per_1000_steps", "entropy")
+        if not all(self._seen[name].known(rule.patience) for name in names):
+            return None
+        completion, returns, laps, entropy = (self._seen[name] for name in names)
+        flat = entropy.last(rule.patience)
+        values = {
+            "completion": completion.now,
+            "completion_best": completion.best,
+            "entropy": entropy.now,
+            "entropy_change": max(flat) - min(flat),
+        }
+        growth = {
+            "completion": rule.completion_gain,
+            "mean_return": rule.return_gain * returns.range,
+            "laps_per_1000_steps": rule.laps_gain * laps.best,
+        }
+        grew = False
+        for name, enough in growth.items():
+            before, since = self._seen[name].bests(rule.patience)
+            values |= {f"{name}_before": before, f"{name}_since": since}
+            grew = grew or since > before + enough
+        scores_s = self._race_scores_s
+        before_s = min(scores_s[: -rule.best_patience], default=math.inf)
+        since_s = min(scores_s[-rule.best_patience :])
+        if math.isfinite(before_s) and math.isfinite(since_s):
+            values |= {"race_score_s_before": before_s, "race_score_s_since": since_s}
+        if (
+            grew
+            or since_s < before_s * (1 - rule.best_gain)
+            or completion.now < completion.best - rule.completion_near
+            or values["entropy_change"] > rule.entropy_change
+        ):
+            return None
+        return _decision(
+            "converged",
+            f"{completion.now:.1f} % completion, entropy {entropy.now:.1%}, no growth for {rule.patience} iterations",
+            values,
+            rule,
+        )
+
+
+class _Average:
+    """A moving average over the last known values of a column; it stays where a row has none."""
+
+    def __init__(self, window: int):
+        self._window = window
+        self._known: list[float] = []
+        self._averages: list[float | None] = []
+        self.first = math.nan
+        self.best, self._worst = -math.inf, math.inf
+
+    def add(self, value: float | None) -> None:
+        if value is not None and math.isfinite(value):
+            self._known = [*self._known, value][-self._window :]
+        average = sum(self._known) / self._window if len(self._known) == self._window else None
+        if average is not None:
+            if math.isinf(self.best):
+                self.first = average
+            self.best, self._worst = max(self.best, average), min(self._worst, average)
+        self._averages.append(average)
+
+    def known(self, patience: int) -> bool:
+        """Return whether there is an average before the last `patience` rows."""
+        return len(self._averages) > patience and self._averages[-patience - 1] is not None
+
+    @property
+    def now(self) -> float:
+        """The newest average; asked for once it is known."""
+        (last,) = self.last(1)
+        return last
+
+    @property
+    def range(self) -> float:
+        """Difference of the highest and the lowest average."""
+        return self.best - self._worst
+
+    def last(self, rows: int) -> list[float]:
+        """Return the averages of the last rows."""
+        return [average for average in self._averages[-rows:] if average is not None]
+
+    def bests(self, patience: int) -> tuple[float, float]:
+        """Return the highest average before the last `patience` rows, and within them."""
+        before = (average for average in self._averages[:-patience] if average is not None)
+        return max(before), max(self.last(patience))
+
+
+def _reliable(config: ReliableStopping, row: Row) -> Decision | None:
+    share = row["lap_share"]
+    if share is None or share < config.lap_share:
+        return None
+    tracks = sum(key.startswith("lap_share/") for key in row)
+    more, where = (" or more", f" on each of {tracks} tracks") if tracks else ("", "")
+    why = f"{share:.0%}{more} of the last {config.episodes} episodes completed the lap{where}"
+    return _decision("reliable", why, {"lap_share": share}, config)
+
+
+def _decision(rule: str, why: str, values: dict[str, float], config: Any) -> Decision:
+    thresholds = {key: value for key, value in asdict(config).items() if key != "kind"}
+    return Decision(
+        rule=rule,
+        why=why,
+        values={key: round(value, 6) for key, value in values.items()},
+        thresholds=thresholds,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convergence:
+    """Since when nothing has grown."""
+
+    iteration: int | None
+    """None: not converged."""
+    completion: float
+    """Moving average at the end, per cent."""
+    completion_before: float
+    """Highest one before the last `patience` iterations."""
+    completion_best: float
+    entropy_change: float
+    """Over the last `patience` iterations; NaN where not logged."""
+    patience: int
+    iterations: int
+    entropy_flat: bool
+
+
+def convergence(
+    iterations: pd.DataFrame, action_count: int | None, stopping: Mapping[str, Any] | None = None
+) -> Convergence | None:
+    """Find the iteration from which on a training no longer grew, None where it is too short to say.
+
+    All series are moving averages of three iterations. Converged since the earliest iteration k, at least `patience`
+    before the end, after which completion, reward and the share of complete laps stay within what counts as growth
+    of their best up to k; completion ends near its best; entropy, where logged, is flat over the last `patience`.
+
+    Args:
+        iterations: a row each, with `episodes`, `completion_mean`, `reward_mean`, `lap_share` and `entropy`.
+        action_count: of a discrete policy, None of a continuous one.
+        stopping: of a run of ours, its group `stopping`, whose rule of convergence is applied if it has one; None:
+            LOG_RULE.
+    """
+    table = iterations[iterations["episodes"] > 0]
+    count = len(table)
+    rule = convergence_rule(stopping)
+    patience = max(rule.patience, math.ceil(PATIENCE_SHARE * count) if rule is LOG_RULE else 0)
+    if count <= patience:
+        return None
+    grown = ("completion_mean", "reward_mean", "lap_share")
+    series = {name: _moving_average(table[name].to_numpy(np.float64)) for name in grown}
+    completion = series["completion_mean"]
+    gains = {
+        "completion_mean": rule.completion_gain,
+        "reward_mean": rule.return_gain * float(np.ptp(series["reward_mean"])),
+        "lap_share": rule.laps_gain,
+    }
+    still = np.ones(count, bool)
+    for name, gain in gains.items():
+        best = np.maximum.accumulate(series[name])
+        still &= best[-1] <= best + gain
+    change = _entropy_change(table["entropy"].to_numpy(np.float64), action_count, patience)
+    flat = not change > rule.entropy_change
+    since = int(still.argmax())
+    near = completion[-1] >= completion.max() - rule.completion_near
+    converged = flat and near and since <= count - 1 - patience
+    return Convergence(
+        iteration=int(table["iteration"].iloc[since]) if converged else None,
+        completion=float(completion[-1]),
+        completion_before=float(completion[:-patience].max()),
+        completion_best=float(completion.max()),
+        entropy_change=change,
+        patience=patience,
+        iterations=count,
+        entropy_flat=flat,
+    )
+
+
+def _entropy_change(entropy: NDArray[np.float64], action_count: int | None, patience: int) -> float:
+    known = _moving_average(entropy)
+    known = known[np.isfinite(known)]
+    if len(known) <= patience:
+        return math.nan
+    # Of a continuous policy exp((a - b) / 2) is the ratio of two scatters, for two normal distributions.
+    scale = 2.0 if action_count is None else math.log(max(action_count, 2))
+    return float(np.ptp(known[-patience:])) / scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overfitting:
+    """How training and evaluation went since the evaluation's best."""
+
+    overfits: bool
+    evaluated: str
+    """`held-out evaluation` or `evaluation`."""
+    best: float
+    """Completion, per cent, mean of three evaluations."""
+    best_iteration: int
+    now: float
+    training_best: float
+    training_now: float
+
+
+def overfitting(iterations: pd.DataFrame) -> Overfitting | None:
+    """Return whether completion in training holds while that of the evaluations falls; None with fewer than six.
+
+    Evaluations on held-out conditions count before others. All series are moving averages of three.
+    """
+    for column, name in (("held_out_completion", "held-out evaluation"), ("eval_completion", "evaluation")):
+        known = iterations[iterations[column].notna() & iterations["completion_mean"].notna()]
+        if len(known) < 6:
+            continue
+        evaluated = _moving_average(known[column].to_numpy(np.float64))
+        training = _moving_average(known["completion_mean"].to_numpy(np.float64))
+        best = 2 + int(evaluated[2:].argmax())  # the first two are of fewer than three
+        holds = training[-1] >= training[2:].max() - LOG_RULE.completion_near
+        return Overfitting(
+            overfits=bool(holds and evaluated[-1] <= evaluated[best] - EVALUATION_DROP),
+            evaluated=name,
+            best=float(evaluated[best]),
+            best_iteration=int(known["iteration"].iloc[best]),
+            now=float(evaluated[-1]),
+            training_best=float(training[2:].max()),
+            training_now=float(training[-1]),
+        )
+    return None
+
+
+def convergence_rule(stopping: Mapping[str, Any] | None) -> ConvergedRule:
+    """Return the rule of convergence of a group `stopping`, LOG_RULE if it has none."""
+    if stopping is None:
+        return LOG_RULE
+    adapter: TypeAdapter[StoppingConfig] = TypeAdapter(StoppingConfig)
+    try:
+        config = adapter.validate_python(stopping)
+    except ValidationError:  # of another version
+        return LOG_RULE
+    own = config.converged if isinstance(config, EntropyStopping) else None
+    return own or LOG_RULE
+
+
+def _moving_average(values: NDArray[np.float64], over: int = 3) -> NDArray[np.float64]:
+    series = pd.Series(values, dtype=np.float64)
+    return series.rolling(over, min_periods=1).mean().where(series.notna()).to_numpy()

@@ -1,0 +1,69 @@
+"""What failed and in which state, on disk."""
+
+import contextlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepracer_exp.env.race import Race
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.files import atomic_write
+
+from .files import CRASH_DUMPS
+
+
+def keep_state(error: RunFailed, race: Race) -> None:
+    """Give an error that has no `arrays` the cars' state as it is now."""
+    if not hasattr(error, "arrays"):
+        error.arrays = race.state_arrays()  # type: ignore[attr-defined]
+
+
+def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = None) -> None:
+    """Write the error's line, its `params` and `arrays` where it has them under `faults/`, as JSON and .npz.
+
+    A disk that takes no more is no reason to lose the error: what does not fit is left out.
+
+    Args:
+        run_dir: folder of the run.
+        error: what happened.
+        worker: number of the process, None for the training process.
+    """
+    folder = run_dir / CRASH_DUMPS
+    stem = "training" if worker is None else f"worker-{worker}"
+    report = {
+        "error": type(error).__name__,
+        "message": str(error),
+        "worker": worker,
+        "params": _plain(getattr(error, "params", None)),
+    }
+    with contextlib.suppress(OSError):
+        folder.mkdir(exist_ok=True)
+        atomic_write(folder / f"{stem}.json", json.dumps(report, indent=2) + "\n")
+        arrays: dict[str, np.ndarray] = getattr(error, "arrays", {})
+        if arrays:
+            with (folder / f"{stem}.npz").open("wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_crash_dump(run_dir: Path, worker: int) -> str | None:
+    """Return the line a worker left behind, None where it left none."""
+    path = run_dir / CRASH_DUMPS / f"worker-{worker}.json"
+    if not path.is_file():
+        return None
+    return str(json.loads(path.read_text(encoding="utf-8"))["message"])
+
+
+def _plain(value: Any) -> Any:
+    """Return the value in JSON's types; NaN and infinities as text."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return repr(value)

@@ -1,0 +1,142 @@
+"""The files of a run folder: their names, and what a training wrote into them."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput, reading
+from deepracer_exp.files import RECORD_BYTES, read_text, read_yaml
+
+CONFIG = "config.yaml"
+"""All values of the experiment. Written last at the start: it makes a folder a run."""
+OVERRIDES = "overrides.yaml"
+PROVENANCE = "provenance.json"
+REWARD = "reward_function.py"
+METRICS = "metrics.jsonl"
+"""A row an iteration."""
+SUMMARY = "summary.json"
+"""Written when the run ends."""
+LOG = "log.txt"
+REPORT = "report.html"
+BEST_LAP = "best_lap.png"
+LEARNING = "learning.png"
+TRACKING = "tracking.json"
+LINEAGE = "lineage.json"
+"""In a clone's folder."""
+REWARD_PRINTS = "reward_prints.log"
+RUNNING = ".running"
+"""Locked by the process that trains in the folder, and there as long as it does."""
+HEARTBEAT = ".heartbeat"
+CHECKPOINTS, TRACE, EVALUATIONS, FILMS, CRASH_DUMPS = "checkpoints", "trace", "evaluations", "films", "faults"
+"""Folders within."""
+BEST_OF_SWEEP = "best_of_sweep.json"
+"""Beside the runs of a sweep."""
+MLFLOW_DB = "mlflow.db"
+"""In `runs_dir`."""
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a run."""
+    return (folder / CONFIG).is_file()
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a run's files hold."""
+
+    path: Path
+    config: dict[str, Any]
+    """All values of the experiment, by group."""
+    rows: list[dict[str, Any]]
+    """metrics.jsonl, a row an iteration."""
+    summary: dict[str, Any]
+    """Empty while the run is running, or if it was killed."""
+    provenance: dict[str, Any]
+    """Where code and reward come from."""
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.path.name
+
+
+def read_run(path: Path) -> RunRecord:
+    """Read a run's folder.
+
+    Raises:
+        BadInput: a file is missing, cannot be read or does not hold what a training writes.
+    """
+    head = read_head(path)
+    return replace(head, rows=read_metrics(path / METRICS))
+
+
+def read_head(path: Path) -> RunRecord:
+    """Read a run's folder without the rows of metrics.jsonl, which is long.
+
+    Raises:
+        BadInput: as for `read_run`.
+    """
+    return RunRecord(
+        path,
+        read_config(path),
+        [],
+        read_object(path / SUMMARY),
+        read_object(path / PROVENANCE),
+    )
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read the config.yaml of a run's folder.
+
+    Raises:
+        BadInput: it cannot be read or holds no values.
+    """
+    file = path / CONFIG
+    mapping = read_yaml(file, "what a run writes there")
+    if not isinstance(mapping, dict):
+        raise BadInput(f"{file}: holds no values; a run writes its experiment there")
+    return {str(key): value for key, value in mapping.items()}
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """Read a JSON object of a run's folder; empty where there is no such file.
+
+    Raises:
+        BadInput: it cannot be read or holds something else.
+    """
+    return _object(file, _text(file)) if file.exists() else {}
+
+
+def read_run_id(path: Path) -> str | None:
+    """Return MLflow's id of the run of a folder, None for one that is not recorded.
+
+    Raises:
+        BadInput: its tracking.json cannot be read or holds something else.
+    """
+    run_id = read_object(path / TRACKING).get("run_id")
+    if not isinstance(run_id, str | None):
+        raise BadInput(f"{path / 'tracking.json'}: run_id: {run_id!r} is no text")
+    return run_id
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Read metrics.jsonl; a last line without an end, cut off by a kill, is left out.
+
+    Raises:
+        BadInput: the file cannot be read, or a line is no JSON object.
+    """
+    lines = _text(path).split("\n")
+    return [_object(path, line, f" line {number}") for number, line in enumerate(lines[:-1], 1)]
+
+
+def _text(path: Path) -> str:
+    return read_text(path, "what a run writes there", RECORD_BYTES)
+
+
+def _object(path: Path, text: str, where: str = "") -> dict[str, Any]:
+    with reading(f"{path}{where}: is not valid JSON"):
+        value = json.loads(text)
+    if not isinstance(value, dict):
+        raise BadInput(f"{path}{where}: {text[:40]!r} is no JSON object")
+    return value

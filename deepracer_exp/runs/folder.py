@@ -1,0 +1,233 @@
+"""The folder of a run that is being trained: its lock, its log and what is written into it."""
+
+import contextlib
+import datetime
+import json
+import logging
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import psutil
+from filelock import FileLock, Timeout
+
+from deepracer_exp.config.compose import Composition
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.files import atomic_write
+from deepracer_exp.rewards.source import RewardSource, source_with_constants
+
+from .files import (
+    BEST_LAP,
+    CONFIG,
+    CRASH_DUMPS,
+    LEARNING,
+    LOG,
+    METRICS,
+    OVERRIDES,
+    PROVENANCE,
+    REPORT,
+    REWARD,
+    RUNNING,
+    SUMMARY,
+    TRACE,
+    read_metrics,
+)
+
+logger = logging.getLogger("deepracer_exp")
+
+_PACKAGES = ("deepracer-exp", "torch", "torchrl", "tensordict", "mujoco", "hydra-core", "mlflow", "numpy")
+
+
+class RunFolder:
+    """`runs_dir/<experiment>/<run>/` and the files that lie directly in it."""
+
+    def __init__(self, path: Path):
+        """Open a folder that is there; nobody else may write into it until this process lets go of it.
+
+        Raises:
+            BadInput: another process trains in it.
+            OSError: it cannot be written.
+        """
+        self.path = path
+        self.name = path.name
+        self._metrics = path / METRICS
+        self._lock = _locked(path / RUNNING)
+        self._log: logging.FileHandler | None = None
+
+    @classmethod
+    def create(cls, runs_dir: str, experiment: str, label: str) -> "RunFolder":
+        """Create a folder of its own, named by the time and `label`.
+
+        Raises:
+            BadInput: the folder cannot be created.
+        """
+        stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        name = f"{stamp}-{re.sub(r'[^A-Za-z0-9._-]+', '_', label)}"
+        parent = Path(runs_dir) / experiment
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            return cls(_make_new(parent, name))
+        except OSError as error:
+            raise BadInput(
+                f"runs_dir={runs_dir}: cannot create {parent / name}: {error.strerror}; give a folder that can be "
+                "written"
+            ) from error
+
+    def describe(
+        self, composition: Composition, reward: RewardSource, seed: int, names: Mapping[str, str]
+    ) -> str | None:
+        """Write the configuration and where code and reward come from; return the git commit if there is one.
+
+        config.yaml makes a folder a run, and is written last: a run that was killed at any moment can be resumed.
+
+        Args:
+            composition: of the experiment.
+            reward: its reward function.
+            seed: of the run.
+            names: what a racer calls its choices.
+        """
+        overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
+        self.write(OVERRIDES, overrides or "[]\n")
+        self.write(REWARD, source_with_constants(reward))
+        commit = git_commit()
+        provenance = {
+            "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
+            "git_commit": commit,
+            "seed": seed,
+            "names": dict(names),
+            "machine": {
+                "system": platform.platform(),
+                "cores": psutil.cpu_count(),
+                "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
+            },
+            "reward": {"name": reward.name, "path": str(reward.path), "sha256": reward.sha256},
+            "command": sys.argv[1:],
+        }
+        self.write(PROVENANCE, json.dumps(provenance, indent=2) + "\n")
+        self.write(CONFIG, composition.yaml())
+        return commit
+
+    def append_metrics(self, row: dict[str, Any]) -> None:
+        """Add one line to metrics.jsonl.
+
+        Raises:
+            RunFailed: the folder is not the one that was opened.
+            OSError: it takes no more.
+        """
+        # Others who write into it would make a folder that is gone again, with nothing else in it.
+        if not (self.path / RUNNING).exists():
+            raise RunFailed(f"{self.path}: the folder of the run is gone")
+        with self._metrics.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Return the lines of metrics.jsonl."""
+        return read_metrics(self._metrics) if self._metrics.exists() else []
+
+    def write_metrics(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write metrics.jsonl again, a line a row."""
+        self.write(METRICS, "".join(json.dumps(row) + "\n" for row in rows))
+
+    def rewind(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Go back to the last of these rows of metrics.jsonl: what was written later goes."""
+        self.write_metrics(rows)
+        for name in (SUMMARY, REPORT, BEST_LAP, LEARNING):
+            (self.path / name).unlink(missing_ok=True)
+        for file in (self.path / TRACE).glob("*"):
+            number = file.name.partition("-")[0]
+            if not number.isdigit() or int(number) > len(rows):
+                file.unlink()
+        shutil.rmtree(self.path / CRASH_DUMPS, ignore_errors=True)
+
+    def write(self, name: str, text: str) -> Path:
+        """Write a file whole or not at all."""
+        return atomic_write(self.path / name, text)
+
+    def open_log(self) -> None:
+        """Log what the project logs to log.txt as well, until the folder is released."""
+        self._log = _LogFile(self.path / LOG, encoding="utf-8")
+        self._log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logger.addHandler(self._log)
+        logger.setLevel(logging.INFO)
+
+    def remove(self) -> None:
+        """Remove a folder in which no run has begun."""
+        self.release()
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def release(self) -> None:
+        """Close the log, and let others write into the folder."""
+        if self._log is not None:
+            logger.removeHandler(self._log)
+            self._log.close()
+        with contextlib.suppress(OSError):  # a disk that takes no more
+            (self.path / RUNNING).unlink(missing_ok=True)
+        self._lock.release()
+
+
+def is_held(run_dir: Path) -> bool:
+    """Return whether a process is training in a run's folder."""
+    if not (run_dir / RUNNING).exists():
+        return False
+    try:
+        _locked(run_dir / RUNNING).release()
+    except BadInput:
+        return True
+    return False
+
+
+def git_commit() -> str | None:
+    """Return the commit of the checkout this code runs from, `-dirty` if changed, None outside a checkout."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        commit = _git(root, "rev-parse", "HEAD")
+        return f"{commit}-dirty" if _git(root, "status", "--porcelain") else commit
+    except (OSError, subprocess.CalledProcessError):
+        # No git, a checkout without a commit, or one owned by somebody else.
+        return None
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def _locked(file: Path) -> FileLock:
+    lock = FileLock(file, timeout=0, thread_local=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BadInput(f"{file.parent}: a process is training in it; end that one first") from None
+    return lock
+
+
+def _make_new(parent: Path, name: str) -> Path:
+    """Make a folder that was not there: two runs may start in the same second."""
+    attempt = 1
+    while True:
+        path = parent / (name if attempt == 1 else f"{name}-{attempt}")
+        try:
+            path.mkdir()
+        except FileExistsError:
+            attempt += 1
+        else:
+            return path
+
+
+class _LogFile(logging.FileHandler):
+    """Says nothing of a full disk: the end of the run reports it in one line."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the base class's name
+        pass
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            super().close()

@@ -1,0 +1,199 @@
+"""Lineage: what a run was cloned from, and the family tree of its ancestors and clones."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter
+
+from deepracer_exp.config.stored import ABSENT, config_differences
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_json_as
+
+from .files import LINEAGE, REWARD, RunRecord, is_run, read_head
+from .result import RunResult, read_result
+
+_NO_EFFECT = ("runs_dir", "debug", "report", "tracking")
+"""Groups that change nothing of how the car drives."""
+_IGNORED = ("name", "code")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lineage:
+    """lineage.json of a clone: where it comes from."""
+
+    parent: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    """Name of the parent's folder."""
+    parent_dir: str
+    """That folder as it was then, absolute."""
+    parent_run_id: str | None
+    """MLflow's id of the parent."""
+    checkpoint: Annotated[str, Field(pattern=r"^\d{6,9}$")]
+    """The parent's checkpoint."""
+    sha256: str
+    """Hash of the checkpoint."""
+    generation: Annotated[int, Field(ge=1)]
+    """1: cloned from a run that is no clone."""
+    registered: str | None
+    """MODEL@ALIAS, if the parent was given so."""
+
+
+_ADAPTER = TypeAdapter(Lineage)
+
+
+def read_lineage(run: Path) -> Lineage | None:
+    """Return what a run was cloned from, None if it was not cloned.
+
+    Raises:
+        BadInput: the file cannot be read or holds something else.
+    """
+    return read_json_as(run / LINEAGE, _ADAPTER, "a clone")
+
+
+@dataclass
+class Member:
+    """A run of the family."""
+
+    name: str
+    path: Path
+    record: RunRecord | None
+    """None: its folder is gone."""
+    lineage: Lineage | None
+    """None: it is no clone, or gone."""
+    generation: int
+    result: RunResult | None
+    """None: not known."""
+    children: "list[Member]" = field(default_factory=list)
+    changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    """Values that differ from the parent's, by dotted key: the parent's and its own."""
+
+    @property
+    def course(self) -> str:
+        """Name of the track, or of several."""
+        return "" if self.record is None else course_names(self.record.config.get("track"))
+
+    def walk(self) -> "Iterator[Member]":
+        """Return the member and all below it, parents first."""
+        yield self
+        for child in self.children:
+            yield from child.walk()
+
+
+def family(run: Path, runs_dir: Path) -> Member:
+    """Return the root of a run's family tree.
+
+    Args:
+        run: its folder.
+        runs_dir: where relatives are searched, besides the runs beside it.
+
+    Raises:
+        BadInput: a file of a relative cannot be used, or a run descends from itself.
+    """
+    places = list(dict.fromkeys([runs_dir.resolve(), run.resolve().parents[1]]))
+    lineages: dict[Path, Lineage | None] = {}
+    children: dict[Path, set[Path]] = {}
+
+    def parent_of(folder: Path) -> Path | None:
+        lineage = lineages[folder] = read_lineage(folder)
+        if lineage is None:
+            return None
+        parent = _parent(lineage, places)
+        children.setdefault(parent, set()).add(folder)
+        return parent
+
+    for place in places:
+        for file in place.glob(f"*/*/{LINEAGE}"):
+            parent_of(file.parent.resolve())
+    root, seen = run.resolve(), set[Path]()
+    while (parent := parent_of(root)) is not None:
+        seen.add(root)
+        if parent in seen:
+            raise BadInput(f"{root / LINEAGE}: {root.name} descends from itself; nothing can be shown")
+        root = parent
+    return _grow(root, children, lineages)
+
+
+def best_members(root: Member) -> dict[int, str]:
+    """Return the best of the family by `id`, with what it is the best by: of each track and measure.
+
+    Where a run was evaluated, those that were not are out.
+    """
+    known = [(one, one.result) for one in root.walk() if one.result is not None]
+    known = [pair for pair in known if pair[1].evaluated] or known
+    groups: dict[tuple[str, str], tuple[Member, RunResult]] = {}
+    for member, result in known:
+        key = (member.course, result.measure)
+        if key not in groups or result.rank > groups[key][1].rank:
+            groups[key] = (member, result)
+    courses = {course for course, _ in groups}
+    words: dict[int, str] = {}
+    for (course, _), (member, result) in groups.items():
+        word = "best" + f" on {course}" * (len(courses) > 1) + f" by {result.criterion}"
+        words[id(member)] = ", ".join(filter(None, [words.get(id(member)), word]))
+    return words
+
+
+def generations(root: Member) -> list[tuple[int, Member, RunResult]]:
+    """Return the best member of each generation on each track and measure; evaluated ones before others."""
+    found: dict[tuple[int, str, str], tuple[Member, RunResult]] = {}
+    evaluated = {(one.generation, one.course) for one in root.walk() if one.result and one.result.evaluated}
+    for member in root.walk():
+        result, place = member.result, (member.generation, member.course)
+        if result is None or (place in evaluated and not result.evaluated):
+            continue
+        key = (*place, result.measure)
+        if key not in found or result.rank > found[key][1].rank:
+            found[key] = (member, result)
+    return [(key[0], *found[key]) for key in sorted(found)]
+
+
+def _parent(lineage: Lineage, places: list[Path]) -> Path:
+    """Return the parent's folder: where it was, where all runs have moved to, or where it was if it is gone."""
+    recorded = Path(lineage.parent_dir)
+    moved = [place / recorded.parent.name / lineage.parent for place in places]
+    return next((path for path in (recorded, *moved) if is_run(path)), recorded).resolve()
+
+
+def _grow(root: Path, children: Mapping[Path, set[Path]], lineages: Mapping[Path, Lineage | None]) -> Member:
+    """Return a member with all that descend from it."""
+    below = [_grow(child, children, lineages) for child in sorted(children.get(root, ()))]
+    lineage = lineages.get(root)
+    record = read_head(root) if is_run(root) else None
+    if lineage is not None:
+        generation = lineage.generation
+    elif record is not None:
+        generation = 0
+    else:  # it is gone, and may have been a clone
+        generation = min(child.generation for child in below) - 1
+    for child in below:
+        if record is not None and child.record is not None:
+            found = run_differences([record, child.record])
+            child.changes = {key: (a, b) for key, (a, b) in found.items() if key not in _IGNORED}
+    result = None if record is None else read_result(root)
+    return Member(root.name, root, record, lineage, generation, result, below)
+
+
+def run_differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
+    """Return the values in which the runs differ, by dotted key; ABSENT where a run has no such key.
+
+    The reward function and the code are compared by their hashes.
+    """
+    configs = [
+        {key: value for key, value in record.config.items() if key not in _NO_EFFECT} for record in records
+    ]
+    courses = [course_names(config.get("track")) for config in configs]
+    if len(set(courses)) > 1:  # the points of a track say less than its name
+        for config, course in zip(configs, courses, strict=True):
+            config["track"] = course
+    for config, record in zip(configs, records, strict=True):
+        sha256 = record.provenance.get("reward", {}).get("sha256")
+        config[REWARD] = ABSENT if sha256 is None else f"sha256 {sha256[:8]}"
+        config["code"] = str(record.provenance.get("git_commit") or ABSENT)[:16]
+    return config_differences(configs)
+
+
+def course_names(track: Any) -> str:
+    """Return the name of the track of a configuration, or those of several."""
+    known = isinstance(track, Mapping)
+    return str(track["name"]) if known and "name" in track else ", ".join(track) if known else ABSENT

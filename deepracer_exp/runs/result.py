@@ -1,0 +1,116 @@
+"""How good a run's best checkpoint is, as its summary tells."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput
+
+from .files import SUMMARY, read_object
+
+IN_TRAINING = "training"
+CRITERIA = {
+    "race_score": "race score",
+    "lap_time": "mean lap",
+    "progress": "completion",
+    IN_TRAINING: "laps in training",
+}
+"""What a measure is called; the best of several policies or runs is the one with the highest rank by it."""
+FIGURES: tuple[tuple[str, str, str, int], ...] = (
+    ("race score, s", "race_score_s", "{:.2f}", -1),
+    ("complete laps, %", "laps_percent", "{:.0f}", 1),
+    ("completion, %", "completion", "{:.1f}", 1),
+    ("held-out completion, %", "held_out_completion", "{:.1f}", 1),
+    ("mean lap, s", "lap_time_s", "{:.2f}", -1),
+)
+"""Figures of an evaluated policy wherever they are shown: name and unit, attribute of RunResult, format, and whether a
+higher value is better (1) or a lower one (-1)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """How good a run's best policy is."""
+
+    measure: str
+    """What its evaluations were ranked by, a key of CRITERIA; IN_TRAINING: it had none, and its training's episodes
+    count."""
+    rank: tuple[float, float]
+    """Compared in order, higher is better; only with runs of the same measure, course and conditions."""
+    iteration: int | None = None
+    """After which the policy was evaluated, the number of its checkpoint; None: not evaluated."""
+    race_score_s: float | None = None
+    """Seconds per complete lap on all conditions, failed laps included."""
+    laps_percent: float | None = None
+    """Complete laps of a hundred tried on the usual conditions."""
+    completion: float | None
+    """Per cent of the lap, mean over the laps tried on the usual conditions."""
+    held_out_completion: float | None = None
+    """The same on the held-out conditions."""
+    lap_time_s: float | None
+    """Mean of the evaluated complete laps, or the fastest of the training."""
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether it is that of an evaluation."""
+        return self.measure != IN_TRAINING
+
+    @property
+    def criterion(self) -> str:
+        """Return what its rank goes by, in words."""
+        return CRITERIA.get(self.measure, self.measure)
+
+    def words(self) -> str:
+        """Return the figures that are known: ``race score 8.02 s, completion 100.0 %, mean lap 7.97 s``."""
+        if not self.evaluated:
+            known = [("completion, %", self.completion, "{:.1f}"), ("best lap, s", self.lap_time_s, "{:.2f}")]
+        else:
+            known = [(name, getattr(self, key), form) for name, key, form, _ in FIGURES]
+        parts = [(*name.split(", "), form.format(value)) for name, value, form in known if value is not None]
+        text = ", ".join(f"{name} {value} {unit}" for name, unit, value in parts)
+        if self.lap_time_s is None:
+            text += ", no complete lap"
+        return text if self.evaluated else f"in training {text}"
+
+
+def read_result(run: Path) -> RunResult | None:
+    """Return what a run came to, None if that is not known.
+
+    Raises:
+        BadInput: its summary.json is not what a training writes.
+    """
+    file = run / SUMMARY
+    summary = read_object(file)
+    try:
+        return result_of(summary)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise BadInput(f"{file}: is not what a training writes: {error!r}") from error
+
+
+def result_of(summary: Mapping[str, Any]) -> RunResult | None:
+    """Return what a run came to by its summary, None if that is not known."""
+    best = summary.get("best")
+    if best is not None and best["eval_completion"] is not None:
+        first, second = best["rank"]
+        share = _number(best.get("eval_lap_share"))
+        return RunResult(
+            measure=str(best["metric"]),
+            rank=(float(first), float(second)),
+            iteration=int(best["iteration"]),
+            race_score_s=_number(best.get("eval_race_score_s")),
+            laps_percent=None if share is None else 100 * share,
+            completion=_number(best["eval_completion"]),
+            held_out_completion=_number(best.get("held_out_completion")),
+            lap_time_s=_number(best["eval_lap_time_s"]),
+        )
+    lap_share, lap_s = _number(summary.get("lap_share")), _number(summary.get("best_lap_time_s"))
+    if lap_share is None and lap_s is None:
+        return None
+    rank = (lap_share or 0.0, -math.inf if lap_s is None else -lap_s)
+    completion = _number((summary.get("last") or {}).get("completion"))
+    return RunResult(measure=IN_TRAINING, rank=rank, completion=completion, lap_time_s=lap_s)
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)

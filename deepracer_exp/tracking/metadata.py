@@ -1,0 +1,240 @@
+"""What describes a run in MLflow besides its metrics: parameters, tags, descriptions, columns of the runs table."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.config.overrides import key_of
+from deepracer_exp.runs.lineage import Lineage
+
+from .metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
+
+Scalar = str | int | float | bool | None
+
+LONGEST_PARAM = 250
+"""Most characters of a parameter's value. MLflow 3 accepts 6000, servers before 2.10 accept 500 and before 1.28 250;
+and the comparison page shows every character."""
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Scalar]:
+    """Return `config` with dotted keys; lists become compact JSON, an empty mapping becomes `{}`."""
+    flat: dict[str, Scalar] = {}
+    for name, value in config.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, f"{key}."))
+        elif isinstance(value, list | tuple | Mapping):
+            flat[key] = json.dumps(value, separators=(",", ":"), ensure_ascii=False)
+        else:
+            flat[key] = value
+    return flat
+
+
+def param_text(value: Scalar) -> str:
+    """Return `value` as YAML writes it, shortened to `LONGEST_PARAM` characters.
+
+    A shortened value ends in a hash of the whole, so that values that differ only after the cut look different.
+    """
+    text = json.dumps(value) if value is None or isinstance(value, bool) else str(value)
+    if len(text) <= LONGEST_PARAM:
+        return text
+    mark = f"… sha256:{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    return text[: LONGEST_PARAM - len(mark)] + mark
+
+
+PARENT = "mlflow.parentRunId"
+"""Tag of a run that is nested under another one in the UI."""
+
+END_TAG = "end"
+"""Tag of an ended run: its status and the reason."""
+
+_MOST_PARAMS = 12  # columns of the table; a tag of an experiment takes 5,000 characters
+
+VIEW = "racing"
+"""Name of the runs table's view that the UI opens with."""
+
+_COLUMNS = (
+    "attributes.Duration",
+    *(f"metrics.`{BEST}{name}`" for name in ("score_s", "lap_time_s", "completion")),
+    *(f"metrics.`{METRICS[column][0]}`" for column in ("eval_completion", "best_lap_time_s", "completion")),
+    "params.`reward`",
+    "params.`network`",
+    "params.`action_space`",
+    "params.`algorithm.lr`",
+    "params.`track`",
+    "params.`seed`",
+)
+
+
+def _view(columns: Sequence[str]) -> dict[str, str]:
+    """Return the experiment tag that makes its runs table open with these columns, in this order."""
+    # In pixels; at MLflow's default of 100 names and numbers are truncated.
+    least = {"params": 180, "tags": 270}
+    widths = {}
+    for column in columns:
+        kind, _, name = column.partition(".")
+        widths[column] = max(least.get(kind, 100), 44 + 8 * len(name.strip("`")))
+    state = {"selectedColumns": columns, "columnOrder": columns, "columnWidths": widths}
+    return {f"mlflow.sharedViewState.{VIEW}": json.dumps(state)}
+
+
+EXPERIMENT_TAGS: Mapping[str, str] = {
+    # Without it MLflow shows the experiment as one of a language model.
+    "mlflow.experimentKind": "custom_model_development",
+    # Without it the runs table shows no metrics and no parameters until its columns are chosen.
+    **_view(_COLUMNS),
+}
+"""Tags of an experiment, set when it is created."""
+
+
+def study_view(objectives: Sequence[str], searched: Sequence[str]) -> dict[str, str]:
+    """Return the experiment tag that makes its runs table open with the columns of a study.
+
+    Args:
+        objectives: of the study; their columns come first.
+        searched: the parameters of the search space.
+    """
+    metrics = dict.fromkeys(map(trial_metric, (*objectives, "lap_time", "completion")))
+    columns = [
+        *(f"metrics.`{name}`" for name in metrics),
+        *(f"params.`{name}`" for name in searched[:_MOST_PARAMS]),
+        f"tags.`{END_TAG}`",
+    ]
+    return _view(columns)
+
+
+def joined(names: Sequence[str], between: str = "+") -> str:
+    """Return up to three names joined, or their number: `18 tracks`."""
+    text = between.join(names)
+    # A folder's name may have 255 characters, and it contains more than the tracks.
+    return text if len(names) == 1 or (len(names) <= 3 and len(text) <= 120) else f"{len(names)} tracks"
+
+
+def lineage_tags(lineage: Lineage) -> dict[str, str]:
+    """Return the tags of a clone: its lineage, and the parent it is nested under in the UI."""
+    tags = {f"lineage.{key}": str(value) for key, value in asdict(lineage).items() if value is not None}
+    return tags if lineage.parent_run_id is None else {**tags, PARENT: lineage.parent_run_id}
+
+
+_COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.constants", "budget.env_steps")
+"""Keys and groups that racers vary: always recorded as parameters."""
+
+
+def run_params(
+    choices: Mapping[str, str],
+    names: Mapping[str, str],
+    config: Mapping[str, Any],
+    overrides: Sequence[str],
+) -> dict[str, Scalar]:
+    """Return the parameters by which runs are compared; the run's config.yaml has all values.
+
+    Args:
+        choices: the option of each group.
+        names: readable names of some choices.
+        config: all values of the experiment.
+        overrides: that it was composed from; their keys become parameters, too.
+    """
+    compared = {*_COMPARED, *({*map(key_of, overrides)} - choices.keys())}
+    values = {
+        key: value
+        for key, value in flatten(config).items()
+        if any(f"{key}.".startswith(f"{one}.") for one in compared)
+    }
+    return {**values, **choices, **names}
+
+
+def run_tags(
+    names: Mapping[str, str], git_commit: str | None, reward_sha256: str, run_dir: Path
+) -> dict[str, str]:
+    """Return the tags of a run: its choices, the origin of its code and reward, and its description.
+
+    `mlflow.source.name` and `mlflow.source.git.commit` fill the columns Source and Version of the runs table,
+    `mlflow.note.content` is the description above the run.
+    """
+    choices = "\n".join(f"- {key}: `{value}`" for key, value in names.items())
+    metrics = "\n".join(f"- `{name}`: {meaning}" for name, meaning in METRICS.values())
+    each = ", ".join(f"`{metric_name(f'{metric}/TRACK')}`" for metric in TRACK_METRICS)
+    metrics += f"\n\nWith several tracks also {each}."
+    tags = {
+        **names,
+        "reward_sha256": reward_sha256,
+        "run_dir": str(run_dir),
+        "mlflow.source.name": "deepracer-exp train",
+        "mlflow.source.type": "LOCAL",
+        "mlflow.note.content": (
+            f"{choices}\n\nRun folder: `{run_dir}`\n\n"
+            f"Metrics, against control steps of all cars:\n\n{metrics}\n"
+        ),
+    }
+    if user := os.environ.get("USER"):  # containers often have a user id without a name
+        tags["mlflow.user"] = user
+    if git_commit:
+        tags |= {"git_commit": git_commit, "mlflow.source.git.commit": git_commit}
+    return tags
+
+
+NOTE = "mlflow.note.content"
+"""Tag of a run or an experiment that MLflow shows as its description."""
+
+PICTURE, REPORT = "best_lap.png", "report.html"
+"""Files of a run that its description shows or mentions."""
+
+WORKFLOW = "workflowType=machine_learning"
+"""Part of an address that opens MLflow's pages for trainings: by default they open for language models, and no tag of
+an experiment changes that."""
+
+OURS = "Trainings of `deepracer-exp`."
+"""Beginning of an experiment's description that was not edited."""
+
+_RACE = {
+    "score_s": "race score {:.2f} s",
+    "lap_time_s": "lap {:.2f} s",
+    "completion": "{:.1f} % of the lap",
+    "held_out_completion": "{:.1f} % on conditions not trained on",
+}
+
+
+def race_result(metrics: Mapping[str, float | None]) -> str:
+    """Return an evaluation in words: ``race score 8.34 s, lap 8.21 s, 99.1 % of the lap``.
+
+    Args:
+        metrics: by name in MLflow; the part before the last slash is ignored.
+    """
+    values = {name.rpartition("/")[2]: value for name, value in metrics.items()}
+    parts = [words.format(values[name]) for name, words in _RACE.items() if values.get(name) is not None]
+    return ", ".join(parts) or "no complete lap"
+
+
+def result_note(summary: Mapping[str, Any], run_id: str, files: Mapping[str, Any]) -> str:
+    """Return the result of a run, for the top of its description.
+
+    Args:
+        summary: its summary.json.
+        run_id: MLflow's.
+        files: of the run in MLflow.
+    """
+    best = summary.get("best")
+    lines = [f"**{summary['status']}**: {summary['reason']}"]
+    if best is not None:
+        lines.append(f"**Best policy, iteration {best['iteration']}**: {race_result(best_metrics(summary))}")
+    if PICTURE in files:
+        lines.append(picture(run_id))
+    if REPORT in files:
+        lines.append(f"Report: `{REPORT}` among the artifacts.")
+    return "\n\n".join(lines)
+
+
+def experiment_note(best_run: str, run_id: str, experiment_id: str, metrics: Mapping[str, float]) -> str:
+    """Return an experiment's description with its best run."""
+    link = f"[{best_run}](#/experiments/{experiment_id}/runs/{run_id}?{WORKFLOW})"
+    return f"{OURS} Lowest race score so far: {link}, {race_result(metrics)}.\n\n{picture(run_id)}"
+
+
+def picture(run_id: str) -> str:
+    """Return the Markdown for the picture of a run's fastest lap."""
+    address = f"get-artifact?path={PICTURE}&run_uuid={run_id}"
+    return f"The fastest lap of the training:\n\n![fastest lap]({address})"

@@ -1,0 +1,179 @@
+"""Metrics of a run: their names in MLflow, and the points recorded of them."""
+
+import math
+import re
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+METRICS: Mapping[str, tuple[str, str]] = {
+    "eval_race_score_s": (
+        "race/score_s",
+        "seconds per complete lap of the evaluation on all conditions, including failed laps",
+    ),
+    "eval_lap_time_s": ("race/lap_time_s", "mean time of the evaluation's complete laps"),
+    "eval_completion": ("race/completion", "mean progress of the evaluation's laps in per cent"),
+    "held_out_completion": (
+        "race/held_out_completion",
+        "the same on held-out conditions",
+    ),
+    "eval_lap_share": ("race/lap_share", "share of the evaluation's laps that were completed (0 to 1)"),
+    "completion": ("train/completion", "mean progress of finished episodes in per cent"),
+    "lap_share": (
+        "train/lap_share",
+        "share of recent episodes that completed the lap (0 to 1), the lowest of several tracks",
+    ),
+    "best_lap_time_s": ("train/best_lap_time_s", "fastest lap so far, with sampled actions"),
+    "mean_lap_time_s": ("train/mean_lap_time_s", "mean time of the iteration's completed laps"),
+    "laps": ("train/laps", "laps completed so far"),
+    "mean_return": ("train/mean_return", "mean sum of rewards of finished episodes"),
+    "episodes": ("train/episodes", "episodes finished so far"),
+    "iteration": ("train/iteration", "training iteration"),
+    "entropy": ("update/entropy", "entropy of the policy"),
+    "kl": ("update/kl", "KL divergence between the policies before and after the iteration"),
+    "policy_loss": ("update/policy_loss", "clipped policy loss"),
+    "value_loss": ("update/value_loss", "loss of the value network"),
+    "lr": ("update/lr", "learning rate"),
+    "clip_fraction": ("update/clip_fraction", "share of samples whose policy ratio was clipped"),
+    "explained_variance": (
+        "update/explained_variance",
+        "variance of the returns explained by the value network",
+    ),
+    "grad_norm": ("update/grad_norm", "norm of the gradient before clipping"),
+    "env_steps_per_s": ("time/env_steps_per_s", "control steps per second of wall time"),
+    "collect_s": ("time/collect_s", "seconds of collection in this iteration"),
+    "update_s": ("time/update_s", "seconds of updates in this iteration"),
+    "wall_clock_s": ("time/wall_clock_s", "seconds since the start of the run"),
+}
+"""Columns of metrics.jsonl: their names in MLflow and their meaning; recorded against env steps.
+
+MLflow's pages group metrics by what precedes the last slash and sort the groups by name: race, time, train, update.
+Within `race` the order of recording matters: the comparison of runs opens with the first metric.
+"""
+
+BEST = "race/best/"
+"""Prefix of the evaluation of the best checkpoint, recorded when the run ends."""
+
+TRACK_METRICS = ("completion", "lap_share", "best_lap_time_s", "mean_lap_time_s")
+"""Metrics that a run on several tracks has for each of them: column `completion/Oval_track`, in MLflow
+`train/completion/Oval_track`, so that all tracks are in one group."""
+
+
+def metric_names(row: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Return a row of metrics.jsonl by MLflow's names, in the order of METRICS.
+
+    Columns unknown to METRICS are called `train/COLUMN` and come last.
+    """
+    rank = {column: place for place, column in enumerate(METRICS)}
+    named = sorted(row.items(), key=lambda item: rank.get(item[0].partition("/")[0], len(rank)))
+    return {metric_name(column): value for column, value in named}
+
+
+def best_metrics(summary: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the evaluation of a run's best checkpoint, from its summary, as metrics of the run."""
+    best = summary.get("best") or {}
+    return {
+        BEST + METRICS[column][0].removeprefix("race/"): value
+        for column, value in best.items()
+        if column in METRICS and METRICS[column][0].startswith("race/")
+    }
+
+
+def evaluate_metric(column: str, track: str | None) -> str:
+    """Return MLflow's name of a result of `deepracer-exp evaluate`.
+
+    Args:
+        column: of the same result in metrics.jsonl.
+        track: its label; None for the run's only track, or for all tracks together.
+    """
+    name = f"race/evaluate/{METRICS[column][0].removeprefix('race/')}"
+    return name if track is None else f"{name}/{track}"
+
+
+def metric_name(column: str) -> str:
+    """Return MLflow's name of a column of metrics.jsonl."""
+    own, slash, track = column.partition("/")
+    return (METRICS[own][0] if own in METRICS else f"train/{own}") + slash + track
+
+
+_LONGEST_LABEL = 80  # MLflow takes 250 characters, older servers fewer; the UI shows about 40
+
+
+def trial_metrics(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Return the values of a trial's best checkpoint by metric; a training has no metrics of these names."""
+    return {trial_metric(name): value for name, value in values.items()}
+
+
+def trial_metric(objective: str) -> str:
+    """Return the metric of a study's objective."""
+    return f"trial/{objective}" if objective == "completion" else f"trial/{objective}_s"
+
+
+def track_labels(names: Sequence[str]) -> list[str]:
+    """Return unique labels of tracks that MLflow accepts as part of a metric's name.
+
+    Letters, digits, `_`, `-` and `.` are kept, anything else becomes `_`. Labels differ by more than case, because
+    some databases compare names without it.
+    """
+    plain = [re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:_LONGEST_LABEL] for name in names]
+    # A path component of dots alone would point elsewhere.
+    plain = [label if label.strip(".") else f"track_{label}" for label in plain]
+    given = {label.casefold() for label in plain}
+    labels: list[str] = []
+    used: set[str] = set()
+    for label in plain:
+        chosen, number = label, 1
+        while chosen.casefold() in used or (number > 1 and chosen.casefold() in given):
+            number += 1
+            chosen = f"{label}-{number}"
+        used.add(chosen.casefold())
+        labels.append(chosen)
+    return labels
+
+
+def track_metric(metric: str, label: str) -> str:
+    """Return the name of one of TRACK_METRICS for a track's label."""
+    return f"{metric}/{label}"
+
+
+Point = tuple[str, float, int, int]
+"""Key, value, time in ms, step."""
+
+_STEP = "env_steps"
+_CLOCK = "wall_clock_s"
+
+
+def now_ms() -> int:
+    """Return the time in ms since 1970."""
+    return time.time_ns() // 1_000_000
+
+
+def points_of(row: Mapping[str, float | None], step: int, start_ms: int) -> tuple[Point, ...]:
+    """Return the points of a row of metrics.jsonl, without None, NaN and infinite values.
+
+    A point's time is the run's start plus the row's `wall_clock_s`, so that a row recorded again, even by another
+    process, is the same point, which MLflow keeps once. A row without that column gets the current time.
+
+    Args:
+        row: its `env_steps` is the step and gives no point.
+        step: env steps.
+        start_ms: the run's start.
+    """
+    clock_s = row.get(_CLOCK)
+    time_ms = now_ms() if clock_s is None else start_ms + round(1000 * clock_s)
+    return points_at(metric_names({key: value for key, value in row.items() if key != _STEP}), step, time_ms)
+
+
+def points_at(metrics: Mapping[str, float | None], step: int, time_ms: int) -> tuple[Point, ...]:
+    """Return the points of metrics, without None, NaN and infinite values.
+
+    Args:
+        metrics: by name in MLflow.
+        step: that they are recorded against.
+        time_ms: since 1970.
+    """
+    return tuple(
+        (key, float(value), time_ms, step)
+        for key, value in metrics.items()
+        if value is not None and math.isfinite(value)
+    )

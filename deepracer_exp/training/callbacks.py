@@ -1,0 +1,360 @@
+"""The callbacks of every training, in their order: one concern each."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.result import Rank
+from deepracer_exp.runs.convergence import Decision, Stopping
+from deepracer_exp.runs.files import (
+    BEST_LAP,
+    CHECKPOINTS,
+    CONFIG,
+    CRASH_DUMPS,
+    LEARNING,
+    LOG,
+    METRICS,
+    OVERRIDES,
+    PROVENANCE,
+    REPORT,
+    REWARD,
+    SUMMARY,
+)
+from deepracer_exp.tracking.delivery import ENDS
+from deepracer_exp.tracking.metadata import END_TAG
+from deepracer_exp.tracking.tracker import Tracker
+
+from .budget import Alerts
+from .display import ProgressDisplay, RunHeader
+from .metrics import NOT_EVALUATED, EvalResult, Finished, Ranking
+from .report import write_pictures, write_run_page
+from .trainer import FINISHED, STOPPED_EARLY, Callback, Trainer, TrainResult
+
+logger = logging.getLogger("deepracer_exp")
+
+BUDGET_REACHED = "budget reached"
+"""Beginning of the reason of a run that has used its budget."""
+_DRIVING = "driving"
+"""What ranks a policy that is not evaluated: the training's own episodes."""
+
+
+def standard_callbacks(
+    experiment: Experiment,
+    setup: RaceSetup,
+    names: Mapping[str, str],
+    tracker: Tracker,
+    console: Console,
+    own: Sequence[Callback] = (),
+) -> list[Callback]:
+    """Return the callbacks of a run in the order in which they are called.
+
+    Args:
+        experiment: what is trained.
+        setup: its files, read.
+        names: what a racer calls the choices.
+        tracker: records the run.
+        console: shows the progress.
+        own: the caller's; they see evaluations and stopping rule, and come before anything is recorded: their columns
+            of `trainer.row` are, and what they refuse is not.
+
+    Raises:
+        BadInput: files or values of the evaluation or the alerts cannot be used.
+    """
+    return [
+        EvalCallback(experiment, console),
+        StoppingCallback(Stopping(experiment.stopping, setup.actions.n), tracker),
+        *own,
+        BudgetCallback(Alerts(experiment.budget), tracker),
+        RecordCallback(),
+        ReportCallback(),
+        TrackingCallback(tracker),
+        DisplayCallback(names, console),
+        BestCallback(experiment, setup),
+    ]
+
+
+class EvalCallback(Callback):
+    """Evaluates the policy every few iterations on the trials of group `evaluation`, the same each time."""
+
+    def __init__(self, experiment: Experiment, console: Console):
+        """Read what is to be driven.
+
+        Raises:
+            BadInput: a track or a condition is unknown or malformed.
+        """
+        self._every = experiment.checkpoints.every
+        self._metric = experiment.checkpoints.metric
+        self._console = console
+        # The cars of the training rest meanwhile, so that all cores are free.
+        self._evaluator = None if self._every is None else Evaluator(experiment, experiment.evaluation)
+
+    def on_replay(self, trainer: Trainer) -> None:
+        """Remove the evaluation of a policy that was evaluated only because the run ended there."""
+        if not self._is_due(trainer.row["iteration"]):
+            trainer.row |= NOT_EVALUATED
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Evaluate when due, and keep a checkpoint of what was evaluated."""
+        if self._is_due(trainer.iteration):
+            self._evaluate(trainer)
+            trainer.request_save()
+
+    def on_train_end(self, trainer: Trainer) -> None:
+        """Evaluate the policy of the last iteration, if that was not due: it may be the best.
+
+        The evaluation stands in metrics.jsonl and in the summary and in no checkpoint, so that a run which resumes
+        here is the one that was never interrupted.
+        """
+        if self._evaluator is not None and trainer.iteration and not self._is_due(trainer.iteration):
+            self._console.print(f"evaluating the policy of iteration {trainer.iteration}", highlight=False)
+            self._evaluate(trainer)
+
+    def _is_due(self, iteration: int) -> bool:
+        return self._every is not None and iteration % self._every == 0
+
+    def _evaluate(self, trainer: Trainer) -> None:
+        assert self._evaluator is not None
+        trainer.evaluation = EvalResult.of(self._evaluator(trainer.networks.policy), self._metric)
+        trainer.row |= trainer.evaluation.columns()
+
+
+class StoppingCallback(Callback):
+    """Ends the run by its stopping rule."""
+
+    def __init__(self, rule: Stopping, tracker: Tracker):
+        self._rule, self._tracker = rule, tracker
+        self._decision: Decision | None = None
+        self._reliable: dict[str, float] | None = None
+
+    def on_replay(self, trainer: Trainer) -> None:
+        """Let the rule see the rows it had seen."""
+        self._observe(trainer)
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Apply the rule to the new row."""
+        self._observe(trainer)
+        if self._decision is not None and self._decision.rule == "reliable":
+            self._reliable = trainer.moment()
+
+    def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
+        """Tag the run with the decision."""
+        for tag, value in (self._decision.tags() if self._decision else {}).items():
+            self._tracker.set_tag(tag, value)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return when the run became reliable."""
+        return {"reliable": self._reliable}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore it."""
+        self._reliable = state["reliable"]
+
+    def summary(self, trainer: Trainer) -> dict[str, Any]:
+        """Return the decision."""
+        return {"stopping": self._decision and self._decision.as_dict(), "reliable": self._reliable}
+
+    def _observe(self, trainer: Trainer) -> None:
+        self._decision = self._rule.observe(trainer.row)
+        if self._decision is not None:
+            status = STOPPED_EARLY if self._decision.hopeless else FINISHED
+            trainer.request_stop(str(self._decision), status)
+
+
+class BudgetCallback(Callback):
+    """Ends the run when a limit is reached, and sends alerts on the way."""
+
+    def __init__(self, alerts: Alerts, tracker: Tracker):
+        self._alerts, self._tracker = alerts, tracker
+
+    def on_fit_start(self, trainer: Trainer) -> None:
+        """Stop if there is nothing left; what was used before needs no alert."""
+        self._check(trainer)
+        trainer.budget.alerts(*trainer.usage)
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Compare what is used with the limits."""
+        self._check(trainer)
+        for alert in trainer.budget.alerts(*trainer.usage):
+            logger.info(alert.message)
+            self._tracker.set_tag(f"budget.{alert.limit}", f"{alert.percent} %")
+            self._alerts.send(alert.message, trainer.folder.path)
+
+    def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
+        """Wait for alerts still on their way."""
+        self._alerts.close()
+
+    def on_release(self, trainer: Trainer) -> None:
+        """Wait for alerts still on their way."""
+        self._alerts.close()
+
+    def summary(self, trainer: Trainer) -> dict[str, Any]:
+        """Return the cost."""
+        return {"cost": trainer.budget.cost(trainer.wall_clock_s)}
+
+    def _check(self, trainer: Trainer) -> None:
+        limit, fraction = trainer.budget.used(*trainer.usage)
+        if fraction >= 1:
+            trainer.request_stop(f"{BUDGET_REACHED}: {limit}")
+
+
+class RecordCallback(Callback):
+    """Writes metrics.jsonl."""
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Append the row."""
+        trainer.folder.append_metrics(trainer.row)
+
+    def on_train_end(self, trainer: Trainer) -> None:
+        """Put the last evaluation into the last row."""
+        if trainer.evaluation is not None:
+            trainer.folder.write_metrics([*trainer.folder.metrics()[:-1], trainer.row])
+
+
+class ReportCallback(Callback):
+    """Draws the pictures of a run, and writes its page if it is over."""
+
+    def on_train_end(self, trainer: Trainer) -> None:
+        """Draw best_lap.png and learning.png."""
+        write_pictures(trainer.folder.path, trainer.setup.courses)
+
+    def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
+        """Write report.html, unless the run may be resumed."""
+        if trainer.experiment.report and result.status in (FINISHED, STOPPED_EARLY):
+            result.note = write_run_page(trainer.folder.path)
+
+
+class TrackingCallback(Callback):
+    """Passes rows, tags and files to the tracker."""
+
+    def __init__(self, tracker: Tracker):
+        self._tracker = tracker
+
+    def on_replay(self, trainer: Trainer) -> None:
+        """Log the row again: the store may lack some, and takes none twice."""
+        self._log(trainer)
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Log the row."""
+        self._log(trainer)
+
+    def on_save(self, trainer: Trainer) -> None:
+        """Let the tracker write the points up to here: no resumed run goes back behind them."""
+        self._tracker.safe_until(trainer.env_steps)
+
+    def on_train_end(self, trainer: Trainer) -> None:
+        """Log the last evaluation of a run that is over; of one that may be resumed, MLflow would keep it."""
+        if trainer.evaluation is not None and not trainer.is_interrupted:
+            self._tracker.log(trainer.evaluation.columns(), step=trainer.env_steps)
+
+    def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
+        """Log files and end the run in the store."""
+        path = trainer.folder.path
+        for name in (CONFIG, OVERRIDES, PROVENANCE, REWARD):
+            self._tracker.log_artifact(path / name)
+        for name in (SUMMARY, METRICS, LOG, REPORT, BEST_LAP, LEARNING):
+            if (path / name).exists():
+                self._tracker.log_artifact(path / name)
+        if (path / CRASH_DUMPS).exists():
+            self._tracker.log_artifact(path / CRASH_DUMPS, CRASH_DUMPS)
+        for name in ("best", "last"):
+            if (trainer.checkpoints.folder / name).exists():
+                self._tracker.log_artifact(
+                    (trainer.checkpoints.folder / name).resolve(), f"{CHECKPOINTS}/{name}"
+                )
+        self._tracker.set_tag(END_TAG, f"{result.status}: {result.reason}")
+        self._tracker.finish(ENDS.get(result.status, "KILLED"))
+
+    def on_release(self, trainer: Trainer) -> None:
+        """End the run in the store as killed."""
+        self._tracker.set_tag(END_TAG, "taken over")
+        self._tracker.finish("KILLED")
+
+    def _log(self, trainer: Trainer) -> None:
+        metrics = {key: value for key, value in trainer.row.items() if key != "env_steps"}
+        self._tracker.log(metrics, step=trainer.row["env_steps"])
+
+
+class DisplayCallback(Callback):
+    """Shows the progress in the terminal."""
+
+    def __init__(self, names: Mapping[str, str], console: Console):
+        self._names, self._console = names, console
+        self._display: ProgressDisplay | None = None
+
+    def on_fit_start(self, trainer: Trainer) -> None:
+        """Show the view before the cars: workers take a second or two to start."""
+        if trainer.stop_reason is None:
+            header = RunHeader.of(trainer.folder, trainer.setup, self._names, trainer.metrics, trainer.budget)
+            self._display = ProgressDisplay(self._console, header).__enter__()
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Show the row, and how long the rest of the budget takes."""
+        assert self._display is not None
+        _, fraction = trainer.budget.used(*trainer.usage)
+        left_s = trainer.row["wall_clock_s"] * (1 / fraction - 1) if fraction else None
+        self._display.update(trainer.row, min(fraction, 1.0), left_s)
+
+    def on_fit_end(self, trainer: Trainer) -> None:
+        """Leave the last view on the screen."""
+        if self._display is not None:
+            self._display.__exit__(None, None, None)
+
+
+class BestCallback(Callback):
+    """Keeps the checkpoint of the best policy: by its evaluation, or, without evaluations, by its own episodes."""
+
+    def __init__(self, experiment: Experiment, setup: RaceSetup):
+        self._metric = experiment.checkpoints.metric
+        self._by_driving = experiment.checkpoints.every is None
+        self._ranking = Ranking([course.tracks[0].length_m for course in setup.courses])
+        self._best: dict[str, Any] | None = None
+        """Iteration and env steps of the policy, what it was ranked by, its rank and its evaluation, JSON types."""
+
+    def on_batch(self, trainer: Trainer, finished: Finished) -> None:
+        """Save a policy that drove better than any before; the update makes another one of it."""
+        if not self._by_driving:
+            return
+        rank = self._ranking.rank(finished)
+        if rank is not None and self._is_better(trainer, rank, _DRIVING, NOT_EVALUATED):
+            trainer.checkpoints.save(trainer.agent, trainer.counters(), best=True)
+
+    def on_iteration_end(self, trainer: Trainer) -> None:
+        """Let the coming checkpoint be the best, if its evaluation is."""
+        trainer.is_best = self._is_best_evaluated(trainer)
+
+    def on_train_end(self, trainer: Trainer) -> None:
+        """Let the last checkpoint be the best, if its evaluation is."""
+        if self._is_best_evaluated(trainer):
+            trainer.checkpoints.mark_best(trainer.iteration)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the best policy's rank, and what is known of each track."""
+        return {"best": self._best, "ranking": self._ranking.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore both."""
+        self._best = state["best"]
+        self._ranking.load_state_dict(state["ranking"])
+
+    def summary(self, trainer: Trainer) -> dict[str, Any]:
+        """Return the best policy."""
+        return {"best": self._best}
+
+    def _is_best_evaluated(self, trainer: Trainer) -> bool:
+        found = trainer.evaluation
+        return found is not None and self._is_better(trainer, found.rank, self._metric, found.columns())
+
+    def _is_better(
+        self, trainer: Trainer, rank: Rank, metric: str, columns: Mapping[str, float | None]
+    ) -> bool:
+        """Return whether a policy ranks above the best one, and remember it then."""
+        if self._best is not None and list(rank) <= self._best["rank"]:
+            return False
+        moment = {"iteration": trainer.iteration, "env_steps": trainer.env_steps}
+        self._best = {**moment, "metric": metric, "rank": list(rank), **columns}
+        return True

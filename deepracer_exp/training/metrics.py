@@ -1,0 +1,387 @@
+"""What the cars achieve: episodes counted from the trace, and the figures of an iteration and of a run."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Metric, Rank
+from deepracer_exp.tracking.metrics import track_labels, track_metric
+
+TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
+"""Columns of metrics.jsonl that differ between two runs of the same seed."""
+_REMEMBERED = 50  # of the last episodes, where no stopping rule says how many
+_FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the policy
+
+
+def track_names(setup: RaceSetup) -> list[str]:
+    """Return the names of the courses: one by its own name, which may stand in a file; several by their options."""
+    courses = setup.courses
+    return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """Episodes that ended, in the order of their ends; arrays of one length."""
+
+    track: np.ndarray
+    """Number of the track, int64."""
+    returns: np.ndarray
+    """Sum of rewards."""
+    progress: np.ndarray
+    """Per cent of the lap at the end."""
+    lap: np.ndarray
+    """Whether the lap was completed."""
+    time_s: np.ndarray
+    """Seconds of driving, the prepare step not counted: the lap time where the lap was completed."""
+
+    def on(self, track: int) -> "Finished":
+        """Return the episodes of one track."""
+        here = self.track == track
+        return Finished(*(values[here] for values in vars(self).values()))
+
+
+class Record:
+    """How episodes ended: how many, how many laps, the fastest, and the last ones."""
+
+    def __init__(self, remembered: int):
+        """Begin with nothing.
+
+        Args:
+            remembered: how many of the last finished episodes `lap_share` looks at.
+        """
+        self._laps_of_last: deque[bool] = deque(maxlen=remembered)
+        self.finished = 0
+        self.laps = 0
+        self.best_lap_s: float | None = None
+
+    @property
+    def lap_share(self) -> float | None:
+        """Share of complete laps among the last episodes, None before as many as are remembered have ended."""
+        last = self._laps_of_last
+        return sum(last) / len(last) if len(last) == last.maxlen else None
+
+    def add(self, finished: Finished) -> None:
+        """Note episodes."""
+        self.finished += len(finished.lap)
+        self.laps += int(finished.lap.sum())
+        self._laps_of_last.extend(finished.lap.tolist())
+        if finished.lap.any():
+            fastest = float(finished.time_s[finished.lap].min())
+            self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything, JSON types."""
+        return {
+            "laps_of_last": list(self._laps_of_last),
+            "finished": self.finished,
+            "laps": self.laps,
+            "best_lap_s": self.best_lap_s,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`."""
+        self._laps_of_last.clear()
+        self._laps_of_last.extend(state["laps_of_last"])
+        self.finished, self.laps, self.best_lap_s = state["finished"], state["laps"], state["best_lap_s"]
+
+
+class EpisodeBook:
+    """Numbers the episodes of a run and remembers how they ended.
+
+    Attributes:
+        all: the episodes of all tracks.
+        tracks: those of each track.
+    """
+
+    def __init__(self, n_cars: int, n_tracks: int, remembered: int, step_s: float):
+        """Open the book.
+
+        Args:
+            n_cars: cars over all processes.
+            n_tracks: tracks the cars drive on.
+            remembered: how many of the last finished episodes `Record.lap_share` looks at.
+            step_s: simulated seconds of a control step.
+        """
+        self._number = np.full(n_cars, -1)
+        self._next_number = 0
+        self._step_s = step_s
+        self.all = Record(remembered)
+        self.tracks = tuple(Record(remembered) for _ in range(n_tracks))
+
+    def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
+        """Note a batch of driving.
+
+        Args:
+            trace: rows of `formats.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T. A car that
+                stands there twice (of asynchronous collection, where one process was faster than the others)
+                drove the lower row later.
+
+        Returns:
+            The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and
+            the episodes that ended in them.
+        """
+        trace = trace.copy()
+        cars = trace[:, 0, PACKED["car"]].astype(np.int64)
+        for part in _each_car_once(cars):
+            begins = trace[part, :, PACKED["steps"]] == 1
+            trace[part, :, PACKED["episode"]] = self._numbers(cars[part], begins)
+        finished = self._close(trace)
+        rows = trace.reshape(-1, trace.shape[-1])
+        return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the numbers of the episodes under way and the records."""
+        return {
+            "number": self._number,
+            "next_number": self._next_number,
+            "records": [record.state_dict() for record in (self.all, *self.tracks)],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`."""
+        self._number, self._next_number = state["number"].copy(), state["next_number"]
+        for record, own in zip((self.all, *self.tracks), state["records"], strict=True):
+            record.load_state_dict(own)
+
+    def _numbers(self, cars: np.ndarray, begins: np.ndarray) -> np.ndarray:
+        """Return the number of each step's episode, (cars, T), from where episodes begin."""
+        # Episodes are numbered in the order in which they begin, cars that begin together by their number.
+        order = np.argwhere(begins.T)
+        numbers = np.full(begins.shape, -1)
+        numbers[order[:, 1], order[:, 0]] = self._next_number + np.arange(len(order))
+        self._next_number += len(order)
+        numbers[:, 0] = np.maximum(numbers[:, 0], self._number[cars])
+        numbers = np.maximum.accumulate(numbers, axis=1)
+        self._number[cars] = numbers[:, -1]
+        return numbers
+
+    def _close(self, trace: np.ndarray) -> Finished:
+        in_time = trace.transpose(1, 0, 2)
+        ends = in_time[in_time[:, :, PACKED["done"]] == 1]
+        finished = Finished(
+            track=ends[:, PACKED["track"]].astype(np.int64),
+            returns=ends[:, PACKED["episode_return"]],
+            progress=ends[:, PACKED["progress"]],
+            lap=ends[:, PACKED["episode_status"]] == STATUS_CODE["lap_complete"],
+            time_s=(ends[:, PACKED["steps"]] - 1) * self._step_s,
+        )
+        self.all.add(finished)
+        for number, record in enumerate(self.tracks):
+            record.add(finished.on(number))
+        return finished
+
+
+def _each_car_once(cars: np.ndarray) -> list[np.ndarray]:
+    """Return the rows at which each car stands for the first time, for the second time, and so on."""
+    order = np.argsort(cars, kind="stable")
+    _, first, counts = np.unique(cars[order], return_index=True, return_counts=True)
+    turn = np.empty(len(cars), np.int64)
+    turn[order] = np.arange(len(cars)) - np.repeat(first, counts)
+    return [np.flatnonzero(turn == nth) for nth in range(turn.max() + 1)]
+
+
+class RunMetrics:
+    """Results of a run on one track, or of each of its tracks.
+
+    Attributes:
+        track_names: in the order of their numbers in the trace.
+        labels: what the tracks are called in metrics; empty with one track, whose metrics need no name.
+    """
+
+    def __init__(self, names: Sequence[str], n_cars: int, step_s: float, stopping: StoppingConfig):
+        """Begin without a result.
+
+        Args:
+            names: of the tracks, in the order of their numbers in the trace.
+            n_cars: cars over all processes.
+            step_s: simulated seconds of a control step.
+            stopping: its rule says of how many episodes `lap_share` is taken.
+        """
+        self.track_names = names
+        self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else _REMEMBERED
+        self._book = EpisodeBook(n_cars, len(names), self.remembered, step_s)
+        self.labels = track_labels(names) if len(names) > 1 else []
+        self._last: list[dict[str, float | None]] = [{} for _ in self.labels]
+
+    @property
+    def lap_share(self) -> float | None:
+        """Share of complete laps among the last episodes on the track where it is lowest.
+
+        None before as many episodes as are remembered have ended on every track.
+        """
+        shares = [record.lap_share for record in self._book.tracks]
+        known = [share for share in shares if share is not None]
+        return min(known) if len(known) == len(shares) else None
+
+    @property
+    def episodes(self) -> Record:
+        """Episodes and laps on all tracks so far."""
+        return self._book.all
+
+    def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
+        """Count a batch; arguments and results as of `EpisodeBook.enter`."""
+        return self._book.enter(trace)
+
+    def row(self, finished: Finished) -> dict[str, float | None]:
+        """Return the figures of the episodes of an iteration, means over episodes.
+
+        Lap times of different tracks have no common measure: with several tracks they stand at each track only.
+        """
+        figures = _figures(finished, self._book.all)
+        if self.labels:
+            figures |= {"lap_share": self.lap_share, "best_lap_time_s": None, "mean_lap_time_s": None}
+        return {"mean_return": _mean(finished.returns), **figures}
+
+    def row_of_tracks(self, finished: Finished) -> dict[str, float | None]:
+        """Return the figures of each track, empty with one track; None where an iteration has nothing to tell."""
+        row: dict[str, float | None] = {}
+        for number, label in enumerate(self.labels):
+            figures = _figures(finished.on(number), self._book.tracks[number])
+            self._last[number] |= {key: value for key, value in figures.items() if value is not None}
+            row |= {track_metric(metric, label): value for metric, value in figures.items()}
+        return row
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything."""
+        return {"book": self._book.state_dict(), "last": self._last}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a `state_dict`."""
+        self._book.load_state_dict(state["book"])
+        self._last = [dict(last) for last in state["last"]]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures at the end; with several tracks, `tracks` has those of each by its name."""
+        book = self._book
+        whole = {
+            "lap_share": self.lap_share,
+            "best_lap_time_s": None if self.labels else book.all.best_lap_s,
+        }
+        if not self.labels:
+            return whole
+        tracks = {
+            name: {
+                "episodes": record.finished,
+                "laps": record.laps,
+                "completion": last.get("completion"),
+                "lap_share": record.lap_share,
+                "best_lap_time_s": record.best_lap_s,
+                "mean_lap_time_s": last.get("mean_lap_time_s"),
+            }
+            for name, record, last in zip(self.track_names, book.tracks, self._last, strict=True)
+        }
+        return {**whole, "tracks": tracks}
+
+
+def _figures(finished: Finished, record: Record) -> dict[str, float | None]:
+    return {
+        "completion": _mean(finished.progress),
+        "lap_share": record.lap_share,
+        "best_lap_time_s": record.best_lap_s,
+        "mean_lap_time_s": _mean(finished.time_s[finished.lap]),
+    }
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+class Ranking:
+    """Ranks a policy by the episodes that ended last on each track.
+
+    Where a lap takes longer than an iteration, or few cars drive on a track, not every iteration ends an episode on
+    each: a track counts with the last iteration that did.
+    """
+
+    def __init__(self, lengths_m: Sequence[float]):
+        """Begin without a result.
+
+        Args:
+            lengths_m: length of each track.
+        """
+        self._lengths_m = lengths_m
+        self._completion = np.full(len(lengths_m), np.nan)
+        self._speed_mps = np.full(len(lengths_m), np.nan)
+        self._episodes = np.zeros(len(lengths_m), np.int64)
+
+    def rank(self, finished: Finished) -> tuple[float, float] | None:
+        """Return completion (per cent) and speed along the lap (m/s), means over tracks; higher is better.
+
+        Completion is the mean over a track's episodes, speed the track's length over the mean time of complete laps,
+        0 where there is none.
+
+        Args:
+            finished: what ended in this iteration.
+
+        Returns:
+            None as long as too few episodes have ended to tell, or if none did in this iteration.
+        """
+        for track in np.unique(finished.track):
+            here = finished.track == track
+            times_s = finished.time_s[here & finished.lap]
+            self._completion[track] = finished.progress[here].mean()
+            self._speed_mps[track] = self._lengths_m[track] / times_s.mean() if len(times_s) else 0.0
+            self._episodes[track] = here.sum()
+        if not len(finished.track) or not self._episodes.all() or self._episodes.sum() < _FEWEST_EPISODES:
+            return None
+        return float(self._completion.mean()), float(self._speed_mps.mean())
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """Return what is known of each track."""
+        return {"completion": self._completion, "speed_mps": self._speed_mps, "episodes": self._episodes}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        """Take over a `state_dict`."""
+        self._completion, self._speed_mps = state["completion"].copy(), state["speed_mps"].copy()
+        self._episodes = state["episodes"].copy()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalResult:
+    """Figures of one evaluation during a training."""
+
+    rank: Rank
+    eval_completion: float
+    """Per cent of the lap, mean over the laps tried on the usual conditions."""
+    held_out_completion: float | None
+    """The same on the held-out conditions; None where there are none."""
+    eval_lap_time_s: float | None
+    """Mean time of the complete laps on the usual conditions, over all tracks."""
+    eval_lap_share: float
+    """Complete laps per lap tried on the usual conditions, 0 to 1."""
+    eval_race_score_s: float | None
+    """Seconds per complete lap on all conditions, failed laps included; None without a lap on each track."""
+
+    @classmethod
+    def of(cls, evaluation: Evaluation, metric: Metric) -> "EvalResult":
+        """Return the figures of an evaluation that is ranked by `metric`."""
+        usual = evaluation.on(USUAL)
+        has_held_out = HELD_OUT in evaluation.conditions
+        return cls(
+            rank=evaluation.rank(metric),
+            eval_completion=usual.completion,
+            held_out_completion=evaluation.on(HELD_OUT).completion if has_held_out else None,
+            eval_lap_share=usual.lap_share,
+            eval_lap_time_s=usual.mean_lap_time_s,
+            eval_race_score_s=evaluation.race_score_s,
+        )
+
+    def columns(self) -> dict[str, float | None]:
+        """Return the columns of metrics.jsonl."""
+        return {name: getattr(self, name) for name in EVAL_COLUMNS}
+
+
+EVAL_COLUMNS = (
+    "eval_completion",
+    "held_out_completion",
+    "eval_lap_share",
+    "eval_lap_time_s",
+    "eval_race_score_s",
+)
+NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)

@@ -1,0 +1,453 @@
+"""The trainer: one loop, and the callbacks that hang on it."""
+
+import contextlib
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+from tensordict import TensorDictBase
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.ppo import PPO, UpdateMetrics
+from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.collectors.base import Collector, worker_count
+from deepracer_exp.collectors.collector import open_collector
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.deepracer.trace import TraceWriter, to_table
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.errors import RunFailed, reading
+from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
+from deepracer_exp.runs.crash_dump import write_crash_dump
+from deepracer_exp.runs.files import SUMMARY, TRACE
+from deepracer_exp.runs.fingerprint import fingerprint
+from deepracer_exp.runs.folder import RunFolder
+
+from .budget import Budget
+from .metrics import NOT_EVALUATED, EvalResult, Finished, RunMetrics, track_names
+from .signals import Interruption
+
+logger = logging.getLogger("deepracer_exp")
+
+FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "hopeless", "interrupted", "failed"
+"""`status` of a run that has ended, as in summary.json."""
+_LAST_EVERY, _LAST_EVERY_S = 10, 5.0
+"""Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
+
+
+class TakenOver(Exception):  # noqa: N818 - reads as what it is at the raise site
+    """Another process continues this run: nothing more may be written of it."""
+
+
+@dataclass
+class TrainResult:
+    """How a training ended."""
+
+    status: str
+    """`finished`, `hopeless` (stopped early: more training would not have helped), `interrupted` or `failed`."""
+    reason: str
+    exit_code: int
+    folder: Path
+    summary: dict[str, Any]
+    """Contents of summary.json."""
+    error: BaseException | None = None
+    """The exception that ended a failed run."""
+    note: str | None = None
+    """A line on what is missing from the results."""
+
+
+class Callback:
+    """Base class of everything that happens around the training loop; each hook does nothing unless overridden.
+
+    The trainer calls a hook of all its callbacks in the order of its list. A hook may read all public attributes of
+    the trainer, add columns to `trainer.row` (in `on_iteration_end`, ahead of the callback that records it), and call
+    `trainer.request_stop` and `trainer.request_save`. An exception from a hook ends the run as failed.
+    """
+
+    hurries_when_interrupted = False
+    """Leave out `on_train_end` when the run is interrupted, because another process resumes it at once."""
+
+    def on_run_created(self, trainer: "Trainer") -> None:
+        """The folder of a new run exists; nothing has been recorded yet. Not called for a resumed run."""
+
+    def on_replay(self, trainer: "Trainer") -> None:
+        """`trainer.row` is a row of metrics.jsonl that a resumed run has up to its checkpoint; called for each."""
+
+    def on_fit_start(self, trainer: "Trainer") -> None:
+        """The loop is about to start; a stop requested here ends it before any car drives."""
+
+    def on_batch(self, trainer: "Trainer", finished: Finished) -> None:
+        """A batch was collected; the networks are still those that drove it.
+
+        Args:
+            trainer: with the batch's steps and episodes counted.
+            finished: the episodes that ended in the batch.
+        """
+
+    def on_iteration_end(self, trainer: "Trainer") -> None:
+        """The networks are updated and `trainer.row` is measured."""
+
+    def on_save(self, trainer: "Trainer") -> None:
+        """A checkpoint was written from which the run can be resumed."""
+
+    def on_fit_end(self, trainer: "Trainer") -> None:
+        """The loop has ended, however it ended, and no car drives any more."""
+
+    def on_train_end(self, trainer: "Trainer") -> None:
+        """The run came to its end or was interrupted, but did not fail; its results are written next."""
+
+    def on_run_end(self, trainer: "Trainer", result: TrainResult) -> None:
+        """summary.json is written; the last hook of a run."""
+
+    def on_release(self, trainer: "Trainer") -> None:
+        """Another process has taken the run over: write nothing more. In place of `on_run_end`."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run needs: tensors, arrays and JSON types, under keys no other callback uses."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore from what all callbacks of the run have stored."""
+
+    def summary(self, trainer: "Trainer") -> dict[str, Any]:
+        """Return entries for summary.json, JSON types."""
+        return {}
+
+
+class Trainer:
+    """Trains one run: collects, updates, measures, and calls its callbacks after every iteration.
+
+    Attributes:
+        experiment: what is trained.
+        setup: its files, read.
+        folder: the run's folder.
+        callbacks: in the order in which they are called.
+        networks: policy and value.
+        agent: what improves them.
+        metrics: episodes and laps so far.
+        budget: the limits and how much of them is used.
+        checkpoints: the run's own.
+        iteration: updates made.
+        env_steps: control steps driven by all cars.
+        row: metrics of the last iteration, a line of metrics.jsonl.
+        evaluation: of the policy after the last iteration, None if it was not evaluated.
+        is_best: whether the policy is the best so far; the next checkpoint becomes `best`.
+        stop_reason: why the loop ends, None while it continues.
+        status: what the run is once it ends without interruption or failure.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        setup: RaceSetup,
+        folder: RunFolder,
+        config: Mapping[str, Any],
+        callbacks: Sequence[Callback],
+    ):
+        """Build the networks and all that trains them.
+
+        Args:
+            experiment: what is trained.
+            setup: its files, read.
+            folder: where everything is written.
+            config: all values, as in config.yaml.
+            callbacks: in the order in which they are called.
+
+        Raises:
+            BadInput: the networks do not fit into memory.
+            OSError: the folder cannot be written.
+        """
+        self.experiment, self.setup, self.folder = experiment, setup, folder
+        self.callbacks = callbacks
+        kept = experiment.checkpoints
+        self.checkpoints = CheckpointStore(folder.path, kept.keep, kept.every)
+        self.budget = Budget(experiment.budget, folder.path)
+        cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+        self.metrics = RunMetrics(
+            track_names(setup), cars, experiment.car.control_period_s, experiment.stopping
+        )
+        self._trace = TraceWriter(folder.path / TRACE)
+        # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
+        # update took 25 times as long.
+        torch.set_num_threads(1)
+        generator = torch.Generator().manual_seed(experiment.seed)
+        with reading(f"network.hidden={list(experiment.network.hidden)}", "a network that fits into memory"):
+            self.networks = build_actor_critic(
+                experiment.network, len(feature_names(experiment.observation)), setup.actions.n, generator
+            )
+        self.agent = PPO(
+            self.networks, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed
+        )
+        self.iteration, self.env_steps = 0, 0
+        self.row: dict[str, Any] = {}
+        self.evaluation: EvalResult | None = None
+        self.is_best = False
+        self.stop_reason: str | None = None
+        self.status = FINISHED
+        self._interruption = Interruption()
+        self._save_requested = False
+        self._fingerprint = fingerprint(config, setup)
+        self._cars: dict[str, Any] | None = None
+        self._first_lap: dict[str, float] | None = None
+        self._began = self._saved_at = time.monotonic()
+        # The clock of a racer starts with the command, not with the loop.
+        self._process_began = psutil.Process().create_time()
+        folder.open_log()
+
+    def fit(self, interruption: Interruption) -> str:
+        """Train until there is a reason to stop.
+
+        Args:
+            interruption: entered; a signal ends the loop after the iteration in progress.
+
+        Returns:
+            The reason.
+
+        Raises:
+            RunFailed: a worker was lost, a number became NaN or infinite, or the disk is full.
+            TakenOver: another process continues the run.
+        """
+        self._interruption = interruption
+        with contextlib.ExitStack() as running:
+            collector = self._start(running)
+            while collector is not None and self.stop_reason is None:
+                # 1. Collect: count steps and episodes; the networks are still those that drove.
+                batch, collect_s = collector.collect(self.experiment.algorithm)
+                rows, finished = self.metrics.enter(batch["next", "trace"].numpy())
+                self.env_steps += batch.numel()
+                self._call("on_batch", finished)
+
+                # 2. Update the networks, and pass them to the cars.
+                began = time.monotonic()
+                update = self._update(batch)
+                collector.publish_policy()
+                update_s = time.monotonic() - began
+                self.iteration += 1
+
+                # 3. Measure: one row of metrics, the steps of the trace.
+                self.row = self._measure(finished, update, batch.numel(), collect_s, update_s)
+                self.evaluation, self.is_best, self._save_requested = None, False, False
+
+                # 4. Callbacks: evaluate, stop?, prune?, budget?, record, track, display, best checkpoint.
+                self._call("on_iteration_end")
+                self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
+                self._check_interruption()
+
+                # 5. Save when due and at the end.
+                if self.stop_reason or self._save_requested or self._is_time_to_save():
+                    self.save(collector)
+        assert self.stop_reason is not None
+        if interruption.signum is None or not any(one.hurries_when_interrupted for one in self.callbacks):
+            self.evaluation, self.is_best = None, False
+            self._call("on_train_end")
+        return self.stop_reason
+
+    def request_stop(self, reason: str, status: str = FINISHED) -> None:
+        """End the run after this iteration; the first request counts.
+
+        Args:
+            reason: for the last line of the run and summary.json.
+            status: FINISHED or STOPPED_EARLY.
+        """
+        if self.stop_reason is None:
+            self.stop_reason, self.status = reason, status
+
+    def request_save(self) -> None:
+        """Write a checkpoint after this iteration."""
+        self._save_requested = True
+
+    def save(self, collector: Collector | None = None) -> None:
+        """Write a checkpoint from which the run can be resumed.
+
+        Args:
+            collector: whose cars are stored; None: before the first iteration, so that a run which is killed before
+                its first checkpoint can begin again.
+
+        Raises:
+            RunFailed: the disk is full, or a worker was lost.
+        """
+        cars = None if collector is None else collector.state_dict()
+        state = {
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "wall_clock_s": self.wall_clock_s,
+            "results": self.metrics.state_dict(),
+            "first_lap": self._first_lap,
+            "cars": cars,
+            **self._fingerprint,
+        }
+        for callback in self.callbacks:
+            state |= callback.state_dict()
+        self.checkpoints.save(self.agent, self.counters(), state, best=self.is_best)
+        if collector is not None:
+            self._call("on_save")
+            self._saved_at = time.monotonic()
+
+    def load(self, checkpoint: Path, state: Mapping[str, Any]) -> None:
+        """Restore a run from a checkpoint.
+
+        Args:
+            checkpoint: its folder.
+            state: what `read_training` found in it.
+
+        Raises:
+            BadInput: it does not fit the experiment.
+        """
+        read_agent(checkpoint, self.agent)
+        self.iteration, self.env_steps = state["iteration"], state["env_steps"]
+        self.metrics.load_state_dict(state["results"])
+        self._first_lap, self._cars = state["first_lap"], state["cars"]
+        self._began -= state["wall_clock_s"]
+        self._process_began -= state["wall_clock_s"]
+        for callback in self.callbacks:
+            callback.load_state_dict(state)
+
+    def replay(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Pass the rows of metrics.jsonl up to the checkpoint to the callbacks again; return them as they left them."""
+        replayed = []
+        for row in rows:
+            self.stop_reason, self.status = None, FINISHED  # the last row decides
+            self.row = dict(row)
+            self._call("on_replay")
+            replayed.append(self.row)
+        return replayed
+
+    def end(
+        self, status: str, reason: str, exit_code: int, error: BaseException | None = None
+    ) -> TrainResult:
+        """Write summary.json and let go of the run.
+
+        Raises:
+            OSError: the folder takes no more; not if the run failed, so that nobody waits for it.
+        """
+        summary = {
+            "status": status,
+            "reason": reason,
+            **self.counters(),
+            "seed": self.experiment.seed,
+            "wall_clock_s": round(self.wall_clock_s, 3),
+            **self.metrics.summary(),
+            "first_lap": self._first_lap,
+            "last": self.row,
+        }
+        for callback in self.callbacks:
+            summary |= callback.summary(self)
+        logger.log(logging.ERROR if error else logging.INFO, "%s: %s", status, reason, exc_info=error)
+        try:
+            self.folder.write(SUMMARY, json.dumps(summary, indent=2) + "\n")
+        except OSError:
+            if status != FAILED:
+                raise
+        result = TrainResult(status, reason, exit_code, self.folder.path, summary, error)
+        self._call("on_run_end", result)
+        self.folder.release()
+        return result
+
+    def fail(self, reason: str, error: BaseException) -> TrainResult:
+        """Write a crash dump and end the run as failed."""
+        write_crash_dump(self.folder.path, error)
+        return self.end(FAILED, reason, RunFailed.exit_code, error)
+
+    def release(self) -> None:
+        """Leave the run to the process that continues it: nothing more is written into its folder."""
+        self._call("on_release")
+        self.folder.release()
+
+    @property
+    def wall_clock_s(self) -> float:
+        """Seconds of training, those before a resume included."""
+        return time.monotonic() - self._began
+
+    @property
+    def usage(self) -> tuple[int, int, float]:
+        """What the budget counts: env steps, iterations and seconds."""
+        return self.env_steps, self.iteration, self.wall_clock_s
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether a signal asked the run to end."""
+        return self._interruption.signum is not None
+
+    def moment(self) -> dict[str, float]:
+        """Return the env steps so far and the seconds since the command started."""
+        return {
+            "env_steps": self.env_steps,
+            "since_process_start_s": round(time.time() - self._process_began, 3),
+        }
+
+    def counters(self) -> dict[str, int]:
+        """Return iteration, env steps, episodes and laps so far."""
+        episodes = self.metrics.episodes
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "episodes": episodes.finished,
+            "laps": episodes.laps,
+        }
+
+    def _start(self, running: contextlib.ExitStack) -> Collector | None:
+        """Start callbacks and cars; None if there is a reason to stop before that."""
+        # There is one already if the run was killed while it was ending, or Ctrl-C came while it began.
+        self._check_interruption()
+        running.callback(self._call, "on_fit_end")
+        self._call("on_fit_start")
+        if self.stop_reason is not None:
+            return None
+        experiment = self.experiment
+        return running.enter_context(
+            open_collector(
+                experiment.collector,
+                experiment.algorithm,
+                self.setup,
+                self.networks.policy,
+                self.folder.path,
+                state=self._cars,
+            )
+        )
+
+    def _check_interruption(self) -> None:
+        if self.is_interrupted:
+            self.stop_reason = INTERRUPTED
+
+    def _call(self, hook: str, *arguments: Any) -> None:
+        for callback in self.callbacks:
+            getattr(callback, hook)(self, *arguments)
+
+    def _update(self, batch: TensorDictBase) -> UpdateMetrics:
+        _, fraction = self.budget.used(*self.usage)
+        try:
+            return self.agent.update(batch, self.iteration, min(fraction, 1.0))
+        except RunFailed as error:
+            error.arrays = {  # type: ignore[attr-defined]
+                "observation": batch["observation"].numpy(),
+                "action": batch["action"].numpy(),
+                "reward": batch["next", "reward"].numpy(),
+            }
+            raise
+
+    def _measure(
+        self, finished: Finished, update: UpdateMetrics, frames: int, collect_s: float, update_s: float
+    ) -> dict[str, Any]:
+        """Return the iteration's row of metrics.jsonl."""
+        if self._first_lap is None and self.metrics.episodes.laps:
+            self._first_lap = self.moment()
+        return {
+            **self.counters(),
+            **self.metrics.row(finished),
+            **{name: float(value) for name, value in vars(update).items()},
+            **NOT_EVALUATED,
+            "wall_clock_s": round(self.wall_clock_s, 3),
+            "collect_s": round(collect_s, 4),
+            "update_s": round(update_s, 4),
+            "env_steps_per_s": round(frames / (collect_s + update_s), 1),
+            **self.metrics.row_of_tracks(finished),
+        }
+
+    def _is_time_to_save(self) -> bool:
+        return self.iteration % _LAST_EVERY == 0 or time.monotonic() > self._saved_at + _LAST_EVERY_S

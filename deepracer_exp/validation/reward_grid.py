@@ -1,0 +1,134 @@
+"""Sample a reward function on a grid of positions, headings, speeds and steering angles."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from deepracer_exp.env.setup import RaceSetup
+
+from .probe import Probe
+from .situations import OFF_ROAD_M, middle_speed_mps, poses, sample, situations
+
+Floats = NDArray[np.float64]
+State = Literal["none", "earlier calls", "randomness"]
+HEADINGS_DEG = 180.0
+_PLACES, _HEADINGS, _OFFSETS, _SPEEDS, _STEERINGS = 10, 25, 25, 13, 13
+
+
+class RewardSampler:
+    """Returns the rewards of poses; a function that keeps state is called with the step before first."""
+
+    def __init__(self, setup: RaceSetup, state: State):
+        """Load the module of `setup`."""
+        self._setup = setup
+        self._is_stateful = state == "earlier calls"
+        self._probe = Probe(setup.reward, setup.reward_time_limit_s)
+
+    def rewards(
+        self,
+        ndist: ArrayLike,
+        offset_m: ArrayLike,
+        heading_error_rad: ArrayLike,
+        speed_mps: ArrayLike,
+        steering_deg: ArrayLike = 0.0,
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the rewards of poses (see `situations.poses`) and whether they are off the track.
+
+        Both have the broadcast shape of the arguments.
+        """
+        shape = np.broadcast_shapes(
+            *(np.shape(v) for v in (ndist, offset_m, heading_error_rad, speed_mps, steering_deg))
+        )
+        at = poses(self._setup, ndist, offset_m, heading_error_rad, speed_mps, steering_deg)
+        now = situations(self._setup, at)
+        before = situations(self._setup, at, earlier=True) if self._is_stateful else None
+        rewards = self._probe.rewards(now, before)
+        return rewards.reshape(shape), now.columns["is_offtrack"].reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class RewardGrid:
+    """Rewards at positions spread evenly over the lap."""
+
+    speeds_mps: Floats
+    """Slowest, middle and fastest of the action space, (3,)."""
+    headings_rad: Floats
+    """Against the centre line, (H,)."""
+    offsets_m: Floats
+    """To the left of the centre line, (W,)."""
+    reward: Floats
+    """By speed, position, heading and offset, (3, P, H, W)."""
+    off_track: NDArray[np.bool_]
+    """The same shape."""
+    all_speeds_mps: Floats
+    """(S,)"""
+    steerings_deg: Floats
+    """(T,)"""
+    by_command: Floats
+    """Driving along the centre line, mean over positions by speed and steering, (S, T)."""
+
+    @property
+    def along(self) -> int:
+        """The index in `headings_rad` of driving along the track."""
+        return len(self.headings_rad) // 2
+
+
+def sample_reward_grid(setup: RaceSetup, sampler: RewardSampler, detail: float) -> RewardGrid:
+    """Sample the rewards of a grid all over the track.
+
+    Args:
+        setup: the experiment's race.
+        sampler: of the reward function.
+        detail: 1, or less for slow functions.
+    """
+    low, high = setup.actions.low, setup.actions.high
+
+    def points(n: int) -> int:
+        """Return an odd number of points, so that the middle is one of them."""
+        return max(5, round(n * detail)) // 2 * 2 + 1
+
+    ndist = (np.arange(max(4, round(_PLACES * detail))) + 0.5) / max(4, round(_PLACES * detail))
+    speeds_mps = np.array([low[1], middle_speed_mps(setup), high[1]])
+    headings_rad = np.radians(np.linspace(-HEADINGS_DEG, HEADINGS_DEG, points(_HEADINGS)))
+    beyond_m = setup.track.width_m / 2 + OFF_ROAD_M
+    offsets_m = np.linspace(-beyond_m, beyond_m, points(_OFFSETS))
+    reward, off_track = sampler.rewards(
+        ndist[:, None, None], offsets_m, headings_rad[:, None], speeds_mps[:, None, None, None]
+    )
+    all_speeds_mps = np.linspace(low[1], high[1], points(_SPEEDS) if high[1] > low[1] else 1)
+    steerings_deg = np.linspace(low[0], high[0], points(_STEERINGS) if high[0] > low[0] else 1)
+    by_command, _ = sampler.rewards(ndist[:, None, None], 0.0, 0.0, all_speeds_mps[:, None], steerings_deg)
+    return RewardGrid(
+        speeds_mps=speeds_mps,
+        headings_rad=headings_rad,
+        offsets_m=offsets_m,
+        reward=reward,
+        off_track=off_track,
+        all_speeds_mps=all_speeds_mps,
+        steerings_deg=steerings_deg,
+        by_command=np.nanmean(by_command, axis=0),
+    )
+
+
+def state_of(setup: RaceSetup, probe: Probe, n: int = 40) -> State:
+    """Find out whether a reward depends on more than the params: on earlier calls, or on randomness.
+
+    Args:
+        setup: the experiment's race.
+        probe: a module that was not called before; it collects the failures.
+        n: number of situations.
+    """
+    at = sample(setup, n)
+    now = situations(setup, at)
+    before = situations(setup, at, earlier=True)
+    alone = probe.rewards(now)
+    if probe.failures:
+        return "none"
+    again = Probe(setup.reward, setup.reward_time_limit_s)
+    if not np.array_equal(alone, again.rewards(now), equal_nan=True):
+        return "randomness"
+    same = np.array_equal(alone, probe.rewards(now, before), equal_nan=True)
+    same = same and np.array_equal(alone, again.rewards(now, now), equal_nan=True)
+    return "none" if same else "earlier calls"

@@ -1,0 +1,446 @@
+"""Trial claims: which worker makes which trial of a study, decided by one table in the study's own database.
+
+The table is the only record that decides. Optuna's trials, MLflow, best_of_sweep.json and the report are derived from
+it and never read back: results go to Optuna by `report_results`, and from there everywhere else.
+
+Optuna's own heartbeat and retry callback (5.0) cannot take its place. They fail a stale trial and add its successor in
+two transactions, so a process killed in between loses the trial; a trial whose worker dies before the first heartbeat
+never becomes stale; and workers that ask for trials at the same moment exceed the total.
+"""
+
+import json
+import logging
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.storages import BaseStorage
+from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.dialects import mysql
+from sqlalchemy.exc import DBAPIError, IntegrityError
+
+from deepracer_exp.training.trainer import TakenOver
+
+from .storage import DOWN, patiently
+
+Value = TypeVar("Value")
+
+_log = logging.getLogger("deepracer_exp")
+
+_TABLE = "deepracer_slots"
+_CLAIMED, _SETTLED, _REPORTED = "claimed", "settled", "told"
+_RELEASED = 0.0
+_RENEWALS = 12
+"""Renewals within one lease; the live view is at most one of them behind."""
+
+_Json = sa.Text().with_variant(mysql.MEDIUMTEXT(), "mysql")
+
+_table = sa.Table(
+    _TABLE,
+    sa.MetaData(),
+    # The longest study name that Optuna allows, and the longest key of MySQL.
+    sa.Column("study", sa.String(512), primary_key=True),
+    sa.Column("slot", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("attempt", sa.Integer, nullable=False),
+    sa.Column("owner", sa.String(255), nullable=False),
+    sa.Column("previous_owner", sa.String(255)),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("expires_s", sa.Double, nullable=False),
+    sa.Column("trial_id", sa.Integer),
+    sa.Column("runs", _Json),
+    sa.Column("progress", _Json),
+    sa.Column("outcome", sa.String(16)),
+    sa.Column("objective_values", _Json),
+    sa.Column("attrs", _Json),
+)
+_of = _table.c
+
+# Seconds since 1970 by the clock of the database, so that the clocks of the machines do not matter. Read when the row
+# is evaluated and not when the transaction begins, because a transaction may wait for another process in between.
+_CLOCKS = {
+    "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
+    "postgresql": "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)",
+    "mysql": "(TIMESTAMPDIFF(MICROSECOND, '1970-01-01', UTC_TIMESTAMP(6)) / 1000000.0)",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialResult:
+    """The result of a trial."""
+
+    state: str
+    """Name of Optuna's state: COMPLETE, PRUNED or FAIL."""
+    values: list[float] | None
+    """One per objective; None unless complete."""
+    attrs: dict[str, Any]
+    """User attributes of the trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """One row of the table: a trial, the worker that owns it, and what earlier owners left."""
+
+    index: int
+    """Place of the trial in the study, from 0; Optuna's number differs where a worker died while it made the trial."""
+    attempt: int
+    """1 for the first owner, one more for each takeover."""
+    owner: str
+    previous_owner: str | None
+    state: str
+    """`claimed`, `settled` (has its result) or `told` (Optuna has the result, too)."""
+    result: TrialResult | None
+    trial_id: int | None
+    """Optuna's id of the trial."""
+    runs: tuple[dict[str, Any], ...]
+    progress: dict[str, Any]
+    expired: bool
+    """Whether the lease has run out, so that any worker may take the trial over."""
+
+
+class TrialClaims:
+    """The claims of one study.
+
+    Each change is a single statement that names the state it expects, and its effect is read back in the same
+    transaction. So a change can be repeated when its answer was lost with the connection.
+    """
+
+    def __init__(self, engine: sa.Engine, study: str):
+        """Create the table if it is missing.
+
+        Args:
+            engine: of the study's database.
+            study: its name.
+        """
+        self.study = study
+        self._engine = engine
+        self._now = sa.literal_column(_CLOCKS[engine.dialect.name], sa.Double)
+        if sa.inspect(engine).has_table(_TABLE):
+            return
+        try:
+            _table.create(engine)
+        except DBAPIError:
+            # Another process was faster; each database reports that in its own way.
+            if not sa.inspect(engine).has_table(_TABLE):
+                raise
+
+    def claim(self, owner: str, total: int, lease_s: float) -> Claim | None:
+        """Claim a trial for an owner, who may hold one at a time.
+
+        In this order: the trial that it holds already (the answer to its first claim was lost), one whose lease has
+        run out, a new one.
+
+        Args:
+            owner: unique name of a worker.
+            total: number of trials of the study.
+            lease_s: how long the claim is valid without renewal, seconds.
+
+        Returns:
+            None if no trial is free now.
+        """
+        lost = 0
+        while True:
+            rows, free = self._open_to(owner, total)
+            for row in rows:
+                if row.owner == owner and not row.expired:
+                    return _as_claim(row)
+            for row in rows:
+                if row.expired and (claim := self._take_over(row, owner, lease_s)) is not None:
+                    return claim
+            if not free:
+                return None
+            # In order; workers that raced for the same trial spread out.
+            index = random.choice(free[: 1 + 2 * lost])
+            if (claim := self._begin(index, owner, lease_s)) is not None:
+                return claim
+            lost += 1
+
+    def renew(self, claim: Claim, lease_s: float, progress: Mapping[str, Any] | None = None) -> bool:
+        """Restart the lease of a claim; return False if another worker has taken it over.
+
+        A lease that has run out can still be renewed until another worker takes the trial over.
+
+        Args:
+            claim: held by the caller.
+            lease_s: how long the claim is valid from now on, seconds.
+            progress: how far the trial is, for the live view; None: unchanged.
+        """
+        more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
+        return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more}, (_CLAIMED,))
+
+    def record(
+        self, claim: Claim, *, trial_id: int | None = None, runs: list[dict[str, Any]] | None = None
+    ) -> bool:
+        """Record what a later owner must know; return False if another worker has taken the trial over."""
+        values: dict[sa.Column[Any], Any] = {}
+        if trial_id is not None:
+            values[_of.trial_id] = trial_id
+        if runs is not None:
+            values[_of.runs] = json.dumps(runs)
+        return self._update_held(claim, values, (_CLAIMED,))
+
+    def settle(self, claim: Claim, result: TrialResult) -> bool:
+        """Store the result of a trial; return False if another worker has taken the trial over.
+
+        Repeated calls return True and the first result stays.
+        """
+        values = {
+            _of.state: _SETTLED,
+            _of.outcome: result.state,
+            _of.objective_values: json.dumps(result.values),
+            _of.attrs: json.dumps(result.attrs),
+        }
+        return self._update_held(claim, values, (_SETTLED, _REPORTED))
+
+    def unreported(self) -> list[Claim]:
+        """Return the claims whose result Optuna does not have yet."""
+        return [_as_claim(row) for row in self._rows(_of.state == _SETTLED)]
+
+    def mark_reported(self, index: int) -> None:
+        """Record that Optuna has the result of a trial."""
+        with self._engine.begin() as connection:
+            where = (_of.slot == index, _of.state == _SETTLED)
+            connection.execute(self._statement({_of.state: _REPORTED}, *where))
+
+    def release(self, owner: str, *, is_lost: bool = False) -> int:
+        """End the leases of an owner that is gone or about to end; return their number.
+
+        Args:
+            owner: of the leases.
+            is_lost: its process died unasked, perhaps because of its trial: the attempts at its run stay counted.
+                Otherwise they start again from zero.
+        """
+        where = (_of.owner == owner, _of.state == _CLAIMED, _of.expires_s > _RELEASED)
+        with self._engine.begin() as connection:
+            mine = connection.execute(self._select(*where)).all()
+            for row in mine:
+                runs = [run if is_lost else {**run, "tries": 0} for run in _runs(row)]
+                values = {_of.expires_s: _RELEASED, _of.runs: json.dumps(runs)}
+                connection.execute(self._statement(values, _of.slot == row.slot, *where))
+        return len(mine)
+
+    def all(self) -> list[Claim]:
+        """Return every claim ever made, by index."""
+        return [_as_claim(row) for row in self._rows()]
+
+    def is_done(self, total: int) -> bool:
+        """Return whether the first `total` trials have their results."""
+        ended = sa.select(sa.func.count()).where(
+            _of.study == self.study, _of.slot < total, _of.state.in_((_SETTLED, _REPORTED))
+        )
+        with self._engine.connect() as connection:
+            return connection.execute(ended).scalar_one() >= total
+
+    def _open_to(self, owner: str, total: int) -> tuple[list[sa.Row[Any]], list[int]]:
+        """Return the claims that an owner holds or may take over, and the indices of trials never claimed.
+
+        A worker without work asks every second, so this reads few rows however many the study has.
+        """
+        within = (_of.study == self.study, _of.slot < total)
+        mine = (_of.state == _CLAIMED, sa.or_(_of.owner == owner, _of.expires_s <= self._now))
+        with self._engine.connect() as connection:
+            rows = list(connection.execute(self._select(_of.slot < total, *mine)).all())
+            if connection.execute(sa.select(sa.func.count()).where(*within)).scalar_one() >= total:
+                return rows, []
+            taken = set(connection.execute(sa.select(_of.slot).where(*within)).scalars())
+        return rows, [index for index in range(total) if index not in taken]
+
+    def _rows(self, *where: sa.ColumnElement[bool]) -> list[sa.Row[Any]]:
+        with self._engine.connect() as connection:
+            return list(connection.execute(self._select(*where)).all())
+
+    def _select(self, *where: sa.ColumnElement[bool]) -> sa.Select[Any]:
+        expired = sa.and_(_of.state == _CLAIMED, _of.expires_s <= self._now).label("expired")
+        return sa.select(_table, expired).where(_of.study == self.study, *where).order_by(_of.slot)
+
+    def _statement(self, values: Mapping[Any, Any], *where: sa.ColumnElement[bool]) -> sa.Update:
+        return sa.update(_table).where(_of.study == self.study, *where).values(dict(values))
+
+    def _begin(self, index: int, owner: str, lease_s: float) -> Claim | None:
+        new = sa.insert(_table).values(
+            study=self.study,
+            slot=index,
+            attempt=1,
+            owner=owner,
+            state=_CLAIMED,
+            expires_s=self._now + lease_s,
+        )
+        try:
+            with self._engine.begin() as connection:
+                connection.execute(new)
+                return _as_claim(connection.execute(self._select(_of.slot == index)).one())
+        except IntegrityError:
+            return None
+
+    def _take_over(self, seen: sa.Row[Any], owner: str, lease_s: float) -> Claim | None:
+        taken = {
+            _of.owner: owner,
+            _of.previous_owner: seen.owner,
+            _of.attempt: seen.attempt + 1,
+            _of.expires_s: self._now + lease_s,
+        }
+        as_seen = (
+            _of.slot == seen.slot,
+            _of.attempt == seen.attempt,
+            _of.owner == seen.owner,
+            _of.state == _CLAIMED,
+            _of.expires_s <= self._now,
+        )
+        with self._engine.begin() as connection:
+            connection.execute(self._statement(taken, *as_seen))
+            row = connection.execute(self._select(_of.slot == seen.slot)).one()
+        mine = (row.owner, row.attempt, row.state) == (owner, seen.attempt + 1, _CLAIMED)
+        return _as_claim(row) if mine else None
+
+    def _update_held(self, claim: Claim, values: Mapping[Any, Any], afterwards: tuple[str, ...]) -> bool:
+        """Change a claim if its owner still holds it; return whether it does and is in one of these states now."""
+        held = (
+            _of.slot == claim.index,
+            _of.owner == claim.owner,
+            _of.attempt == claim.attempt,
+            _of.state == _CLAIMED,
+        )
+        with self._engine.begin() as connection:
+            if values:
+                connection.execute(self._statement(values, *held))
+            row = connection.execute(self._select(_of.slot == claim.index)).one()
+        return (row.owner, row.attempt) == (claim.owner, claim.attempt) and row.state in afterwards
+
+
+class Lease:
+    """Keeps a claim while its trial is made: renews it from a thread, and checks it before each write; a context.
+
+    A process that was suspended for longer than its lease, and whose trial was taken over meanwhile, finds out by
+    `confirm`, which precedes everything that is written.
+    """
+
+    def __init__(self, claims: TrialClaims, claim: Claim, lease_s: float, patience_s: float):
+        """Hold a fresh claim.
+
+        Args:
+            claims: of the study.
+            claim: just made.
+            lease_s: how long it is valid without renewal, seconds.
+            patience_s: how long to wait for a database that does not answer, seconds.
+        """
+        self.claim = claim
+        self._claims, self._lease_s, self._patience_s = claims, lease_s, patience_s
+        self._progress: Mapping[str, Any] = {}
+        self._renewed_at = time.monotonic()
+        self._lost = False
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
+
+    def __enter__(self) -> "Lease":
+        """Start to renew."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def show(self, progress: Mapping[str, Any]) -> None:
+        """Set how far the trial is; the next renewal stores it."""
+        self._progress = progress
+
+    def confirm(self) -> None:
+        """Return while the claim is held.
+
+        Raises:
+            TakenOver: it is lost.
+            RunFailed: the database has not answered for too long.
+        """
+        if not self._lost and time.monotonic() > self._renewed_at + self._lease_s / 2:
+            self._lost = not patiently(self._renew, self._patience_s)
+        if self._lost:
+            raise TakenOver(f"trial {self.claim.index} was taken over")
+
+    def held(self, write: Callable[[], bool]) -> None:
+        """Make a write that returns False if the claim is lost.
+
+        Raises:
+            TakenOver: it returned False.
+            RunFailed: the database has not answered for too long.
+        """
+        if not patiently(write, self._patience_s):
+            self._lost = True
+        self.confirm()
+
+    def _renew(self) -> bool:
+        began = time.monotonic()
+        held = self._claims.renew(self.claim, self._lease_s, dict(self._progress) or None)
+        if held:
+            self._renewed_at = began
+        return held
+
+    def _keep(self) -> None:
+        while not self._over.wait(self._lease_s / _RENEWALS):
+            try:
+                if not self._renew():
+                    self._lost = True
+                    return
+            except DOWN as error:
+                # `confirm` waits for the database before anything is written.
+                _log.warning("lease of trial %d: %s", self.claim.index, type(error).__name__)
+
+
+def report_results(claims: TrialClaims, storage: BaseStorage) -> None:
+    """Report to Optuna the results it does not have yet; the worker of one may have been killed before it could."""
+    for claim in claims.unreported():
+        assert claim.trial_id is not None
+        assert claim.result is not None
+        try:
+            for key, value in claim.result.attrs.items():
+                storage.set_trial_user_attr(claim.trial_id, key, value)
+            # Not by `Study.tell`, which ends the process's study with the last point of a grid.
+            state, values = TrialState[claim.result.state], claim.result.values
+            if state == TrialState.PRUNED:
+                values = _last_value(storage.get_trial(claim.trial_id))
+            storage.set_trial_state_values(claim.trial_id, state, values)
+        except UpdateFinishedTrialError:
+            pass  # another process was faster, with the same result
+        claims.mark_reported(claim.index)
+
+
+def fail_unclaimed_trials(claims: TrialClaims, storage: BaseStorage) -> None:
+    """Fail Optuna's running trials that no claim refers to: their workers were lost while they created them."""
+    known = {claim.trial_id for claim in claims.all()}
+    study_id = storage.get_study_id_from_name(claims.study)
+    for trial in storage.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,)):
+        if trial._trial_id not in known:
+            storage.set_trial_user_attr(trial._trial_id, "fate", "failed")
+            storage.set_trial_user_attr(trial._trial_id, "reason", "its worker was lost before it began")
+            storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+
+
+def _last_value(trial: FrozenTrial) -> list[float] | None:
+    """Return the last value of a pruned trial, as `Study.tell` records it."""
+    return None if trial.last_step is None else [trial.intermediate_values[trial.last_step]]
+
+
+def _runs(row: sa.Row[Any]) -> tuple[dict[str, Any], ...]:
+    return tuple(json.loads(row.runs)) if row.runs else ()
+
+
+def _as_claim(row: sa.Row[Any]) -> Claim:
+    result = None
+    if row.outcome is not None:
+        values = json.loads(row.objective_values) if row.objective_values else None
+        result = TrialResult(state=row.outcome, values=values, attrs=json.loads(row.attrs))
+    return Claim(
+        index=row.slot,
+        attempt=row.attempt,
+        owner=row.owner,
+        previous_owner=row.previous_owner,
+        state=row.state,
+        result=result,
+        trial_id=row.trial_id,
+        runs=_runs(row),
+        progress=json.loads(row.progress) if row.progress else {},
+        expired=bool(row.expired),
+    )

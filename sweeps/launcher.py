@@ -1,0 +1,168 @@
+"""Worker processes: what runs in one, and how the driver starts and ends those on this machine."""
+
+import logging
+import multiprocessing
+import os
+import sys
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Protocol
+
+from deepracer_exp.addresses import take_over
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.lifeline import end_with_owner
+from deepracer_exp.training.signals import Interruption
+
+from .worker_config import WorkerConfig, owner_name
+
+_log = logging.getLogger("deepracer_exp")
+
+
+class WorkerProcess(Protocol):
+    """A worker as the driver sees it: started, or waiting for room on a cluster."""
+
+    @property
+    def owner(self) -> str | None:
+        """Its name in the trial claims; None before it has started."""
+
+    @property
+    def exitcode(self) -> int | None:
+        """Exit code; None while it lives."""
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether a worker that ended is certainly gone; on a lost machine it may still run."""
+
+    def terminate(self) -> None:
+        """Ask it to end, with a checkpoint of its trial."""
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for its end, at most this long."""
+
+    def kill(self) -> None:
+        """End it at once."""
+
+
+class Launcher(Protocol):
+    """Starts workers somewhere."""
+
+    workers: int
+    """How many run at a time."""
+    cores: int
+    """Per worker."""
+
+    def folder(self, runs_dir: Path) -> Path:
+        """Return the folder of runs as the workers see it."""
+
+    def start(self, config: WorkerConfig, token: str) -> WorkerProcess:
+        """Start a worker.
+
+        Args:
+            config: of the worker.
+            token: of the worker's name.
+
+        Raises:
+            BadInput, RunFailed: no worker can ever start here.
+        """
+
+    def close(self) -> None:
+        """Free everything."""
+
+
+class LocalLauncher:
+    """Starts processes on this machine."""
+
+    def __init__(self, workers: int | None):
+        """Start nothing yet.
+
+        Args:
+            workers: how many; None: one per core.
+        """
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.workers = workers or cores
+        self.cores = max(1, cores // self.workers)
+        # A fork server has imported once what all workers need; see `start_workers_early`.
+        forks = sys.platform.startswith("linux")
+        self._context = (
+            multiprocessing.get_context("forkserver") if forks else multiprocessing.get_context("spawn")
+        )
+
+    def folder(self, runs_dir: Path) -> Path:
+        """Return it unchanged: workers have the working folder of the sweep."""
+        return runs_dir
+
+    def start(self, config: WorkerConfig, token: str) -> "LocalWorker":
+        """Start a process."""
+        log = str(config.folder / "workers.log")
+        started = self._context.Process(target=run_worker, args=(config, token, log))
+        started.start()
+        return LocalWorker(started, token)
+
+    def close(self) -> None:
+        """Do nothing: its processes are joined."""
+
+
+class LocalWorker:
+    """A process on this machine."""
+
+    is_seen = True
+
+    def __init__(self, started: BaseProcess, token: str):
+        assert started.pid is not None
+        self._process, self.owner = started, owner_name(started.pid, token)
+
+    @property
+    def exitcode(self) -> int | None:
+        """Exit code; None while it lives."""
+        return self._process.exitcode
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self._process.terminate()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for its end."""
+        self._process.join(timeout_s)
+
+    def kill(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.join()
+
+
+def run_worker(config: WorkerConfig, token: str, log: str) -> None:
+    """Run a worker; the target of its process.
+
+    Exits with 0 when the study has all its trials, 130 or 143 when asked to end, 3 if the database stays away.
+
+    Args:
+        config: of the worker.
+        token: of the worker's name.
+        log: file for stdout and stderr.
+    """
+    take_over(config.addresses)
+    # A session of its own: Ctrl-C in the terminal goes to the driver, which asks its workers to end.
+    os.setsid()
+    with open(log, "a", buffering=1, encoding="utf-8") as file:
+        os.dup2(file.fileno(), sys.stdout.fileno())
+        os.dup2(file.fileno(), sys.stderr.fileno())
+    logging.basicConfig(format="%(asctime)s %(process)d %(message)s", level=logging.WARNING)
+    end_with_owner()
+    with Interruption() as interruption:
+        import optuna
+        import torch
+
+        from .storage import open_storage
+        from .worker import Worker
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        torch.set_num_threads(1)
+        try:
+            storage = open_storage(config.config.storage, config.runs_dir, config.config.patience_s)
+            Worker(config, storage, owner_name(os.getpid(), token)).work(interruption)
+        except (BadInput, RunFailed) as error:
+            _log.error("%s", error)
+            sys.exit(error.exit_code)
+        except KeyboardInterrupt:  # the second one
+            sys.exit(interruption.exit_code or 130)
+    sys.exit(interruption.exit_code or 0)

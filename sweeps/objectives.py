@@ -1,0 +1,136 @@
+"""Objectives of a study: their units, the values of a policy, and the order they put trials in."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import optuna
+
+from deepracer_exp.errors import BadInput
+
+if TYPE_CHECKING:
+    from deepracer_exp.evaluation.result import Evaluation
+
+NONE = "\N{EN DASH}"
+"""Shown where there is no value."""
+_LEAST_SHARE = 0.01  # of the lap; a trial that never moved must not divide by zero
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Name, unit and direction of an objective."""
+
+    title: str
+    unit: str
+    minimize: bool
+
+    @property
+    def label(self) -> str:
+        """Title and unit, for an axis."""
+        return f"{self.title}, {self.unit}"
+
+    @property
+    def words(self) -> str:
+        """The title within a sentence."""
+        return self.title[0].lower() + self.title[1:]
+
+
+MEASURES: Mapping[str, Measure] = {
+    "race_score": Measure("Race score", "s", minimize=True),
+    "lap_time": Measure("Lap time", "s", minimize=True),
+    "completion": Measure("Completion", "%", minimize=False),
+}
+"""By the name of the objective. Race score: seconds per complete lap, failed laps included."""
+
+
+def objectives_of(study: optuna.Study) -> tuple[str, ...]:
+    """Return the names of a study's objectives.
+
+    Raises:
+        BadInput: the study was not made by a sweep.
+    """
+    names = study.user_attrs.get("objectives")
+    if (
+        not isinstance(names, list | tuple)
+        or len(names) != len(study.directions)
+        or not set(names) <= set(MEASURES)
+    ):
+        raise BadInput(
+            f"study {study.study_name}: has no objectives that a sweep writes ({', '.join(MEASURES)}); "
+            "it was not made by `deepracer-exp sweep`"
+        )
+    return tuple(names)
+
+
+def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
+    """Return the number that trials are sorted by, lower is better.
+
+    One objective: its value. Several: the race score if it is one of them; otherwise lap time over the share of the
+    lap driven, which is close to seconds per complete lap, so that a fast car that rarely finishes is not the best.
+    """
+    by_name = dict(zip(objectives, values, strict=True))
+    if len(objectives) == 1:
+        (name,) = objectives
+        return by_name[name] if MEASURES[name].minimize else -by_name[name]
+    if "race_score" in by_name:
+        return by_name["race_score"]
+    return by_name["lap_time"] / max(by_name["completion"] / 100, _LEAST_SHARE)
+
+
+def values_of(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s: float) -> list[float]:
+    """Return the values of the objectives, means over tracks; lap time and completion of the usual conditions.
+
+    Args:
+        evaluation: of the policy.
+        objectives: names in MEASURES.
+        trial_time_s: the longest that a trial of the evaluation may take. A policy without a complete lap gets more
+            than that, and more the less of the lap it drives, because samplers need a number for it as well.
+    """
+    from deepracer_exp.evaluation.result import USUAL
+
+    usual = evaluation.on(USUAL)
+    fallback = without_lap(usual.completion, trial_time_s)
+    values = {
+        "race_score": evaluation.race_score_s,
+        "lap_time": usual.mean_lap_time_s,
+        "completion": usual.completion,
+    }
+    return [fallback if values[one] is None else float(values[one] or 0.0) for one in objectives]
+
+
+def without_lap(completion: float, trial_time_s: float) -> float:
+    """Return seconds for a policy that completes no lap, from one to two times `trial_time_s`.
+
+    Args:
+        completion: mean share of the lap that it drives, per cent.
+        trial_time_s: the longest that a trial of the evaluation may take.
+    """
+    return trial_time_s * (2 - min(completion, 100.0) / 100)
+
+
+def intermediate_value(row: Mapping[str, Any], objective: str, trial_time_s: float) -> float | None:
+    """Return the value of an evaluation during training; None if this row of metrics.jsonl has none."""
+    completion = row.get("eval_completion")
+    value = row.get({"race_score": "eval_race_score_s", "lap_time": "eval_lap_time_s"}.get(objective, ""))
+    if completion is None:
+        return None
+    if objective == "completion":
+        return float(completion)
+    return without_lap(completion, trial_time_s) if value is None else float(value)
+
+
+def shown(objective: str, value: float) -> str:
+    """Return a value with its unit: ``9.84 s``, ``97.3 %``."""
+    digits = 2 if MEASURES[objective].minimize else 1
+    return f"{value:.{digits}f} {MEASURES[objective].unit}"
+
+
+def shown_or_dash(objective: str, value: float | None) -> str:
+    """Return a value for a table: with its unit, or a dash."""
+    return NONE if value is None else shown(objective, value)
+
+
+def shown_values(objectives: Sequence[str], values: Sequence[float]) -> str:
+    """Return all values of a trial: ``lap time 9.84 s, completion 97.3 %``."""
+    pairs = zip(objectives, values, strict=True)
+    return ", ".join(f"{MEASURES[name].words} {shown(name, value)}" for name, value in pairs)

@@ -1,0 +1,197 @@
+"""The live view of a sweep in a terminal, and plain lines where there is none."""
+
+import collections
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from deepracer_exp.training.display import sparkline
+
+from .claims import Claim, TrialResult
+from .labels import duration, outcome_words, parameter, short_keys
+from .objectives import NONE, cost, shown_values
+from .worker_config import WorkerConfig
+
+_POINTS = 16
+"""Of a sparkline."""
+_LEAST_MADE = 0.05
+"""Trials made in this start before their pace shows how long the others take."""
+_STATES = {"COMPLETE": "done", "PRUNED": "pruned", "FAIL": "failed"}
+
+
+class SweepView:
+    """Shows a running sweep; a context.
+
+    On a terminal one panel is redrawn in place and stays at the end; elsewhere, each trial that ends is a line.
+    """
+
+    def __init__(self, config: WorkerConfig, workers: int, console: Console):
+        """Show nothing yet.
+
+        Args:
+            config: of the workers.
+            workers: number of workers.
+            console: of stderr, since stdout is for results.
+        """
+        self._study, self._folder, self._sweep = config.study, config.folder, config.config
+        self._workers, self._console = workers, console
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._began = time.monotonic()
+        self._made_before: float | None = None
+        """Trials made before this start; running ones count by the share that was made."""
+        self._printed: set[int] = set()
+        self._completions: dict[int, collections.deque[float]] = {}
+        self._evaluated: dict[int, str] = {}
+        self.stage = ""
+        """What happens while no trial runs."""
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        else:
+            trials = self._sweep.trials
+            self._line(f"{self._study}: {trials} trials, {self._workers} workers; runs in {self._folder}")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, claims: Sequence[Claim]) -> None:
+        """Draw the present state of all claims."""
+        ended = {one.index for one in claims if one.result is not None}
+        if self._made_before is None:
+            self._made_before, self._printed = _made(claims), set(ended)
+        for one in claims:
+            self._follow(one)
+            if self._live is None and one.result is not None and one.index not in self._printed:
+                line = _sentence(one, one.result, self._sweep.objectives)
+                self._line(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
+        self._printed |= ended
+        if self._live is not None:
+            self._live.update(self._panel(claims), refresh=True)
+
+    def _line(self, text: str) -> None:
+        self._console.print(text, highlight=False, soft_wrap=True)
+
+    def _follow(self, claim: Claim) -> None:
+        completion = claim.progress.get("completion")
+        if completion is None:
+            return
+        seen = self._completions.setdefault(claim.index, collections.deque(maxlen=_POINTS))
+        if not seen or seen[-1] != completion:
+            seen.append(float(completion))
+
+    def _panel(self, claims: Sequence[Claim]) -> Panel:
+        parts: list[Any] = [self._summary(claims)]
+        running = [one for one in claims if one.result is None]
+        if running:
+            parts += [Text(), self._running(running)]
+        elif not claims and not self.stage:
+            parts += [Text(), Text("workers start", style="dim")]
+        if self.stage:
+            parts += [Text(), Text(self.stage, style="dim")]
+        return Panel(Group(*parts), title=self._study, title_align="left", border_style="dim")
+
+    def _summary(self, claims: Sequence[Claim]) -> Table:
+        total = self._sweep.trials
+        counts = collections.Counter(one.result.state for one in claims if one.result is not None)
+        ended = counts.total()
+        words = ", ".join(f"{counts[one]} {word}" for one, word in _STATES.items())
+        grid = Table.grid(padding=(0, 2))
+        grid.add_column(style="dim")
+        grid.add_column()
+        grid.add_row("trials", ProgressBar(total, min(ended, total), width=40))
+        grid.add_row("", f"{ended} of {total}: {words}")
+        grid.add_row("time", f"{duration(time.monotonic() - self._began)}, {self._left(claims)}")
+        grid.add_row("best", _best(claims, self._sweep.objectives))
+        return grid
+
+    def _left(self, claims: Sequence[Claim]) -> str:
+        """Return how long the rest takes at the pace of this start; less if trials end early."""
+        made = _made(claims)
+        here = made - (self._made_before or 0.0)
+        if here < _LEAST_MADE:
+            return "time left not known yet"
+        left = max(self._sweep.trials - made, 0.0) / here * (time.monotonic() - self._began)
+        return f"about {duration(left)} left"
+
+    def _running(self, running: Sequence[Claim]) -> Table:
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        for name in ("trial", "steps", "completion", "", "entropy", "evaluated"):
+            table.add_column(name, justify="left" if name in ("", "evaluated") else "right", no_wrap=True)
+        table.add_column("values", ratio=1)
+        for claim in running:
+            table.add_row(*self._cells(claim))
+        return table
+
+    def _cells(self, claim: Claim) -> tuple[str, ...]:
+        row: Mapping[str, Any] = claim.progress
+        name = f"{_number(claim)}" + (f" (attempt {claim.attempt})" if claim.attempt > 1 else "")
+        if claim.expired or "env_steps" not in row:
+            stage = "waits for a worker" if claim.expired else "starts"
+            return name, NONE, NONE, "", NONE, stage, _params(claim)
+        lap_s, completion = row.get("eval_lap_time_s"), row.get("eval_completion")
+        if completion is not None:
+            lap = "no lap" if lap_s is None else f"{lap_s:.2f} s"
+            self._evaluated[claim.index] = f"{lap}, {completion:.0f} %"
+        return (
+            name,
+            f"{row['env_steps']:,}",
+            NONE if row["completion"] is None else f"{row['completion']:.0f} %",
+            sparkline(list(self._completions.get(claim.index, ())), _POINTS),
+            f"{row['entropy']:.2f}",
+            self._evaluated.get(claim.index, NONE),
+            _params(claim),
+        )
+
+
+def _made(claims: Sequence[Claim]) -> float:
+    return sum(1.0 if one.result is not None else one.progress.get("share", 0.0) for one in claims)
+
+
+def _params(claim: Claim) -> str:
+    """Return the values of a trial: `lr 0.0003, network mlp`."""
+    params = claim.progress.get("params", {})
+    return ", ".join(f"{short} {parameter(params[key])}" for key, short in short_keys(params).items())
+
+
+def _number(claim: Claim) -> object:
+    """Return Optuna's number of the trial, which is known from its first row on."""
+    stored = claim.progress if claim.result is None else claim.progress | claim.result.attrs
+    return stored.get("number", NONE)
+
+
+def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
+    done = [
+        (cost(objectives, one.result.values), one.index, one, one.result)
+        for one in claims
+        if one.result is not None and one.result.state == "COMPLETE" and one.result.values
+    ]
+    if not done:
+        return NONE
+    *_, best, result = min(done, key=lambda one: one[:2])
+    return f"trial {_number(best)}, {_values(result, objectives)}"
+
+
+def _values(result: TrialResult, objectives: Sequence[str]) -> str:
+    lap_s, completion = result.attrs.get("lap_time_s"), result.attrs.get("completion")
+    lap = "no lap" if lap_s is None else f"lap {lap_s:.2f} s"
+    return f"{shown_values(objectives, result.values or ())} ({lap}, {completion:.0f} % driven)"
+
+
+def _sentence(claim: Claim, result: TrialResult, objectives: Sequence[str]) -> str:
+    outcome, steps = outcome_words(result.attrs.get("fate", "")), result.attrs.get("env_steps", 0)
+    end = _values(result, objectives) if result.values else result.attrs.get("reason", "")
+    values = f" with {params}" if (params := _params(claim)) else ""
+    return f"trial {_number(claim)}{values} {_STATES[result.state]} ({outcome}) after {steps:,} steps: {end}"

@@ -1,0 +1,63 @@
+"""What a worker process is given, and the name it goes by."""
+
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+
+from deepracer_exp.addresses import taken_out
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.sweep import SweepConfig
+from deepracer_exp.tracking.store import Store
+
+from .space import SearchSpace
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerConfig:
+    """A sweep as each of its workers knows it."""
+
+    study: str
+    runs_dir: Path
+    config: SweepConfig
+    protocol: EvaluationConfig
+    space: SearchSpace
+    parent: tuple[str, ...]
+    """Overrides that name the run and checkpoint that all trials are clones of; empty: trials start from scratch."""
+    store: Store | None
+    """Where runs are recorded; None with `tracking=off`."""
+    study_run_id: str | None
+    """MLflow's id of the study's run, None if it has none."""
+    evaluations: int | None
+    """Evaluations of a trial before its end, None where that depends on the trial."""
+    cores: int
+    """Per worker."""
+    addresses: Mapping[str, str] = field(default_factory=taken_out, repr=False)
+    """Addresses of servers and databases with their passwords, by the redacted form the other fields hold."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the study's runs."""
+        return self.runs_dir / self.study
+
+
+def owner_name(pid: int, token: str) -> str:
+    """Return a name that no other worker has or ever will have.
+
+    Args:
+        pid: of its process.
+        token: a few random characters, because process ids are reused.
+    """
+    return f"{socket.gethostname()}:{pid}:{token}"
+
+
+def is_gone(owner: str) -> bool:
+    """Return whether a worker ran on this machine and its process no longer exists.
+
+    If two machines share a name, a living worker may be taken for gone. It then loses its trial and finds out, as a
+    worker does whose lease ran out.
+    """
+    host, pid, _ = owner.rsplit(":", 2)
+    return host == socket.gethostname() and not psutil.pid_exists(int(pid))

@@ -1,0 +1,147 @@
+import multiprocessing
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.collectors import watchdog
+from deepracer_exp.collectors.base import cores, worker_count
+from deepracer_exp.collectors.collector import LocalCollector
+from deepracer_exp.collectors.worker import EnvFactory
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.trace import PACKED
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.errors import RunFailed
+
+pytestmark = pytest.mark.usefixtures("workers_start_early")
+
+
+@pytest.fixture
+def collect(tmp_path):
+    """Open a collection of tiny's cars; the policy drives at random, its weights are 0."""
+    opened = []
+
+    def open_(*overrides: str, frames: int = 64) -> LocalCollector:
+        experiment, _ = compose_experiment(["experiment=tiny", "collector.cars=4", *overrides])
+        setup = build_setup(experiment)
+        size = len(feature_names(experiment.observation))
+        networks = build_actor_critic(experiment.network, size, setup.actions.n, torch.Generator())
+        opened.append(LocalCollector(experiment.collector, setup, networks.policy, frames, tmp_path))
+        opened[-1].networks = networks
+        return opened[-1]
+
+    yield open_
+    for collection in opened:
+        collection.close()
+
+
+def test_processes_are_as_many_as_asked_for_or_as_there_are_cores():
+    def count(*overrides: str) -> int:
+        return worker_count(compose_experiment(overrides)[0].collector)
+
+    assert count("collector=in_process") == 0
+    assert count("collector=sync") == count("collector=async") == cores() >= 1
+    assert count("collector=sync", "collector.processes=3") == 3
+
+
+@pytest.mark.parametrize(
+    ("overrides", "shape"),
+    [
+        (("collector=in_process",), (4, 16)),
+        (("collector=sync", "collector.processes=2"), (8, 8)),
+        (("collector=async", "collector.processes=2"), (4, 16)),
+    ],
+    ids=["in_process", "sync", "async"],
+)
+def test_a_batch_has_cars_first_and_time_last(collect, overrides, shape):
+    batches = iter(collect(*overrides))
+    for turn in range(3):
+        batch = next(batches)
+        assert batch.batch_size == shape
+        trace = batch["next", "trace"].numpy()
+        cars = trace[:, :, PACKED["car"]]
+        assert (cars == cars[:, :1]).all()
+        assert len(np.unique(cars[:, 0])) == shape[0]
+        if "async" not in overrides[0] and turn == 0:
+            assert cars[:, 0].tolist() == list(range(shape[0]))
+        steps = trace[:, :, PACKED["steps"]]
+        goes_on = np.diff(steps, axis=1) == 1
+        assert (goes_on | (trace[:, :-1, PACKED["done"]] == 1)).all()
+
+
+def test_steps_are_rounded_up_to_whole_steps_of_all_cars(collect):
+    batch = next(iter(collect("collector=in_process", frames=50)))
+    assert batch.batch_size == (4, 13)
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_the_cars_of_the_workers_drive_with_the_weights_published_last(collect, mode):
+    collection = collect(f"collector={mode}", "collector.processes=2")
+    batches = iter(collection)
+    next(batches)
+    chosen = 3
+    with torch.no_grad():
+        for parameter in collection.networks.policy.parameters():
+            parameter.zero_()
+        last_bias = [p for p in collection.networks.policy.parameters() if p.ndim == 1][-1]
+        last_bias[chosen] = 100.0
+    collection.publish_policy()
+    for _ in range(1 if mode == "sync" else 6):  # what was on its way is driven by earlier weights
+        batch = next(batches)
+    assert (batch["action"] == chosen).all()
+
+
+def test_nothing_is_left_when_it_is_closed(collect, tmp_path):
+    before = set(multiprocessing.active_children())
+    with collect("collector=sync", "collector.processes=2") as collection:
+        next(iter(collection))
+        assert len(set(multiprocessing.active_children()) - before) == 2
+        assert (tmp_path / ".heartbeat").exists()
+    assert set(multiprocessing.active_children()) == before
+    assert not (tmp_path / ".heartbeat").exists()
+
+
+def test_nobody_is_waited_for_when_an_error_leaves_the_block(collect):
+    before = set(multiprocessing.active_children())
+    collection = collect("collector=async", "collector.processes=2")
+    next(iter(collection))
+    began = time.monotonic()
+    with pytest.raises(ZeroDivisionError), collection:
+        raise ZeroDivisionError
+    assert time.monotonic() - began < 5
+    assert set(multiprocessing.active_children()) == before
+
+
+class _Broken(EnvFactory):
+    def __call__(self):
+        raise ValueError("no engine\nin this car")
+
+
+def test_workers_that_do_not_start_are_told_in_one_line_and_gone(collect, monkeypatch):
+    before = set(multiprocessing.active_children())
+    monkeypatch.setattr("deepracer_exp.collectors.collector.EnvFactory", _Broken)
+    with pytest.raises(RunFailed, match="collector workers did not start: no engine") as error:
+        collect("collector=sync", "collector.processes=2")
+    assert "\n" not in str(error.value)
+    assert set(multiprocessing.active_children()) == before
+
+
+class _Sleeping(EnvFactory):
+    def __call__(self):
+        import time
+
+        time.sleep(3600)
+
+
+def test_workers_that_hang_while_they_start_are_ended(collect, monkeypatch):
+    before = set(multiprocessing.active_children())
+    monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
+    monkeypatch.setattr("deepracer_exp.collectors.collector.EnvFactory", _Sleeping)
+    with pytest.raises(RunFailed, match="collector workers did not start: worker 0 took no step"):
+        collect(
+            "collector=sync", "collector.processes=2", "collector.hang_timeout_s=1", "reward.time_limit_s=0.5"
+        )
+    assert set(multiprocessing.active_children()) == before

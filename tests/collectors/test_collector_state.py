@@ -1,0 +1,218 @@
+import copy
+import multiprocessing
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.collectors.collector import LocalCollector
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.errors import BadInput, RunFailed
+
+pytestmark = pytest.mark.usefixtures("workers_start_early")
+
+IN_PROCESS = ("collector=in_process", "collector.cars=6")
+SYNC = ("collector=sync", "collector.processes=2", "collector.cars=3")
+EVERYTHING = (
+    "track=[reinvent_carpet,Oval_track]",
+    "track.direction=alternate",
+    "randomization=sim2real",
+    # Cars are in the middle of a later episode when the state is taken.
+    "episode.max_steps=11",
+)
+
+
+class Driver:
+    """Collections of one experiment, and the weights that drive in them."""
+
+    def __init__(self, folder, *overrides: str):
+        experiment, _ = compose_experiment(["experiment=tiny", *overrides])
+        self._config, self._setup, self._folder = experiment.collector, build_setup(experiment), folder
+        size = len(feature_names(experiment.observation))
+        generator = torch.Generator().manual_seed(1)
+        self.policy = build_actor_critic(experiment.network, size, self._setup.actions.n, generator).policy
+        self._weights = copy.deepcopy(self.policy.state_dict())
+        self._opened = []
+
+    def open(self, state=None) -> LocalCollector:
+        self.policy.load_state_dict(self._weights)
+        self._opened.append(
+            LocalCollector(self._config, self._setup, self.policy, 6 * 20, self._folder, state=state)
+        )
+        return self._opened[-1]
+
+    def learn(self, collection: LocalCollector, turn: int) -> None:
+        """Change the weights as an update would, in a way that depends on the turn alone."""
+        generator = torch.Generator().manual_seed(turn)
+        with torch.no_grad():
+            for name, parameter in self.policy.named_parameters():
+                noise = torch.randn(parameter.shape, generator=generator)
+                parameter.copy_(self._weights[name] + 0.3 * noise)
+        collection.publish_policy()
+
+    def collect(self, collection: LocalCollector, turns: range) -> list:
+        batches, source = [], iter(collection)
+        for turn in turns:
+            if turn:
+                self.learn(collection, turn)
+            batches.append(next(source).exclude("collector").clone())
+        return batches
+
+    def close(self) -> None:
+        for collection in self._opened:
+            collection.close()
+
+
+@pytest.fixture
+def driver_of(tmp_path):
+    made = []
+
+    def make(*overrides: str) -> Driver:
+        made.append(Driver(tmp_path, *overrides))
+        return made[-1]
+
+    yield make
+    for driver in made:
+        driver.close()
+
+
+def stored(state, folder):
+    """Return the state as it comes back from a checkpoint."""
+
+    class Holder:
+        def state_dict(self):
+            return state
+
+        def load_state_dict(self, loaded):
+            self.loaded = loaded
+
+    archive, holder = StateDictCheckpointAdapter("archive"), Holder()
+    Checkpoint().register("cars", holder, adapter=archive).save(folder / "checkpoint")
+    Checkpoint().register("cars", holder, adapter=archive).load(folder / "checkpoint")
+    return holder.loaded
+
+
+def assert_same(batches, expected) -> None:
+    for batch, wanted in zip(batches, expected, strict=True):
+        assert set(batch.keys(True, True)) == set(wanted.keys(True, True))
+        for key, values in wanted.items(True, True):
+            # NaN stands in columns of the trace that say nothing.
+            assert torch.equal(batch[key].nan_to_num(7.0), values.nan_to_num(7.0)), key
+
+
+@pytest.mark.parametrize("collector", [IN_PROCESS, SYNC], ids=["in_process", "sync"])
+@pytest.mark.parametrize("space", ["discrete", "continuous"])
+def test_a_collection_goes_on_bit_for_bit_from_a_stored_state(driver_of, tmp_path, collector, space):
+    driver = driver_of(*collector, *EVERYTHING, f"action_space={space}")
+    uninterrupted = driver.open()
+    before = driver.collect(uninterrupted, range(3))
+    state = stored(uninterrupted.state_dict(), tmp_path)
+    expected = driver.collect(uninterrupted, range(3, 5))
+    assert {"observation", "action", "action_log_prob"} < set(expected[0].keys())
+    assert not torch.equal(before[2]["observation"], expected[0]["observation"])
+    done = expected[0]["next", "done"][:, 0]
+    assert not done.all()
+    uninterrupted.close()
+    resumed = driver.open(state)
+    assert_same(driver.collect(resumed, range(3, 5)), expected)
+    if collector is SYNC:  # what a batch asks of a worker, and the watchdog expects
+        assert np.fromfile(tmp_path / ".heartbeat", np.int64).tolist() == [40, 40]
+
+
+def test_what_else_the_training_process_draws_does_not_change_what_its_cars_do(driver_of):
+    driver = driver_of(*IN_PROCESS)
+    expected = driver.collect(driver.open(), range(2))
+    collection = driver.open()
+    batches = driver.collect(collection, range(1))
+    drawn = torch.manual_seed(5).get_state()
+    state = collection.state_dict()
+    batches += driver.collect(collection, range(1, 2))
+    assert torch.equal(torch.get_rng_state(), drawn)
+    assert_same(batches, expected)
+    assert_same(driver.collect(driver.open(state), range(1, 2)), expected[1:])
+
+
+def test_before_the_first_batch_the_state_is_the_one_it_began_from(driver_of):
+    driver = driver_of(*IN_PROCESS)
+    collection = driver.open()
+    assert collection.state_dict() == {}
+    driver.collect(collection, range(1))
+    state = collection.state_dict()
+    expected = driver.collect(collection, range(1, 2))
+    again = driver.open(state).state_dict()
+    assert_same(driver.collect(driver.open(again), range(1, 2)), expected)
+
+
+def test_the_cars_of_one_worker_go_on_in_the_training_process(driver_of):
+    one = driver_of("collector=sync", "collector.processes=1", "collector.cars=6")
+    collection = one.open()
+    one.collect(collection, range(1))
+    state = collection.state_dict()
+    expected = one.collect(collection, range(1, 2))
+    here = driver_of(*IN_PROCESS)
+    assert_same(here.collect(here.open(state), range(1, 2)), expected)
+
+
+def test_closing_leaves_the_threads_of_this_process_as_they_were(driver_of):
+    before = torch.get_num_threads()
+    driver_of("collector=sync", "collector.processes=1", "collector.cars=6").open().close()
+    assert torch.get_num_threads() == before
+
+
+def test_asynchronous_workers_have_no_state_and_begin_again(driver_of):
+    driver = driver_of("collector=async", "collector.processes=1", "collector.cars=6")
+    collection = driver.open()
+    driver.collect(collection, range(1))
+    assert collection.state_dict() == {}
+    collection.close()
+    assert driver.collect(driver.open({}), range(1))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (SYNC, "has the cars of 1 processes that wait for one another; accepted by this collector: 2"),
+        (("collector=async", "collector.processes=1"), "accepted by this collector: 0"),
+        (("collector=sync", "collector.processes=1", "collector.cars=3"), "'physics' of its cars has shape"),
+    ],
+    ids=["processes", "async", "cars"],
+)
+def test_a_state_of_another_collection_is_refused_and_no_process_left(driver_of, overrides, message):
+    before = set(multiprocessing.active_children())
+    here = driver_of(*IN_PROCESS)
+    collection = here.open()
+    here.collect(collection, range(1))
+    with pytest.raises(BadInput, match="the checkpoint does not fit") as error:
+        driver_of(*overrides).open(collection.state_dict())
+    assert message in str(error.value)
+    assert set(multiprocessing.active_children()) == before
+
+
+def test_a_worker_that_is_gone_when_asked_for_its_cars_is_a_failure(driver_of):
+    before = set(multiprocessing.active_children())
+    driver = driver_of(*SYNC)
+    collection = driver.open()
+    driver.collect(collection, range(1))
+    collection._collector.procs[1].kill()
+    with pytest.raises(RunFailed, match=r"collector worker 1 .* died by signal SIGKILL"):
+        collection.state_dict()
+    assert set(multiprocessing.active_children()) == before
+
+
+def test_a_worker_that_does_not_answer_when_asked_for_its_cars_is_a_failure(driver_of):
+    before = set(multiprocessing.active_children())
+    driver = driver_of(
+        "collector=sync", "collector.processes=1", "collector.hang_timeout_s=2", "reward.time_limit_s=1"
+    )
+    collection = driver.open()
+    driver.collect(collection, range(1))
+    os.kill(collection._collector.procs[0].pid, signal.SIGSTOP)
+    with pytest.raises(RunFailed, match="a collector worker did not report the state of its cars for 2 s"):
+        collection.state_dict()
+    assert set(multiprocessing.active_children()) == before

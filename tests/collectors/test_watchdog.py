@@ -1,0 +1,130 @@
+import multiprocessing
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from deepracer_exp.collectors import watchdog
+from deepracer_exp.collectors.watchdog import Watchdog
+
+
+@pytest.fixture
+def processes():
+    # The watchdog's timing is not that of the machine: these do nothing but wait.
+    context = multiprocessing.get_context("spawn")
+    started = [context.Process(target=time.sleep, args=(600,), daemon=True) for _ in range(2)]
+    for process in started:
+        process.start()
+    yield started
+    for process in started:
+        process.kill()
+        process.join()
+
+
+@pytest.fixture
+def watch(tmp_path, monkeypatch):
+    monkeypatch.setattr(watchdog, "_LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
+    made = []
+
+    def make(lockstep: bool, timeout_s: float = 1.0) -> Watchdog:
+        made.append(Watchdog(tmp_path / "beats", 2, timeout_s, lockstep))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.fixture
+def beats(tmp_path):
+    return lambda: np.memmap(tmp_path / "beats", np.int64, "r+")
+
+
+def _wait_until(condition) -> None:
+    give_up_at = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < give_up_at
+        time.sleep(0.02)
+
+
+def _keep_beating(counters, workers, seconds):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        counters[workers] += 1
+        time.sleep(0.02)
+
+
+def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, processes):
+    dog = watch(lockstep=False)
+    dog.workers_started(processes)
+    counters = beats()
+    counters[:] = 1
+    dog.expect()
+    _keep_beating(counters, [1], 4.0)
+    _wait_until(lambda: dog.verdict)
+    assert list(dog.verdict) == [0]
+    assert "after 1 steps" in dog.verdict[0]
+    processes[0].join(60)
+    assert processes[0].exitcode == -signal.SIGKILL
+    assert processes[1].is_alive()
+
+
+def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats, processes):
+    dog = watch(lockstep=True)
+    dog.workers_started(processes)
+    beats()[:] = 10
+    dog.expect()
+    dog.delivered(0)
+    _wait_until(lambda: dog.verdict)
+    assert list(dog.verdict) == [1]
+
+
+def test_what_arrived_is_no_excuse_for_the_next_batch(watch, beats, processes):
+    """A worker may hang after the last step of its part as well as within it."""
+    dog = watch(lockstep=True)
+    dog.workers_started(processes)
+    counters = beats()
+    counters[:] = 10
+    dog.expect()
+    dog.delivered(0)
+    dog.expect()
+    _keep_beating(counters, [1], 4.0)
+    _wait_until(lambda: dog.verdict)
+    assert list(dog.verdict) == [0]
+
+
+def test_nobody_is_ended_while_nothing_is_waited_for(watch, beats, processes):
+    dog = watch(lockstep=False)
+    dog.workers_started(processes)
+    beats()[:] = 1
+    dog.rest()
+    time.sleep(2.5)
+    assert not dog.verdict
+    assert all(process.is_alive() for process in processes)
+
+
+def test_workers_that_never_begin_are_ended_though_nobody_knows_them_yet(watch, processes):
+    dog = watch(lockstep=True)
+    _wait_until(lambda: dog.verdict)
+    for process in processes:
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
+
+
+def test_the_first_to_die_is_remembered(watch, processes):
+    dog = watch(lockstep=True, timeout_s=600)
+    dog.workers_started(processes)
+    processes[1].kill()
+    _wait_until(lambda: dog.first_dead is not None)
+    processes[0].kill()
+    processes[0].join()
+    assert dog.first_dead == 1
+
+
+def test_the_counters_are_gone_afterwards(watch, tmp_path):
+    dog = watch(lockstep=True)
+    assert (tmp_path / "beats").exists()
+    dog.close()
+    assert not (tmp_path / "beats").exists()

@@ -1,0 +1,305 @@
+"""Lines of every generation, and what of a damaged file can still be read."""
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.errors import BadInput
+
+from . import made_up_logs as made
+
+ROWS = made.drives([0, 1, 2], seed=3)
+GENERATIONS = sorted(made.FIELDS)
+PREFIXES = (
+    "",
+    "[download_node-1] [agent-9] ",
+    "1654981129000,",
+    "deepracer-0_robomaker.1.abc@host    | \x1b[33m[ WARN]\x1b[0m ",
+    '{"log":"',
+)
+
+
+def read_or_refused(path: Path) -> Recording | None:
+    """Return the recording, None if it was refused as it should be."""
+    refused = None
+    try:
+        return read_recording(path)
+    except BadInput as error:
+        refused = str(error)
+    assert "\n" not in refused
+    assert len(refused) < 1000
+    return None
+
+
+def lines_refused(recording: Recording) -> int:
+    return sum(problem.lines for problem in recording.problems if problem.line is not None)
+
+
+@pytest.mark.parametrize("prefix", PREFIXES)
+@pytest.mark.parametrize("fields", GENERATIONS)
+def test_every_generation_of_lines_with_any_prefix_has_the_same_columns(tmp_path, fields, prefix):
+    suffix = '\\n","stream":"stdout"}' if prefix.startswith("{") else "\r" if prefix else "\tmore"
+    log = tmp_path / "a-robomaker.log"
+    log.write_text(
+        "".join(f"{made.line(row, fields, prefix)}{suffix}\n" for row in ROWS.itertuples()), newline=""
+    )
+    recording = read_recording(log)
+    assert not recording.problems
+    steps = recording.steps
+    for name in ("X", "Y", "yaw", "progress"):
+        np.testing.assert_allclose(steps[name], ROWS[name], rtol=0, atol=6e-5)
+    for name in ("episode", "steps", "done", "all_wheels_on_track", "tstamp", "action"):
+        np.testing.assert_array_equal(steps[name], ROWS[name])
+    status = [""] * len(ROWS) if fields == 15 else ROWS["episode_status"].tolist()
+    assert steps["episode_status"].astype(str).tolist() == status
+    assert steps["pause_duration"].eq(0).all()
+    assert steps["obstacle_crash_counter"].notna().all() == (fields == 19)
+    assert steps["wall_clock"].notna().all() == (fields >= 18)
+    assert steps["speed_mps"].isna().all()
+
+
+@pytest.mark.parametrize("fields", GENERATIONS)
+def test_every_generation_of_csv_goes_by_its_names(tmp_path, fields):
+    file = tmp_path / "0-iteration.csv"
+    file.write_text(made.csv_text(ROWS, fields))
+    steps = read_recording(file).steps
+    np.testing.assert_array_equal(steps["X"], ROWS["X"])
+    assert steps["obstacle_crash_counter"].notna().all() == (fields >= 18)
+    assert steps["wall_clock"].notna().all() == (fields == 19)
+
+
+def test_the_eighteenth_value_is_a_counter_or_a_clock_by_its_size(tmp_path):
+    rows = ROWS.assign(wall_clock=[2] * 9 + [1.7e9] * 9)
+    (tmp_path / "a.log").write_text(made.log_text(rows, 18))
+    steps = read_recording(tmp_path).steps
+    assert steps["obstacle_crash_counter"].tolist()[:9] == [2] * 9
+    assert steps["wall_clock"].isna().tolist() == [True] * 9 + [False] * 9
+
+
+def test_the_radians_of_2019_become_degrees_and_later_degrees_stay(tmp_path):
+    radians = ROWS.assign(yaw=np.radians(ROWS["yaw"]), steer=np.radians(ROWS["steer"]))
+    (tmp_path / "old.log").write_text(made.log_text(radians, 15))
+    (tmp_path / "later.log").write_text(made.log_text(ROWS, 15))
+    for name in ("old", "later"):
+        steps = read_recording(tmp_path / f"{name}.log").steps
+        np.testing.assert_allclose(steps["yaw"], ROWS["yaw"], rtol=0, atol=0.004)
+        np.testing.assert_allclose(steps["steer"], ROWS["steer"], rtol=0, atol=0.4)
+
+
+@pytest.mark.parametrize(
+    "action", ["[-6.65667057  0.65535903]", "[ 5.  1.]", "[1.5875086159594005 1.7339787686700332]"]
+)
+def test_a_continuous_action_is_no_number(tmp_path, action):
+    rows = ROWS.assign(action=action)
+    (tmp_path / "a.log").write_text(made.log_text(rows, 19))
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/0-iteration.csv").write_text(made.csv_text(rows, 19))
+    for path in (tmp_path / "a.log", tmp_path / "b"):
+        recording = read_recording(path)
+        assert len(recording.steps) == len(ROWS)
+        assert recording.steps["action"].isna().all()
+
+
+def test_generations_one_after_the_other_in_one_file_are_all_read(tmp_path):
+    text = "".join(
+        made.log_text(ROWS.assign(episode=ROWS["episode"] + 3 * at), f) for at, f in enumerate(GENERATIONS)
+    )
+    (tmp_path / "a.log").write_text(text)
+    recording = read_recording(tmp_path)
+    assert not recording.problems
+    assert len(recording.steps) == len(ROWS) * len(GENERATIONS)
+    tables = [
+        made.csv_text(ROWS.assign(episode=ROWS["episode"] + 3 * at), f) for at, f in enumerate(GENERATIONS)
+    ]
+    (tmp_path / "all.csv").write_text("\n".join(tables))
+    assert len(read_recording(tmp_path / "all.csv").steps) == len(ROWS) * len(GENERATIONS)
+
+
+def test_torn_lines_are_listed_with_their_numbers_and_the_others_are_read(tmp_path):
+    lines = [made.line(row) for row in ROWS.itertuples()]
+    lines[2] = lines[2].rsplit(",", 2)[0]  # as many values as a line of 2019
+    lines[7] = lines[7].replace("False", "Fal", 1)
+    lines[9] = lines[9][:40]
+    lines[-1] = lines[-1].rsplit(",", 1)[0]
+    log = tmp_path / "torn.log"
+    log.write_text("some noise\n" + "\n".join(lines))
+    recording = read_recording(log)
+    assert len(recording.steps) == len(ROWS) - 4
+    assert [problem.line for problem in recording.problems] == [4, 9, 11, 19]
+    told = [problem.reason for problem in recording.problems]
+    assert "incomplete" in told[0]
+    assert told[1] == "done is 'Fal'; accepted: True or False"
+    assert all(str(problem).startswith(f"{log}:") for problem in recording.problems)
+
+
+def test_bad_rows_of_a_csv_are_listed_with_their_numbers(tmp_path):
+    lines = made.csv_text(ROWS).splitlines()
+    lines[3] = lines[3].replace(",", ";")
+    lines[5] = ",".join(["x", *lines[5].split(",")[1:]])
+    lines[8] = ",".join(["0", "2", "inf", *lines[8].split(",")[3:]])
+    lines.insert(10, "")
+    lines.append(lines[-1][:30])
+    file = tmp_path / "0-iteration.csv"
+    file.write_text("\n".join(lines))
+    recording = read_recording(file)
+    assert len(recording.steps) == len(ROWS) - 3
+    assert [problem.line for problem in recording.problems] == [4, 6, 9, 21]
+    assert recording.problems[1].reason == "episode is 'x'; accepted: a number"
+
+
+def test_many_bad_lines_are_counted(tmp_path):
+    (tmp_path / "a.log").write_text(made.log_text(ROWS) + "SIM_TRACE_LOG:rubbish\n" * 500)
+    recording = read_recording(tmp_path)
+    assert len(recording.problems) == 21
+    assert lines_refused(recording) == 500
+    assert recording.problems[-1].reason.endswith("the last one in line 521")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "latin-1"])
+def test_other_encodings_are_read(tmp_path, encoding):
+    text = "gemütlich\n" * 3 + made.log_text(ROWS, prefix="müde: ")
+    (tmp_path / "a.log").write_bytes(text.encode(encoding))
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/0-iteration.csv").write_bytes(made.csv_text(ROWS).encode(encoding))
+    for path in (tmp_path / "a.log", tmp_path / "b"):
+        recording = read_recording(path)
+        assert (len(recording.steps), recording.problems) == (len(ROWS), ())
+
+
+def test_policy_updates_that_diverged_are_read_and_torn_ones_listed(tmp_path):
+    good = made.trainer_text(2).replace("1.900", "nan")
+    (tmp_path / "sagemaker.log").write_text(good + "Policy training> Surrogate loss=0.1, KL diver\n")
+    recording = read_recording(tmp_path)
+    assert recording.updates["entropy"].isna().tolist() == [False, False, True, True]
+    (problem,) = recording.problems
+    assert problem.reason == "a policy update that cannot be read"
+    assert problem.line == len(good.splitlines()) + 1
+
+
+def test_a_truncated_archive_gives_what_can_be_read(tmp_path):
+    rng = np.random.default_rng(0)
+    files = made.console() | {"z.log": rng.bytes(200_000).hex()}
+    path = made.write_archive(files, tmp_path / "model.tar.gz")
+    raw = path.read_bytes()
+    whole = len(read_recording(path).steps)
+    seen = set()
+    for share in (0.02, 0.3, 0.9):
+        path.write_bytes(raw[: int(share * len(raw))])
+        recording = read_or_refused(path)
+        if recording is None:
+            continue
+        seen.add(len(recording.steps))
+        assert any("cannot be read to its end" in problem.reason for problem in recording.problems)
+    assert seen
+    assert max(seen) <= whole
+
+
+def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
+    log = tmp_path / "large.log"
+    noise = (
+        b"[ WARN] [1654981129.973417277]: [ClientConfiguration] Retry Strategy will use the default.\n"
+        * 11_000
+    )
+    with log.open("wb") as file:
+        for number in range(150):  # 150 MB
+            file.write(noise)
+            if number % 50 == 0:
+                file.write(made.log_text(ROWS.assign(episode=ROWS["episode"] + number)).encode())
+    tracemalloc.start()
+    recording = read_recording(log)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(recording.steps) == 3 * len(ROWS)
+    assert peak < 60e6
+
+
+def test_a_line_without_end_is_skipped_and_told(tmp_path):
+    log = tmp_path / "a.log"
+    with log.open("wb") as file:
+        file.write(made.log_text(ROWS).encode())
+        for _ in range(40):
+            file.write(b"\0" * 2**20)
+        file.write(
+            b"\n" + made.log_text(ROWS.assign(episode=ROWS["episode"] + 9)).encode() + b"SIM_TRACE_LOG:1\n"
+        )
+    recording = read_recording(log)
+    assert len(recording.steps) == 2 * len(ROWS)
+    first = len(ROWS) + 4
+    assert [problem.line for problem in recording.problems] == [2 * first, first]
+    assert "a line of more than 16 MiB" in recording.problems[1].reason
+
+
+FILES = ("a.log", "0-iteration.csv", "a.tar.gz", "TrainingMetrics.json")
+characters = st.sampled_from(list("0123456789.,-[]\"'\\\r\t :TFaex_\0é\x1b"))
+edits = st.lists(
+    st.tuples(st.floats(0, 1, exclude_max=True), st.sampled_from(["put", "cut", "over"]), characters),
+    max_size=12,
+)
+
+
+def damaged(text: str, changes: list[tuple[float, str, str]]) -> str:
+    for share, kind, character in changes:
+        at = int(share * len(text))
+        new = "" if kind == "cut" else character
+        text = text[:at] + new + text[at if kind == "put" else at + 1 :]
+    return text
+
+
+@given(fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
+@settings(max_examples=150)
+def test_every_trace_line_is_read_or_listed(tmp_path_factory, fields, changes, cut):
+    text = damaged(made.log_text(ROWS, fields), changes)
+    text = text[: int(cut * len(text))]
+    log = tmp_path_factory.mktemp("fuzz") / "a.log"
+    log.write_text(text, newline="")
+    present = sum("SIM_TRACE_LOG:" in line for line in text.split("\n"))
+    recording = read_or_refused(log)
+    if recording is None:
+        return
+    assert len(recording.steps) + sum(problem.lines for problem in recording.problems) == present
+
+
+@given(fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
+@settings(max_examples=150)
+def test_every_line_of_a_csv_is_read_or_listed(tmp_path_factory, fields, changes, cut):
+    head, _, body = made.csv_text(ROWS, fields).partition("\n")
+    body = damaged(body, changes)
+    body = body[: int(cut * len(body))]
+    file = tmp_path_factory.mktemp("fuzz") / "0-iteration.csv"
+    file.write_text(f"{head}\n{body}", newline="")
+    present = sum(bool(line.strip()) for line in body.split("\n"))
+    recording = read_or_refused(file)
+    if recording is None:
+        return
+    assert len(recording.steps) + sum(problem.lines for problem in recording.problems) == present
+
+
+@given(
+    raw=st.binary(max_size=2000),
+    name=st.sampled_from(["a.log", "0-iteration.csv", "a.tar.gz", "TrainingMetrics.json"]),
+)
+@settings(max_examples=150)
+def test_random_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw, name):
+    folder = tmp_path_factory.mktemp("fuzz")
+    head = b"\x1f\x8b\x08\0" if name.endswith("gz") else b""
+    (folder / name).write_bytes(head + raw)
+    for path in (folder, folder / name):
+        with pytest.raises(BadInput) as refused:
+            read_recording(path)
+        assert "\n" not in str(refused.value)
+
+
+@given(cut=st.floats(0, 1), changes=edits)
+@settings(max_examples=60)
+def test_a_damaged_metrics_file_is_read_or_refused(tmp_path_factory, cut, changes):
+    text = damaged(made.training_metrics(ROWS), changes)
+    file: Path = tmp_path_factory.mktemp("fuzz") / "TrainingMetrics.json"
+    file.write_text(text[: int(cut * len(text))], newline="")
+    recording = read_or_refused(file)
+    assert recording is None or len(recording.metrics) <= 3

@@ -1,0 +1,198 @@
+"""Laws of the simulation trace."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from deepracer_exp.deepracer.trace import (
+    EPISODE_STATUS,
+    PACKED,
+    PACKED_COLUMNS,
+    SCHEMA,
+    STATUS_CODE,
+    TRACE_COLUMNS,
+    TraceWriter,
+    read_trace,
+    to_table,
+)
+from deepracer_exp.errors import BadInput, RunFailed
+
+CONSOLE = (
+    Path(__file__).parents[2] / "../shared/reference/console_training/sim-trace/training/training-simtrace"
+)
+WHOLE = ("episode", "steps", "action", "closest_waypoint", "car")
+YES_NO = ("done", "all_wheels_on_track")
+TRACKS = ("Oval_track", "Bowtie_track", "2022_summit_speedway")
+
+
+def packed_rows(count: int, seed: int = 0) -> np.ndarray:
+    draw = np.random.default_rng(seed)
+    rows = draw.normal(size=(count, len(PACKED_COLUMNS)))
+    for name in WHOLE:
+        rows[:, PACKED[name]] = draw.integers(0, 500, count)
+    for name in YES_NO:
+        rows[:, PACKED[name]] = draw.integers(0, 2, count)
+    rows[:, PACKED["episode_status"]] = draw.integers(0, len(EPISODE_STATUS), count)
+    rows[:, PACKED["track"]] = draw.integers(0, len(TRACKS), count)
+    return rows
+
+
+def table(count: int = 7, iteration: int = 3) -> pa.Table:
+    return to_table(packed_rows(count, iteration), iteration, TRACKS)
+
+
+def test_the_services_columns_come_first_and_in_its_order() -> None:
+    header = (
+        "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
+        "track_len,tstamp,episode_status,pause_duration,obstacle_crash_counter"
+    )
+    assert TRACE_COLUMNS[:18] == tuple(header.split(","))
+
+
+@pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recording of the console beside the project")
+def test_a_recording_of_the_console_goes_through_packed_rows_unchanged() -> None:
+    recorded = pd.read_csv(CONSOLE / "6-iteration.csv")
+    assert TRACE_COLUMNS[: len(recorded.columns)] == tuple(recorded.columns)
+    coded = recorded.assign(episode_status=recorded["episode_status"].map(STATUS_CODE))
+    packed = coded.reindex(columns=PACKED_COLUMNS, fill_value=0).to_numpy(dtype=np.float64)
+    trace = to_table(packed, 6, TRACKS).to_pandas()
+    for name in recorded.columns:
+        values = trace[name].astype(str) if name == "episode_status" else trace[name]
+        np.testing.assert_array_equal(values, recorded[name], err_msg=name)
+
+
+@given(rows=arrays(np.float64, (3, len(PACKED_COLUMNS)), elements=st.floats(-1e9, 1e9)))
+def test_no_double_column_loses_a_bit(rows: np.ndarray) -> None:
+    rows[:, [PACKED["episode_status"], PACKED["track"]]] = 1
+    trace = to_table(rows, 0, TRACKS)
+    for field in SCHEMA:
+        if field.name in PACKED and field.type == pa.float64():
+            np.testing.assert_array_equal(trace[field.name].to_numpy(), rows[:, PACKED[field.name]])
+
+
+def test_every_column_has_its_type_and_says_its_unit() -> None:
+    trace = table()
+    assert trace.schema.equals(SCHEMA)
+    assert trace.column_names == list(TRACE_COLUMNS)
+    assert all(trace.schema.field(name).metadata[b"unit"] for name in TRACE_COLUMNS)
+
+
+def test_every_status_code_becomes_its_word() -> None:
+    rows = packed_rows(len(EPISODE_STATUS))
+    rows[:, PACKED["episode_status"]] = np.arange(len(EPISODE_STATUS))
+    trace = to_table(rows, 0, TRACKS)
+    assert trace["episode_status"].to_pylist() == list(EPISODE_STATUS)
+
+
+def test_every_row_names_its_course() -> None:
+    rows = packed_rows(3)
+    rows[:, PACKED["track"]] = [2, 0, 1]
+    assert to_table(rows, 0, TRACKS)["track"].to_pylist() == [
+        "2022_summit_speedway",
+        "Oval_track",
+        "Bowtie_track",
+    ]
+    with pytest.raises(ValueError, match="track code 2"):
+        to_table(rows, 0, TRACKS[:2])
+
+
+@pytest.mark.parametrize("code", [-1, len(EPISODE_STATUS), 256, 0.5, np.nan])
+def test_an_unknown_status_code_is_refused(code: float) -> None:
+    rows = packed_rows(3)
+    rows[1, PACKED["episode_status"]] = code
+    with pytest.raises(ValueError, match="status code"):
+        to_table(rows, 0, TRACKS)
+
+
+def test_a_continuous_action_has_no_number_but_its_steering_and_speed() -> None:
+    rows = packed_rows(2)
+    rows[:, PACKED["action"]] = np.nan
+    rows[:, PACKED["steer"]] = [-12.5, 31.0]
+    trace = to_table(rows, 0, TRACKS)
+    assert trace["action"].to_pylist() == [None, None]
+    assert trace["steer"].to_pylist() == [-12.5, 31.0]
+
+
+def test_rows_of_another_width_are_refused() -> None:
+    with pytest.raises(ValueError, match="shape"):
+        to_table(np.zeros((3, 4)), 0, TRACKS)
+
+
+def test_no_rows_are_a_table_too(tmp_path: Path) -> None:
+    TraceWriter(tmp_path).write(0, table(0))
+    assert list(read_trace(tmp_path).columns) == list(TRACE_COLUMNS)
+
+
+def test_what_was_written_is_read_in_the_order_of_iterations(tmp_path: Path) -> None:
+    writer = TraceWriter(tmp_path / "trace mit Ümläuten")
+    for iteration in (10, 9, 100_000):
+        path = writer.write(iteration, table(iteration=iteration))
+        assert path.name == f"{iteration:05d}-iteration.parquet"
+    trace = read_trace(writer.folder)
+    assert trace["iteration"].tolist() == [9] * 7 + [10] * 7 + [100_000] * 7
+    assert trace.index.tolist() == list(range(21))
+    pd.testing.assert_frame_equal(trace[:7], table(iteration=9).to_pandas(), check_categorical=False)
+
+
+def test_an_iteration_written_again_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    TraceWriter(tmp_path).write(4, table(7))
+    TraceWriter(tmp_path).write(4, table(2))
+    assert len(read_trace(tmp_path)) == 2
+
+
+def test_a_write_that_breaks_off_leaves_neither_a_file_nor_the_half_of_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def disk_full(table: pa.Table, where: Path, **options: object) -> None:
+        where.write_bytes(b"PAR1 half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", disk_full)
+    with pytest.raises(RunFailed, match=r"00003-iteration\.parquet.*No space left on device"):
+        TraceWriter(tmp_path).write(3, table())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_fails_the_run(tmp_path: Path) -> None:
+    (tmp_path / "trace").write_text("a file")
+    with pytest.raises(RunFailed, match="trace cannot be written"):
+        TraceWriter(tmp_path / "trace").write(0, table())
+
+
+def test_only_the_wanted_columns_are_read(tmp_path: Path) -> None:
+    TraceWriter(tmp_path).write(0, table())
+    assert list(read_trace(tmp_path, ("X", "episode_status")).columns) == ["X", "episode_status"]
+
+
+def test_an_unfinished_file_is_not_read(tmp_path: Path) -> None:
+    TraceWriter(tmp_path).write(0, table())
+    (tmp_path / ".00001-iteration.parquet").write_bytes(b"PAR1 half")
+    assert len(read_trace(tmp_path)) == 7
+
+
+@pytest.mark.parametrize("content", [b"", b"PAR1 half", b"episode,steps\n1,2\n" * 10])
+def test_a_torn_file_is_named(tmp_path: Path, content: bytes) -> None:
+    TraceWriter(tmp_path).write(0, table())
+    (tmp_path / "00001-iteration.parquet").write_bytes(content)
+    with pytest.raises(BadInput, match=r"00001-iteration\.parquet") as caught:
+        read_trace(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_parquet_file_of_another_kind_is_named(tmp_path: Path) -> None:
+    pq.write_table(pa.table({"episode": [1]}), tmp_path / "00000-iteration.parquet")
+    with pytest.raises(BadInput, match=r"00000-iteration\.parquet"):
+        read_trace(tmp_path)
+
+
+def test_a_folder_without_a_trace_is_named(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "none"):
+        with pytest.raises(BadInput, match=r"accepted: the trace folder"):
+            read_trace(folder)

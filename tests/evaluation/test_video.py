@@ -1,0 +1,34 @@
+import ctypes.util
+import os
+import shutil
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import read_frames
+
+drawable = os.environ.get("MUJOCO_GL") or any(map(ctypes.util.find_library, ("EGL", "OSMesa")))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not drawable, reason="this machine has neither EGL nor OSMesa")
+@pytest.mark.parametrize("view", ["chase", "top"])
+def test_a_film_shows_the_car_on_its_way(trained, start, tmp_path, view):
+    folder = shutil.copytree(trained().folder, tmp_path / "run", symlinks=True)
+    ended = start(
+        *("evaluate", str(folder), "evaluation.trials=1", "evaluation.time_s=2"),
+        *("evaluation.held_out=null", "--video", "lap.mp4", "--view", view),
+    ).end(300)
+    assert ended.code == 0, ended.stderr
+    frames = read_frames(str(tmp_path / "lap.mp4"))
+    about = next(frames)
+    assert about["fps"] == 15
+    width, height = about["size"]
+    pictures = [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in frames]
+    # Two seconds, or less where the car leaves the road, and the last picture a second more.
+    assert 16 <= len(pictures) <= 47
+    road = np.array([0x4A, 0x4D, 0x52])
+    seen = (np.abs(pictures[0] - road).max(axis=2) < 12).mean()
+    assert seen > 0.02, "no road to be seen"
+    assert np.abs(pictures[0] - pictures[-1]).max() > 60, "nothing moves"
+    corner = pictures[0][:140, :350]
+    assert (corner.min(axis=2) > 230).sum() > 100, "no figures to be seen"

@@ -1,0 +1,406 @@
+import builtins
+import hashlib
+import io
+import pickle
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.rewards.params import COLUMNS, TrackParams, batch_params, rows, scalar_params, select
+from deepracer_exp.rewards.prints import RewardPrints
+from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
+from deepracer_exp.rewards.source import RewardSource
+
+WAYPOINTS = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 0.0)]
+ROAD = [TrackParams(WAYPOINTS, 3.4, False)]
+KEYS = {
+    **dict.fromkeys(("x", "y", "heading", "distance_from_center", "projection_distance", "progress"), float),
+    **dict.fromkeys(("steps", "speed", "steering_angle", "track_width", "track_length", "sim_time"), float),
+    **dict.fromkeys(("all_wheels_on_track", "is_left_of_center", "is_reversed", "is_crashed"), bool),
+    **dict.fromkeys(("is_offtrack", "object_in_camera"), bool),
+    **dict.fromkeys(("waypoints", "closest_waypoints", "closest_objects", "objects_location"), list),
+    **dict.fromkeys(("objects_left_of_center", "objects_speed", "objects_heading"), list),
+    **dict.fromkeys(("objects_distance_from_center", "objects_distance"), list),
+}
+
+
+def columns(n: int, dtype: type = np.float64) -> dict[str, np.ndarray]:
+    made = {key: np.arange(n).astype(dtype) for key in COLUMNS}
+    made["steps"] = np.full(n, 7)
+    made["closest_waypoints"] = np.tile(np.array([0, 1], np.int32), (n, 1))
+    return made
+
+
+def function(
+    body: str,
+    n_cars: int = 3,
+    time_limit_s: float = 5.0,
+    prints: RewardPrints | None = None,
+    **overrides: float,
+) -> RewardFunction:
+    """Make a reward of a module, or of the body of a function where there is no `def`."""
+    text = body if "def " in body else f"def reward_function(params):\n    {body}\n"
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    source = RewardSource("mine", "/somewhere/mine.py", text, digest, dict(overrides), overrides)
+    return RewardFunction(source, n_cars, time_limit_s, prints)
+
+
+def failure(reward: RewardFunction, active: np.ndarray | None = None) -> RewardFailed:
+    with pytest.raises(RewardFailed) as caught:
+        reward(columns(reward.n_cars), ROAD, active)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int64])
+def test_the_params_are_the_27_keys_of_the_service_as_plain_python(dtype: type) -> None:
+    row = next(iter(rows(select(columns(2, dtype), None))))
+    params = scalar_params(row, WAYPOINTS, 3.4, False)
+    assert {key: type(value) for key, value in params.items()} == KEYS
+    assert len(KEYS) == 27
+    assert all(type(index) is int for index in params["closest_waypoints"])
+    assert all(type(point) is tuple and type(point[0]) is float for point in params["waypoints"])
+    assert set(COLUMNS) | set(TrackParams._fields) < set(KEYS)
+
+
+def test_keys_about_other_objects_hold_the_defaults_of_an_empty_road() -> None:
+    params = scalar_params(next(iter(rows(select(columns(1), None)))), WAYPOINTS, 3.4, True)
+    assert params["closest_objects"] == [0, 0]
+    assert not params["is_crashed"]
+    assert not params["object_in_camera"]
+    assert [v for k, v in params.items() if k.startswith("objects_")] == [[]] * 6
+
+
+def test_batch_params_hold_the_same_keys_and_values() -> None:
+    selected = select(columns(3), None)
+    batch = batch_params(selected, np.array(WAYPOINTS), 3.4, False)
+    for car, row in enumerate(rows(selected)):
+        for key, value in scalar_params(row, WAYPOINTS, 3.4, False).items():
+            shared = key in TrackParams._fields or key.startswith("objects_")
+            np.testing.assert_array_equal(batch[key] if shared else batch[key][car], value)
+    assert set(batch) == set(KEYS)
+
+
+def test_each_car_is_paid_for_its_own_params() -> None:
+    np.testing.assert_array_equal(function("return params['x'] * 2")(columns(3), ROAD), [0.0, 2.0, 4.0])
+
+
+def test_cars_that_are_not_active_get_nothing_and_are_not_called() -> None:
+    reward = function("return 1 / (params['x'] - 1)")
+    np.testing.assert_array_equal(reward(columns(3), ROAD, np.array([True, False, True])), [-1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(reward(columns(3), ROAD, np.zeros(3, bool)), np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    "value", ["True", "3", "2.5", "-1e5", "1e5", "np.float32(2)", "np.array(3)", "Fraction(1, 2)"]
+)
+def test_whatever_float_makes_a_bounded_number_of_is_a_reward(value: str) -> None:
+    head = "import numpy as np\nfrom fractions import Fraction\n"
+    result = function(f"{head}def reward_function(params):\n    return {value}\n")(columns(3), ROAD)
+    assert result.dtype == np.float64
+    assert result[0] == float(eval(value, {"np": np, "Fraction": Fraction}))  # noqa: S307
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("return None", "returned None; accepted: a finite number from -100000 to 100000"),
+        ("return '1.0'", "returned '1.0'; accepted: a finite"),
+        ("return b'1'", "returned b'1'"),
+        ("return float('nan')", "returned nan"),
+        ("return float('-inf')", "returned -inf"),
+        ("return 1e9", "returned 1000000000.0"),
+        ("return -100000.1", "returned -100000.1"),
+        ("return 10 ** 400", "returned 1000"),
+        ("return 1j", "returned 1j"),
+        ("return [1.0]", "returned [1.0]"),
+        ("return 1 / 0", "raised ZeroDivisionError: division by zero in line 2 of /somewhere/mine.py"),
+        ("return params['nonsense']", "raised KeyError: 'nonsense' in line 2"),
+        ("raise ValueError('two\\nlines')", "raised ValueError: two lines in line 2"),
+        ("raise ValueError('x' * 1000000)", "raised ValueError: xxx"),
+        ("import sys; sys.exit(0)", "raised SystemExit: 0 in line 2"),
+        ("raise GeneratorExit", "raised GeneratorExit in line 2"),
+        ("return reward_function(params)", "raised RecursionError"),
+    ],
+)
+def test_a_bad_reward_fails_the_run_in_one_line(body: str, message: str) -> None:
+    error = failure(function(body), np.array([False, True, True]))
+    assert isinstance(error, RunFailed)
+    assert str(error).startswith(f"reward mine: reward_function {message}")
+    assert str(error).endswith("(car 1, step 7)")
+    assert len(str(error)) < 500
+
+
+def test_the_failure_keeps_car_and_params_as_they_were_given() -> None:
+    body = "params['waypoints'].clear(); speed = params.pop('speed'); return None if speed == 2 else 1.0"
+    error = failure(function(body))
+    assert error.car == 2
+    assert error.params is not None
+    assert error.params["speed"] == 2.0
+    assert error.params["waypoints"] == WAYPOINTS
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301 - as between processes
+    assert (str(again), again.params, again.car) == (str(error), error.params, 2)
+
+
+def test_the_line_is_that_of_the_reward_file_even_if_a_library_raised() -> None:
+    text = "import json\n\n\ndef reward_function(params):\n    return json.loads('{')\n"
+    assert "in line 5 of /somewhere/mine.py" in str(failure(function(text)))
+
+
+CTRL_C = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        f"{CTRL_C}; return 1.0",
+        f"\n    try:\n        {CTRL_C}\n        while True: pass\n    except: return 1.0",
+    ],
+)
+def test_ctrl_c_is_the_users_even_if_the_reward_swallows_it(body: str) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        function(body)(columns(3), ROAD)
+
+
+def test_a_keyboard_interrupt_that_the_reward_raises_is_its_fault() -> None:
+    assert "raised KeyboardInterrupt in line 2" in str(failure(function("raise KeyboardInterrupt")))
+    with pytest.raises(BadInput, match="cannot be run: raised KeyboardInterrupt in line 1"):
+        function("raise KeyboardInterrupt\ndef reward_function(params): return 1.0\n")
+
+
+@pytest.mark.parametrize("method", ["__str__", "__repr__"])
+@pytest.mark.parametrize("body", ["raise SystemExit", "while True: pass"])
+def test_an_error_whose_text_is_hostile_is_a_fault_like_others(method: str, body: str) -> None:
+    text = (
+        f"class Evil(Exception):\n    def {method}(self):\n        {body}\n"
+        "def reward_function(params):\n    raise Evil(params)\n"
+    )
+    error = failure(function(text, time_limit_s=0.05))
+    assert "reward_function raised " in str(error)
+    assert "in line 5 of /somewhere/mine.py" in str(error)
+    assert "reward mine" in "".join(traceback.format_exception(error))
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        ("import builtins; builtins.len = None; return 1.0", "builtins.len"),
+        ("import builtins; del builtins.isinstance; return []", "builtins.isinstance"),
+        ("import io, sys; sys.stdout = io.StringIO(); return 1.0", "sys.stdout"),
+    ],
+)
+def test_what_everything_uses_is_put_back_and_its_replacement_is_a_fault(body: str, name: str) -> None:
+    before = builtins.__dict__.copy(), sys.stdout
+    assert f"reward_function replaced {name}" in str(failure(function(body)))
+    assert (builtins.__dict__, sys.stdout) == before
+
+
+def test_a_closed_stream_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    error = failure(function("import sys; sys.stdout.close(); return 1.0"))
+    assert "closed sys.stdout" in str(error)
+    assert sys.stdout is sys.stderr
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "\n    while True:\n        pass",
+        "\n    while True:\n        try: params['x']\n        except Exception: pass",
+        "\n    try:\n        while True: pass\n    except:\n        pass\n    while True:\n        pass",
+    ],
+)
+def test_a_reward_that_hangs_is_stopped_by_the_time_limit(body: str) -> None:
+    error = failure(function(body, time_limit_s=0.05))
+    limit = "the time limit of 0.05 s of CPU for one step"
+    assert f"reward_function took longer than {limit} in line" in str(error)
+    assert error.car == 0
+    assert error.hung
+
+
+def test_a_reward_that_sleeps_for_ever_is_stopped_too() -> None:
+    error = failure(function("\n    import time\n    time.sleep(600)", time_limit_s=0.02))
+    assert "reward_function took longer than 0.2 s without computing: 10 times the time limit" in str(error)
+
+
+def test_a_busy_machine_never_fails_a_good_reward() -> None:
+    """Each call waits longer than its limit, as on a machine that has no time for it, but computes next to nothing."""
+    reward = function("import time; time.sleep(0.03); return 1.0", time_limit_s=0.05)
+    np.testing.assert_array_equal(reward(columns(3), ROAD), np.ones(3))
+
+
+def test_time_in_which_the_whole_process_was_stopped_does_not_count() -> None:
+    stop = (
+        "import os, signal, subprocess; subprocess.Popen(['sh', '-c', f'sleep 1; kill -CONT {os.getpid()}'])"
+    )
+    body = f"{stop}; os.kill(os.getpid(), signal.SIGSTOP); return 1.0"
+    np.testing.assert_array_equal(function(body, n_cars=1, time_limit_s=0.05)(columns(1), ROAD), [1.0])
+
+
+def test_timer_and_handler_found_are_put_back() -> None:
+    def mine(*_: object) -> None:
+        raise AssertionError("must not fire")
+
+    handler = signal.signal(signal.SIGALRM, mine)
+    timer = signal.setitimer(signal.ITIMER_REAL, 1000.0)
+    try:
+        function("return 1.0")(columns(3), ROAD)
+        failure(function("raise ValueError"))
+        assert signal.getsignal(signal.SIGALRM) is mine
+        assert 990.0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 1000.0
+    finally:
+        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_REAL, *timer)
+
+
+def test_outside_the_main_thread_rewards_are_paid_without_a_limit() -> None:
+    results: list[np.ndarray] = []
+    thread = threading.Thread(target=lambda: results.append(function("return 1.0")(columns(3), ROAD)))
+    thread.start()
+    thread.join()
+    np.testing.assert_array_equal(results, np.ones((1, 3)))
+
+
+def test_what_a_reward_does_to_its_params_reaches_neither_the_next_call_nor_the_caller() -> None:
+    body = (
+        "seen = (len(params), len(params['waypoints']), *params['closest_waypoints'],"
+        " *params['closest_objects'], len(params['objects_speed']))\n"
+        "    params['waypoints'].append((9.0, 9.0)); params['closest_waypoints'][0] = 99\n"
+        "    params['closest_objects'][1] = 5; params['objects_speed'].append(1.0); params.clear()\n"
+        "    return seen == (27, 4, 0, 1, 0, 0, 0)"
+    )
+    given, road = columns(3), [TrackParams(list(WAYPOINTS), 3.4, False)]
+    reward = function(body)
+    for _ in range(2):
+        np.testing.assert_array_equal(reward(given, road), np.ones(3))
+    assert road[0].waypoints == WAYPOINTS
+    np.testing.assert_array_equal(given["closest_waypoints"], columns(3)["closest_waypoints"])
+
+
+def test_module_globals_persist_for_a_car_and_never_pass_to_another() -> None:
+    text = "calls = []\ndef reward_function(params):\n    calls.append(1)\n    return len(calls)\n"
+    reward = function(text)
+    reward(columns(3), ROAD)
+    reward(columns(3), ROAD, np.array([False, True, False]))
+    np.testing.assert_array_equal(reward(columns(3), ROAD), [2.0, 3.0, 2.0])
+
+
+def test_constants_are_those_of_the_config() -> None:
+    text = "WEIGHT = 1.0\nTWICE = WEIGHT * 2\ndef reward_function(params):\n    return TWICE\n"
+    np.testing.assert_array_equal(function(text)(columns(3), ROAD), [2.0] * 3)
+    np.testing.assert_array_equal(function(text, WEIGHT=4.5)(columns(3), ROAD), [9.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "import nonsense_of_mine",
+            "raised ModuleNotFoundError: No module named 'nonsense_of_mine' in line 1",
+        ),
+        ("import sys; sys.exit(3)", "raised SystemExit: 3 in line 1"),
+        ("while True: pass", "took longer than the time limit"),
+    ],
+)
+def test_a_module_that_cannot_be_run_is_bad_input(text: str, message: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        function(f"{text}\ndef reward_function(params): return 1.0\n", time_limit_s=0.05)
+    assert str(caught.value).startswith(f"/somewhere/mine.py: cannot be run: {message}")
+
+
+def test_a_name_that_is_no_function_is_bad_input() -> None:
+    with pytest.raises(BadInput, match="reward_function is 5; accepted: a function"):
+        function("def other(): pass\nreward_function = 5\n")
+
+
+def test_a_callable_object_is_accepted() -> None:
+    text = "class R:\n    def __call__(self, params):\n        return 2.0\nreward_function = R()\n"
+    np.testing.assert_array_equal(function(text)(columns(3), ROAD), [2.0] * 3)
+
+
+def test_prints_go_to_the_log_and_nowhere_else(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    prints = RewardPrints(tmp_path / "reward_prints.log")
+    text = "print('made')\ndef reward_function(params):\n    print('x is', params['x'])\n    return 1.0\n"
+    function(text, prints=prints)(columns(3), ROAD)
+    function(text)(columns(3), ROAD)
+    prints.close()
+    log = prints.path.read_text().splitlines()
+    assert log == [f"car {i}: made" for i in range(3)] + [f"car {i}: x is {i}.0" for i in range(3)]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_million_prints_do_not_stop_a_reward(tmp_path: Path) -> None:
+    prints = RewardPrints(tmp_path / "reward_prints.log")
+    body = "\n    for i in range(100000):\n        print('line', i)\n    return 1.0"
+    np.testing.assert_array_equal(function(body, prints=prints)(columns(3), ROAD), np.ones(3))
+    prints.close()
+    assert prints.written + prints.dropped == 300_000
+    assert prints.path.stat().st_size < 100_000
+
+
+def batch(body: str, **options: Any) -> RewardFunction:
+    text = "import numpy as np\ndef reward_function(params):\n    return 1.0\ndef reward_batch(params):\n    "
+    return function(text + body + "\n", **options)
+
+
+def test_a_batch_function_is_called_once_for_all_active_cars() -> None:
+    reward = batch("global calls; calls = globals().get('calls', 0) + 1; return params['x'] + 10 * calls")
+    np.testing.assert_array_equal(reward(columns(3), ROAD), [10.0, 11.0, 12.0])
+    np.testing.assert_array_equal(reward(columns(3), ROAD, np.array([True, False, True])), [20.0, 0.0, 22.0])
+
+
+@pytest.mark.parametrize(
+    ("body", "car", "message"),
+    [
+        (
+            "return None",
+            None,
+            "returned object of shape (); accepted: one number a car, shape (3,) (3 cars)",
+        ),
+        ("return 1.0", None, "returned float64 of shape ()"),
+        ("return params['x'][:2]", None, "returned float64 of shape (2,)"),
+        ("return params['x'] * 1j", None, "returned complex128 of shape (3,)"),
+        ("return ['a', 'b', 'c']", None, "of shape (3,)"),
+        ("return [[1], [2, 3], 4]", None, "returned [[1], [2, 3], 4]"),
+        ("return 1 / 0", None, "raised ZeroDivisionError: division by zero in line 5"),
+        ("while True: pass", None, "took longer than the time limit of 0.05 s"),
+        ("return np.array([1.0, 2.0, np.nan])", 2, "returned nan; accepted: a finite number"),
+        ("return np.array([1.0, 1e6, np.nan])", 1, "returned 1000000.0; accepted: a finite number"),
+    ],
+)
+def test_a_bad_batch_fails_the_run_in_one_line(body: str, car: int | None, message: str) -> None:
+    error = failure(batch(body, time_limit_s=0.05))
+    assert f"reward mine: reward_batch {message}" in str(error) or message in str(error)
+    assert error.car == car
+    assert error.params is not None
+    assert set(error.params) == set(KEYS)
+    if car is not None:
+        assert error.params["x"] == float(car)
+        assert str(error).endswith(f"(car {car}, step 7)")
+
+
+def test_a_batch_function_that_mutates_its_params_changes_nothing_outside() -> None:
+    reward = batch(
+        "total = params['x'] + params['waypoints'].sum();"
+        " params['x'][:] = 9; params['waypoints'][:] = 9; return total"
+    )
+    given = columns(3)
+    np.testing.assert_array_equal(reward(given, ROAD), reward(given, ROAD))
+    np.testing.assert_array_equal(given["x"], [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("make", [function, batch])
+def test_columns_that_are_missing_are_a_fault_of_the_caller(make: Callable[..., RewardFunction]) -> None:
+    given = columns(3)
+    del given["x"]
+    with pytest.raises(KeyError, match="x"):
+        make("return 1.0")(given, ROAD)

@@ -1,0 +1,149 @@
+"""Runs of ours in everybody's schema."""
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from deepracer_exp.deepracer.recording import (
+    EVALUATION_COLUMNS,
+    METRICS_COLUMNS,
+    STEP_COLUMNS,
+    UPDATE_COLUMNS,
+)
+from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.own_recording import is_own_run, read_own_recording
+
+OWN = ("stream", "worker", "wall_clock")
+"""Columns that a trace of ours does not have."""
+
+
+@pytest.fixture
+def folder(trained, tmp_path):
+    """Return a copy of a run's folder that may be spoilt."""
+    return shutil.copytree(trained().folder, tmp_path / "run", symlinks=True)
+
+
+def test_the_steps_are_the_rows_of_the_trace(trained):
+    steps = read_own_recording(trained().folder).steps
+    assert {name: str(steps[name].dtype) for name in steps} == {
+        name: kind for name, (kind, _) in STEP_COLUMNS.items()
+    }
+    trace = read_trace(trained().folder / "trace")
+    assert len(steps) == len(trace) == 4096
+    for name in STEP_COLUMNS:
+        if name not in OWN:
+            assert steps[name].tolist() == trace[name].tolist(), name
+    assert set(steps["stream"]) == {"training"}
+    assert set(steps["worker"]) == {0}
+    assert steps["wall_clock"].isna().all()
+
+
+def test_rows_of_an_episode_keep_their_own_iterations(trained):
+    steps = read_own_recording(trained().folder).steps
+    iterations = steps.groupby("episode")["iteration"].nunique()
+    assert iterations.max() > 1
+    # The steps of each go on by one.
+    assert set(steps.groupby("episode")["steps"].diff().dropna()) == {1}
+
+
+def test_iterations_of_updates_evaluations_and_trace_are_those_of_the_metrics(trained):
+    run = trained()
+    recording = read_own_recording(run.folder)
+    assert {name: str(kind) for name, kind in recording.updates.dtypes.items()} == {
+        name: kind for name, (kind, _) in UPDATE_COLUMNS.items()
+    }
+    assert (
+        recording.updates["iteration"].tolist()
+        == sorted(recording.steps["iteration"].unique())
+        == [row["iteration"] for row in run.metrics]
+        == [1, 2, 3, 4]
+    )
+    for name in ("policy_loss", "value_loss", "kl", "entropy", "lr"):
+        assert recording.updates[name].tolist() == [row[name] for row in run.metrics]
+    evaluated = [row for row in run.metrics if row["eval_completion"] is not None]
+    assert list(recording.evaluations) == list(EVALUATION_COLUMNS)
+    assert recording.evaluations["iteration"].tolist() == [row["iteration"] for row in evaluated]
+    assert recording.evaluations["completion"].tolist() == [row["eval_completion"] for row in evaluated]
+    assert list(recording.metrics) == list(METRICS_COLUMNS)
+    assert recording.metrics.empty
+
+
+def test_what_was_trained_with_is_told_in_the_services_words(trained):
+    recording = read_own_recording(trained().folder)
+    assert recording.problems == ()
+    assert recording.hyperparameters["batch_size"] == 256
+    assert recording.hyperparameters["discount_factor"] == 0.99
+    assert recording.track == "reinvent_base"
+    assert recording.metadata.actions[0] == (-30.0, 1.0)
+    assert "def reward_function" in recording.reward_source
+    assert trained().folder / "config.yaml" in recording.files
+
+
+@pytest.mark.parametrize("space", ["grid_fine", "continuous"])
+def test_the_action_space_is_that_of_the_environment(trained, space):
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.env.action_space import build_action_space
+    from deepracer_exp.export.aws_files import metadata_of
+
+    overrides = (f"action_space={space}",)
+    experiment, _ = compose_experiment(overrides)
+    recording = read_own_recording(trained(*overrides).folder)
+    assert recording.metadata == metadata_of(build_action_space(experiment.action_space))
+    assert recording.steps["action"].isna().all() == (space == "continuous")
+
+
+def test_a_torn_file_of_the_trace_is_left_out_and_told(folder):
+    torn = folder / "trace" / "00002-iteration.parquet"
+    torn.write_bytes(torn.read_bytes()[:-100])
+    recording = read_own_recording(folder)
+    assert set(recording.steps["iteration"]) == {1, 3, 4}
+    (problem,) = recording.problems
+    assert problem.file == str(torn)
+    assert problem.reason.startswith("left out: ")
+    assert torn not in recording.files
+
+
+def test_a_file_of_another_kind_among_the_trace_is_left_out_and_told(folder):
+    other = folder / "trace" / "00003-iteration.parquet"
+    pd.DataFrame({"episode": np.arange(10)}).to_parquet(other)
+    recording = read_own_recording(folder)
+    assert set(recording.steps["iteration"]) == {1, 2, 4}
+    assert [problem.file for problem in recording.problems] == [str(other)]
+
+
+def test_a_line_of_the_metrics_cut_off_by_a_kill_is_told(folder):
+    file = folder / "metrics.jsonl"
+    file.write_text(file.read_text()[:-40])
+    recording = read_own_recording(folder)
+    assert recording.updates["iteration"].tolist() == [1, 2, 3]
+    (problem,) = recording.problems
+    assert (problem.file, problem.line) == (str(file), 4)
+
+
+def test_missing_files_beside_the_trace_are_told(folder):
+    for name in ("metrics.jsonl", "config.yaml", "reward_function.py"):
+        (folder / name).unlink()
+    recording = read_own_recording(folder)
+    assert len(recording.steps) == 4096
+    assert len(recording.updates) == len(recording.evaluations) == 0
+    assert (
+        recording.metadata is recording.hyperparameters is recording.reward_source is recording.track is None
+    )
+    assert sorted(problem.file for problem in recording.problems) == sorted(
+        str(folder / name) for name in ("metrics.jsonl", "config.yaml", "reward_function.py")
+    )
+
+
+def test_without_a_trace_there_is_nothing_to_read(folder):
+    assert is_own_run(folder)
+    for path in (folder / "trace").iterdir():
+        path.write_bytes(b"nothing")
+    with pytest.raises(BadInput, match="nothing of the trace can be read"):
+        read_own_recording(folder)
+    shutil.rmtree(folder / "trace")
+    assert not is_own_run(folder)
+    with pytest.raises(BadInput, match=r"no \*-iteration.parquet; accepted: the folder of a run"):
+        read_own_recording(folder)

@@ -1,0 +1,169 @@
+"""Each trial has one owner at a time, whether workers race, are late or are killed; on each kind of database."""
+
+import random
+import time
+
+from sweeps.claims import TrialClaims, TrialResult
+
+THREE = ("anna", "ben", "cleo")
+HOUR_S = 3600.0
+
+
+def result(state="COMPLETE", values=None, **attrs) -> TrialResult:
+    return TrialResult(state=state, values=values, attrs=attrs)
+
+
+def _settle_all(claims: TrialClaims, total: int) -> None:
+    while (claim := claims.claim("last", total, HOUR_S)) is not None:
+        assert claims.settle(claim, result(values=[1.0]))
+
+
+def test_racing_processes_get_each_trial_exactly_once(url, race):
+    lines = race("claim", url, THREE, 24, HOUR_S).lines()
+    claimed = [tuple(map(int, line.split()[:2])) for printed in lines for line in printed]
+    assert sorted(claimed) == [(index, 1) for index in range(24)]
+
+
+def test_an_expired_lease_is_taken_over_exactly_once(url, claims, race):
+    for owner in ("first", "second"):
+        claims.record(claim := claims.claim(owner, 2, HOUR_S), trial_id=40 + claim.index)
+    for owner in ("first", "second"):
+        assert claims.release(owner) == 1
+    lines = race("claim", url, THREE, 2, HOUR_S).lines()
+    taken = sorted(line for printed in lines for line in printed)
+    assert taken == ["0 2 first 40", "1 2 second 41"]
+
+
+def test_processes_may_create_the_table_together(url, race):
+    assert race("table", url, THREE).lines() == [["made"]] * 3
+
+
+def test_no_write_of_a_late_owner_is_kept(claims):
+    late = claims.claim("late", 1, 0.0)
+    heir = claims.claim("heir", 1, HOUR_S)
+    claims.record(heir, trial_id=7, runs=[{"seed": 1}])
+    before = claims.all()
+    assert not claims.renew(late, HOUR_S, {"completion": 100.0})
+    assert not claims.record(late, trial_id=8, runs=[])
+    assert not claims.settle(late, result(values=[1.0], fate="finished"))
+    assert claims.release("late") == 0
+    assert claims.all() == before
+    assert claims.settle(heir, result("PRUNED", fate="collapsed"))
+    assert not claims.settle(late, result(values=[1.0]))
+    assert claims.all()[0].result.state == "PRUNED"
+
+
+def test_the_next_owner_gets_what_the_earlier_one_recorded(claims):
+    first = claims.claim("first", 1, 0.0)
+    runs = [{"seed": 1, "run_dir": "runs/ä", "status": "running", "value": None}]
+    assert claims.record(first, trial_id=3)
+    assert claims.record(first, runs=runs)
+    heir = claims.claim("heir", 1, HOUR_S)
+    assert (heir.index, heir.attempt, heir.previous_owner) == (0, 2, "first")
+    assert (heir.trial_id, heir.runs) == (3, tuple(runs))
+
+
+def test_an_expired_lease_can_be_renewed_until_it_is_taken_over(claims):
+    claim = claims.claim("slow", 1, 0.0)
+    assert claims.all()[0].expired
+    assert claims.renew(claim, HOUR_S)
+    assert not claims.all()[0].expired
+    assert claims.claim("other", 1, HOUR_S) is None
+
+
+def test_a_lease_expires_by_itself_and_not_before(claims):
+    lease_s = 2.0
+    began = time.monotonic()
+    claim = claims.claim("slow", 1, lease_s)
+    until = time.monotonic() + 60.0
+    while (heir := claims.claim("heir", 1, HOUR_S)) is None:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    assert time.monotonic() - began > 0.95 * lease_s
+    assert (heir.index, heir.attempt) == (claim.index, 2)
+
+
+def test_an_owner_that_claims_again_gets_its_trial_again(claims):
+    """The answer to its first claim was lost with the connection."""
+    first = claims.claim("one", 5, HOUR_S)
+    assert claims.claim("one", 5, HOUR_S) == first
+    assert len(claims.all()) == 1
+
+
+def test_a_second_result_is_accepted_and_the_first_one_stays(claims):
+    claim = claims.claim("one", 1, HOUR_S)
+    first = result(values=[12.5], fate="finished")
+    assert claims.settle(claim, first)
+    assert claims.settle(claim, result("FAIL"))
+    claims.mark_reported(0)
+    assert claims.settle(claim, result("FAIL"))
+    assert not claims.renew(claim, HOUR_S)
+    assert not claims.record(claim, trial_id=1)
+    (stored,) = claims.all()
+    assert (stored.state, stored.result) == ("told", first)
+
+
+def test_a_release_frees_the_trials_of_that_owner_only(claims):
+    for owner in ("gone", "there"):
+        claims.claim(owner, 2, HOUR_S)
+    assert claims.release("gone") == 1
+    assert claims.release("gone") == 0
+    assert [one.expired for one in claims.all()] == [True, False]
+    assert claims.claim("heir", 2, HOUR_S).previous_owner == "gone"
+    assert claims.claim("other", 2, HOUR_S) is None
+
+
+def test_a_result_waits_until_it_is_reported_to_optuna(claims):
+    claim = claims.claim("one", 2, HOUR_S)
+    claims.settle(claim, result(values=[1.0, 2.0], reason="x" * 70_000))
+    (waiting,) = claims.unreported()
+    assert (waiting.index, waiting.result.values) == (0, [1.0, 2.0])
+    assert len(waiting.result.attrs["reason"]) == 70_000
+    claims.mark_reported(0)
+    claims.mark_reported(0)
+    assert claims.unreported() == []
+    assert claims.is_done(1)
+    assert not claims.is_done(2)
+
+
+def test_a_finished_trial_is_never_claimed_again_and_the_total_may_change(claims):
+    _settle_all(claims, 3)
+    assert claims.claim("late", 3, HOUR_S) is None
+    assert claims.claim("late", 5, 0.0).index == 3
+    assert claims.claim("next", 3, HOUR_S) is None, "beyond the total nothing is taken over"
+    _settle_all(claims, 5)
+    assert [one.index for one in claims.all()] == [0, 1, 2, 3, 4]
+
+
+def test_studies_of_one_database_share_no_claim(engine, claims):
+    other = TrialClaims(engine, "other")
+    mine, its = claims.claim("one", 1, HOUR_S), other.claim("one", 1, HOUR_S)
+    assert (mine.index, its.index) == (0, 0)
+    assert other.settle(its, result("FAIL"))
+    assert not claims.is_done(1)
+    assert claims.renew(mine, HOUR_S)
+
+
+def test_progress_stays_until_the_next_one(claims):
+    claim = claims.claim("one", 1, HOUR_S)
+    assert claims.renew(claim, HOUR_S, {"completion": 12.5})
+    assert claims.renew(claim, HOUR_S)
+    assert claims.all()[0].progress == {"completion": 12.5}
+
+
+def test_kills_in_the_middle_of_claiming_lose_and_double_no_trial(url, claims, race):
+    total = 20
+    racers = race("claim", url, THREE, total, HOUR_S)
+    for number in (0, 1):
+        time.sleep(random.uniform(0.0, 0.05))
+        racers[number].kill()
+    printed = {int(line.split()[0]) for lines in racers.lines() for line in lines if line.count(" ") == 3}
+    found = claims.all()
+    assert [one.index for one in found] == list(range(total)), "the one that lives has claimed the rest"
+    assert printed <= {one.index for one in found}
+    for one in found:
+        assert claims.release(one.owner) == 1
+    _settle_all(claims, total)
+    assert [(one.index, one.attempt, one.state) for one in claims.all()] == [
+        (index, 2, "settled") for index in range(total)
+    ]

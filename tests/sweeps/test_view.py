@@ -1,0 +1,76 @@
+"""The view of a sweep in a terminal."""
+
+import io
+from types import SimpleNamespace
+
+from rich.console import Console
+
+from sweeps.claims import Claim, TrialResult
+from sweeps.view import SweepView
+
+CONFIG = SimpleNamespace(trials=4, objectives=("race_score",))
+WORKER_CONFIG = SimpleNamespace(study="spring", config=CONFIG, folder="runs/spring")
+
+
+def claim(number, outcome=None, values=None, share=0.0, params=None, **attrs):
+    progress = {"number": number, "env_steps": 8192, "completion": 51.0, "entropy": 2.31}
+    progress |= {"share": share, "params": params or {}}
+    result = outcome and TrialResult(state=outcome, values=values, attrs={"number": number, **attrs})
+    return Claim(
+        index=number, attempt=1, owner="host:1:a", previous_owner=None, state="told" if outcome else "claimed",
+        result=result, trial_id=number, runs=(), progress=progress, expired=False,
+    )  # fmt: skip
+
+
+def shown(claims, is_terminal=True, first=(), after_s=0.0):
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=is_terminal, width=100, height=30, color_system=None)
+    with SweepView(WORKER_CONFIG, 2, console) as view:
+        view.show(first)
+        view._began -= after_s
+        view.show(claims)
+    return text.getvalue()
+
+
+ENDED = [
+    claim(0, "COMPLETE", [8.25], fate="converged", env_steps=8192, lap_time_s=8.1, completion=98.0),
+    claim(1, "PRUNED", None, fate="collapsed", env_steps=4096, reason="collapsed: entropy 0.01"),
+]
+
+
+def test_it_counts_trials_by_outcome_and_names_the_best():
+    view = shown([*ENDED, claim(2)])
+    for words in ("2 of 4: 1 done, 1 pruned, 0 failed", "trial 0, race score 8.25 s", "8,192", "51 %"):
+        assert words in view
+
+
+def test_the_time_left_is_estimated_from_the_pace_of_this_start_only():
+    assert "min left" in shown([*ENDED, claim(2)], after_s=600)
+    assert "not known yet" in shown([*ENDED, claim(2)], first=[*ENDED, claim(2)], after_s=600)
+    # Two of four were there; half of the third in ten minutes: thirty for the rest.
+    half = claim(2, share=0.5)
+    assert "about 30 min left" in shown([*ENDED, half], first=ENDED, after_s=600)
+
+
+def test_it_shows_the_values_of_a_trial_from_its_start_on():
+    params = {"algorithm.lr": 0.00031234, "network": "mlp_small"}
+    begun = claim(2)
+    begun.progress.clear()
+    begun.progress.update(number=2, params=params, share=0.0)
+    for view in (shown([begun]), shown([claim(2, params=params)])):
+        assert "lr 0.000312" in view
+        assert "mlp_small" in view
+
+
+def test_before_the_first_trial_it_says_that_workers_start():
+    assert "workers start" in shown([])
+
+
+def test_without_a_terminal_each_trial_that_ends_is_a_line():
+    lines = shown(ENDED, is_terminal=False).splitlines()
+    assert lines[0] == "spring: 4 trials, 2 workers; runs in runs/spring"
+    assert lines[1].startswith("trial 0 done (converged) after 8,192 steps: race score 8.25 s")
+    assert lines[2].startswith(
+        "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01; 2 of 4, about"
+    )
+    assert len(lines) == 3

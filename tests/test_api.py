@@ -1,0 +1,53 @@
+"""What the commands do can be done from Python, without private names."""
+
+import subprocess
+import sys
+
+import torch
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+
+from deepracer_exp import Callback, compose, evaluate, load_policy, make_env, read_run, train
+
+TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
+
+
+class StopsAfterTwo(Callback):
+    """Adds a column to the metrics, and ends the run."""
+
+    def on_iteration_end(self, trainer):
+        trainer.row["twice"] = 2 * trainer.iteration
+        if trainer.iteration == 2:
+            trainer.request_stop("two are enough")
+
+
+def test_an_experiment_is_trained_with_an_own_callback_raced_and_read(tmp_path):
+    experiment = compose(*TINY, f"runs_dir={tmp_path}", "algorithm.lr=1e-3")
+    assert experiment.config.algorithm.lr == 1e-3
+    result = train(experiment, callbacks=[StopsAfterTwo()])
+    assert (result.status, result.reason, result.exit_code) == ("finished", "two are enough", 0)
+
+    run = read_run(result.folder)
+    assert run.metrics["twice"].tolist() == [2, 4]
+    assert run.summary["iteration"] == 2
+    assert len(run.steps) == run.metrics["env_steps"].iloc[-1]
+    assert run.config["algorithm"]["lr"] == 1e-3
+
+    evaluation = evaluate(result.folder, "checkpoint=last", "evaluation.trials=1", "evaluation.held_out=null")
+    assert 0 <= evaluation.groups[0].completion <= 100
+    assert list(result.folder.glob("evaluations/*.json"))
+
+
+def test_a_stored_policy_drives_the_environment(trained):
+    run = trained()
+    env = make_env(compose(*TINY), n_cars=3)
+    check_env_specs(env)
+    policy = load_policy(run.folder, "last")
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        first, second = (env.rollout(5, policy, auto_reset=True)["action"] for _ in range(2))
+    assert first.shape[:2] == (3, 5)
+    assert first.dtype == second.dtype == torch.int64
+
+
+def test_importing_the_package_imports_no_torch():
+    code = "import sys, deepracer_exp, deepracer_exp.cli; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

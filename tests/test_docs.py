@@ -1,0 +1,176 @@
+"""README and docs agree with the program."""
+
+import importlib.util
+import json
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from deepracer_exp.cli import parse
+from deepracer_exp.commands.arguments import runs_and_overrides
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment, compose_export, expand_grid
+from deepracer_exp.config.options import conf_dir, groups, options
+from deepracer_exp.config.sweep import compose_sweep
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+GENERATED = {"commands.md", "configuration.md"}
+
+
+def _reference():
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_readme_has_at_most_120_lines():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_linked_file_exists(page):
+    for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if not link.startswith("http") and link not in GENERATED:
+            assert (page.parent / link).is_file(), link
+
+
+@pytest.mark.parametrize("group", groups())
+def test_the_configuration_page_has_every_option_of_a_group(group):
+    page = _reference().configuration_page()
+    section = re.split(r"^## ", page.split(f"\n## {group}\n")[1], flags=re.MULTILINE)[0]
+    assert set(options(group)) <= set(re.findall(r"`(\w+)`", section))
+
+
+def test_the_configuration_page_has_every_group_with_its_default_in_bold():
+    page = _reference().configuration_page()
+    defaults = yaml.safe_load((conf_dir() / "train.yaml").read_text(encoding="utf-8"))["defaults"]
+    chosen = {
+        group: option for entry in defaults if isinstance(entry, dict) for group, option in entry.items()
+    }
+    assert sorted(chosen) == groups()
+    for group, option in chosen.items():
+        assert option is None or f"**`{option}`**" in page.split(f"\n## {group}\n")[1].split("\n## ")[0]
+
+
+def test_the_page_of_commands_has_every_command():
+    headings = set(re.findall(r"^## (.+)$", _reference().commands_page(), re.MULTILINE))
+    assert {"train", "evaluate", "runs compare", "runs clean", "sweep", "stopping replay", "ui"} <= headings
+
+
+def test_the_site_lists_every_page():
+    listed = re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted({path.name for path in (ROOT / "docs").glob("*.md")} | GENERATED)
+
+
+def test_the_picture_of_the_layers_shows_those_that_are_checked():
+    contract = re.search(
+        r"^layers = \[(.*?)^\]", (ROOT / "pyproject.toml").read_text(), re.DOTALL | re.MULTILINE
+    )
+    rows = [re.findall(r"\w+", row) for row in re.findall(r'"(.*)"', contract.group(1))]
+    packages = [[name for name in row if (ROOT / "deepracer_exp" / name).is_dir()] for row in rows]
+    drawn = re.findall(r'font-weight="bold"[^>]*>(\w+)<', (ROOT / "docs/images/layers.svg").read_text())
+    shown = [name for name in drawn if (ROOT / "deepracer_exp" / name).is_dir()]
+    assert sorted(shown) == sorted(name for row in packages for name in row)
+    position = {name: index for index, row in enumerate(packages) for name in row}
+    assert [position[name] for name in shown] == sorted(position[name] for name in shown)
+
+
+def _commands():
+    """Return every command that a page shows in a block of code, without its comment; each once."""
+    shown = {}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8").replace("\\\n", "")
+        for line in re.findall(r"^(?:    |\$ )?(deepracer-exp .*)$", text, re.MULTILINE):
+            words = shlex.split(line, comments=True)
+            if "..." not in words and "COMMAND" not in words:
+                shown.setdefault(tuple(words[1:]), page.name)
+    return [pytest.param(words, id=f"{page}: {shlex.join(words)}") for words, page in shown.items()]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a working folder with the files that the commands name, among them those of docs/extending.md."""
+    folder = tmp_path_factory.mktemp("docs")
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    for name, content in re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', page, re.DOTALL | re.MULTILINE):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+    for name in ("DIR", "model_1", "model_2"):
+        (folder / name).mkdir()
+        (folder / name / "reward_function.py").write_text(
+            "SPEED = 1\n\ndef reward_function(params):\n    return SPEED * params['speed']\n",
+            encoding="utf-8",
+        )
+    actions = {"action_space": [{"steering_angle": 0, "speed": 1}], "action_space_type": "discrete"}
+    (folder / "model_metadata.json").write_text(json.dumps(actions), encoding="utf-8")
+    np.save(folder / "my_route.npy", np.array([[np.cos(t), np.sin(t)] * 3 for t in np.linspace(0, 6, 50)]))
+    options = folder / "conf" / "experiment"
+    (options / "my_model.yaml").write_text("# @package _global_\nname: my_model\n", encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("words", _commands())
+def test_every_command_shown_is_accepted(words, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("HOME", str(folder))
+    words = [re.sub(r"~/deepracer-for-cloud/custom_files", "DIR", word) for word in words]
+    words = [word.replace("track=NAME", "track=Oval_track") for word in words]
+    args = parse(words)
+    if words[0] == "train":
+        for overrides in expand_grid(args.overrides) if args.multirun else [args.overrides]:
+            compose_experiment(overrides)
+    elif words[0] == "validate":
+        compose_experiment([word for word in args.overrides if not word.startswith("trial=")])
+    elif words[0] == "evaluate":
+        compose_evaluation([*runs_and_overrides(args)[1], "run=RUN"])
+    elif words[0] == "export":
+        compose_export([*runs_and_overrides(args)[1], "run=RUN"])
+    elif words[0] == "sweep" and args.overrides[0] not in ("report", "best"):
+        compose_sweep(args.overrides)
+
+
+def _examples():
+    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    return re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", _examples(), ids=lambda example: example.split("\n")[0])
+def test_every_python_example_runs(example, tmp_path):
+    done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_example_of_a_batched_reward_pays_what_the_scalar_one_pays(folder):
+    module = runpy.run_path(str(folder / "my_fast_reward.py"))
+    batch = {"all_wheels_on_track": np.array([True, False]), "speed": np.array([2.0, 3.0])}
+    each = [
+        module["reward_function"]({key: column[car] for key, column in batch.items()}) for car in range(2)
+    ]
+    assert module["reward_batch"](batch).tolist() == each
+
+
+def _imports():
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    return sorted(set(re.findall(r"^ *((?:from|import) deepracer_exp.*?)(?: *#.*)?$", text, re.MULTILINE)))
+
+
+@pytest.mark.parametrize("line", _imports())
+def test_every_import_shown_works(line):
+    exec(line, {})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_of_ours_that_is_named_exists(page):
+    named = re.findall(
+        r"`((?:deepracer_exp|sweeps|tests|benchmarks|conf|docs)/[\w/.-]+)`", page.read_text("utf-8")
+    )
+    assert [name for name in named if not (ROOT / name).exists()] == []

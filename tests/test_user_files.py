@@ -1,0 +1,58 @@
+"""The one reader of files that a user gave."""
+
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.config.driving import RewardConfig
+from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
+from deepracer_exp.deepracer.model_metadata import read_model_metadata
+from deepracer_exp.deepracer.routes import read_knots, read_route
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_yaml
+from deepracer_exp.rewards.source import load_reward_source
+from deepracer_exp.runs.files import read_config, read_metrics
+from deepracer_exp.runs.resolve import read_best_of_sweep
+from tests.hostile_files import KINDS, PLACES, make
+
+
+def _reward(path: Path) -> object:
+    return load_reward_source(RewardConfig(name="mine", file=str(path), constants={}, time_limit_s=1.0))
+
+
+READERS = {
+    "my.npy": read_route,
+    "my.yaml": read_knots,
+    "hyperparameters.json": read_hyperparameters,
+    "model_metadata.json": read_model_metadata,
+    "reward.py": _reward,
+    "config.yaml": lambda path: read_config(path.parent),
+    "metrics.jsonl": read_metrics,
+    "best_of_sweep.json": lambda path: read_best_of_sweep(path.parent),
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", READERS)
+def test_whatever_a_file_is_its_reader_takes_it_or_names_it_in_one_line(tmp_path, name, kind):
+    path = make(kind, tmp_path / name)
+    complaint = None
+    try:
+        READERS[name](path)
+    except BadInput as error:
+        complaint = str(error)
+    if complaint is None:
+        assert kind not in PLACES or kind == "missing"
+    else:
+        assert str(path) in complaint
+        assert complaint.isprintable()
+
+
+def test_aliases_count_each_time_and_may_be_used(tmp_path):
+    path = tmp_path / "my.yaml"
+    path.write_text("a: &a [1, 2]\nb: *a\nc: [*a, *a]\n")
+    assert read_yaml(path, "YAML")["c"] == [[1, 2], [1, 2]]
+    path.write_text("a: &a [" + "1, " * 400 + "]\nb: &b [" + "*a, " * 400 + "]\nc: *b\n")
+    with pytest.raises(BadInput, match="more than 100,000 values"):
+        read_yaml(path, "YAML")

@@ -1,0 +1,120 @@
+"""Runs recorded by TensorBoard and Weights & Biases."""
+
+import json
+import struct
+
+import pytest
+
+from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
+from deepracer_exp.tracking.loggers import TENSORBOARD, WANDB, open_tracker
+from deepracer_exp.tracking.metrics import METRICS, metric_name
+from deepracer_exp.tracking.tracker import Tracker
+
+ROWS = [
+    {"env_steps": 100 * k, "wall_clock_s": 2.0 * k, "mean_return": float(k), "eval_lap_time_s": None}
+    for k in (1, 2, 3)
+]
+
+
+def record(tracker: Tracker, identity, rows, safe: int, status="FINISHED") -> None:
+    tracker.start("progress_gain s1", "tiny", {"seed": 1}, {"reward": "progress_gain"}, identity)
+    for row in rows:
+        tracker.log(row, step=row["env_steps"])
+    tracker.safe_until(safe)
+    tracker.set_tag("end", "finished: budget")
+    tracker.finish(status)
+
+
+def scalars(folder):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}, events
+
+
+def test_tensorboard_has_the_metrics_under_their_names_in_mlflow(identity, tmp_path):
+    pytest.importorskip("tensorboard")
+    record(open_tracker(TensorBoardTracking(kind="tensorboard"), tmp_path), identity, ROWS, 0)
+    found, events = scalars(tmp_path / TENSORBOARD)
+    assert found == {
+        "train/mean_return": [(100, 1.0), (200, 2.0), (300, 3.0)],
+        "time/wall_clock_s": [(100, 2.0), (200, 4.0), (300, 6.0)],
+    }
+    texts = {tag.removesuffix("/text_summary") for tag in events.Tags()["tensors"]}
+    assert texts == {"parameters", "reward", "end"}
+
+
+def test_a_resumed_run_has_each_row_once_in_tensorboard(identity, tmp_path):
+    pytest.importorskip("tensorboard")
+    killed = open_tracker(TensorBoardTracking(kind="tensorboard"), tmp_path)
+    killed.start("progress_gain s1", "tiny", {"seed": 1}, {}, identity)
+    for row in ROWS:
+        killed.log(row, step=row["env_steps"])
+    killed.finish("KILLED")
+    other = {**ROWS[2], "mean_return": 7.0}
+    record(open_tracker(TensorBoardTracking(kind="tensorboard"), tmp_path), identity, [*ROWS[:2], other], 300)
+    found, _ = scalars(tmp_path / TENSORBOARD)
+    assert found["train/mean_return"] == [(100, 1.0), (200, 2.0), (300, 7.0)]
+
+
+def read_wandb(folder) -> list[dict[str, float]]:
+    """Return the rows of an offline run, whose file is a LevelDB log behind seven bytes."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    (file,) = folder.glob("offline-run-*/*.wandb")
+    data, at, rows, content = file.read_bytes(), 7, [], b""
+    while at + 7 < len(data):
+        if 32768 - at % 32768 < 7:  # no header fits into the rest of the block
+            at += 32768 - at % 32768
+            continue
+        _, length, part = struct.unpack_from("<IHB", data, at)
+        if at + 7 + length > len(data):
+            break
+        content += data[at + 7 : at + 7 + length]
+        at += 7 + length
+        if part in (1, 4):  # whole, or the last part
+            message = Record.FromString(content)
+            content = b""
+            if message.HasField("history"):
+                items = message.history.item
+                rows.append({item.key or item.nested_key[0]: json.loads(item.value_json) for item in items})
+    return rows
+
+
+def test_wandb_has_only_rows_that_a_checkpoint_covers_and_each_once(identity, tmp_path, wait_until):
+    pytest.importorskip("wandb")
+    config = WandbTracking(kind="wandb", project="deepracer-exp", entity=None, mode="offline")
+    for status, steps in (("KILLED", [100, 200]), ("FINISHED", [100, 200, 300])):
+        record(open_tracker(config, tmp_path), identity, ROWS, 200, status)
+        # W&B's own process may still be writing.
+        wait_until(lambda steps=steps: len(read_wandb(tmp_path / WANDB)) >= len(steps))
+        rows = read_wandb(tmp_path / WANDB)
+        assert [row["_step"] for row in rows] == steps
+        assert [row["train/mean_return"] for row in rows] == [step / 100 for step in steps]
+        assert "race/lap_time_s" not in rows[0]
+
+
+@pytest.mark.parametrize("kind", [TENSORBOARD, WANDB])
+def test_a_missing_package_is_one_line_that_names_the_extra(call, kind, monkeypatch):
+    import importlib.util
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *a: None if name == kind else find(name, *a)
+    )
+    ended = call("train", "experiment=tiny", f"tracking={kind}")
+    ended.assert_bad_input(f"tracking={kind}", f"pip install 'deepracer-exp[{kind}]'")
+    assert not list(ended.cwd.glob("runs/*/*"))
+
+
+def test_a_training_writes_its_curves_for_tensorboard(call):
+    pytest.importorskip("tensorboard")
+    ended = call("train", "experiment=tiny", "tracking=tensorboard", "budget.iterations=2")
+    assert ended.code == 0, ended.stderr
+    found, _ = scalars(ended.folder / TENSORBOARD)
+    rows = [json.loads(line) for line in (ended.folder / "metrics.jsonl").read_text().splitlines()]
+    steps = [row["env_steps"] for row in rows]
+    assert [step for step, _ in found[metric_name("entropy")]] == steps
+    assert found.keys() & {name for name, _ in METRICS.values()} == found.keys()
+    assert not (ended.folder / "tracking.json").exists()

@@ -1,0 +1,99 @@
+"""Own callbacks: they end a run, add to it, or find that another process has taken it over."""
+
+import json
+
+import pytest
+
+from benchmarks.same import different_rows, different_tensors
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.runs.folder import RunFolder, is_held
+from deepracer_exp.training.run import copy_run, resume, train
+from deepracer_exp.training.trainer import STOPPED_EARLY, Callback, TakenOver
+
+TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "checkpoints.every=2")
+
+
+class At(Callback):
+    """Calls a function after an iteration."""
+
+    def __init__(self, iteration, do):
+        self.iteration, self.do, self.dir = iteration, do, None
+
+    def on_run_created(self, trainer):
+        self.dir = trainer.folder.path
+
+    def on_iteration_end(self, trainer):
+        if trainer.iteration == self.iteration:
+            self.do(trainer)
+
+
+def take_away(trainer):
+    raise TakenOver
+
+
+def run(folder, callback, *overrides, **options):
+    experiment, composition = compose_experiment([*TINY, f"runs_dir={folder}", *overrides])
+    return train(experiment, composition, callbacks=[callback] if callback else (), **options)
+
+
+def test_a_run_that_a_callback_stops_early_keeps_a_best_policy(tmp_path):
+    callback = At(3, lambda trainer: trainer.request_stop("median: slower than the others", STOPPED_EARLY))
+    outcome = run(tmp_path, callback)
+    assert (outcome.status, outcome.reason) == ("hopeless", "median: slower than the others")
+    rows = read_metrics(outcome.folder / "metrics.jsonl")
+    assert [row["eval_completion"] is not None for row in rows] == [False, True, True]
+    assert (outcome.folder / "checkpoints" / "best").exists()
+
+
+def test_nothing_is_written_of_a_run_once_it_was_taken_over(tmp_path):
+    callback = At(3, take_away)
+    with pytest.raises(TakenOver):
+        run(tmp_path, callback)
+    assert [row["iteration"] for row in read_metrics(callback.dir / "metrics.jsonl")] == [1, 2]
+    assert not (callback.dir / "summary.json").exists()
+    assert not is_held(callback.dir)
+
+
+def test_a_copy_continues_as_the_run_would_have_while_its_folder_is_held(tmp_path):
+    callback = At(3, take_away)
+    with pytest.raises(TakenOver):
+        run(tmp_path / "cut", callback)
+    holder = RunFolder(callback.dir)
+    assert is_held(callback.dir)
+    copy = copy_run(callback.dir, 2)
+    assert copy.name == f"{callback.dir.name}-attempt2"
+    outcome = resume(copy, [])
+    assert outcome.status == "finished"
+    whole = run(tmp_path / "whole", None).folder
+    assert different_rows(*(read_metrics(one / "metrics.jsonl") for one in (whole, copy))) is None
+    assert different_tensors(*(one / "checkpoints" / "last" for one in (whole, copy))) is None
+    assert not (callback.dir / "summary.json").exists()
+    holder.release()
+
+
+def test_a_copy_of_a_copy_has_one_attempt_in_its_name(tmp_path):
+    first = run(tmp_path, None).folder
+    assert copy_run(copy_run(first, 2), 3).name == f"{first.name}-attempt3"
+
+
+def test_a_copy_is_another_run_of_mlflow(tmp_path):
+    outcome = run(tmp_path, None, "tracking=mlflow", run_name="trial 3", tags={"sweep.trial": "3"})
+    before = json.loads((outcome.folder / "tracking.json").read_text())
+    after = json.loads((copy_run(outcome.folder, 2) / "tracking.json").read_text())
+    assert before["run_id"]
+    assert before["tags"]["sweep.trial"] == "3"
+    assert before["run_name"] == "trial 3"
+    assert after["run_id"] is None
+    assert after["tags"]["run_dir"].endswith("-attempt2")
+    assert {**after["tags"], "run_dir": ""} == {**before["tags"], "run_dir": ""}
+
+
+def test_a_callback_adds_a_column_to_the_metrics(tmp_path):
+    outcome = run(tmp_path, At(2, lambda trainer: trainer.row.update(mine=1.5)))
+    assert [row.get("mine") for row in read_metrics(outcome.folder / "metrics.jsonl")] == [
+        None,
+        1.5,
+        None,
+        None,
+    ]
