@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from deepracer_exp.runs.clean import Removable, StoreOverview
     from deepracer_exp.runs.files import RunRecord
-    from deepracer_exp.tracking.cleaning import Overview, Removable
 
 _LIST = "list"
 _EPILOG = """\
@@ -222,7 +222,7 @@ def _promote(args: argparse.Namespace) -> int:
 
 
 def _clean(args: argparse.Namespace) -> int:
-    from deepracer_exp.tracking.cleaning import remove, survey, total
+    from deepracer_exp.runs.clean import remove, survey, total
 
     stores = read_stores(args.overrides)
     runs_dir = stores.runs_dir
@@ -251,16 +251,16 @@ def _clean(args: argparse.Namespace) -> int:
     return 0
 
 
-def _overview(uri: str | None, runs_dir: Path) -> "tuple[Overview | None, str | None]":
+def _overview(uri: str | None, runs_dir: Path) -> "tuple[StoreOverview | None, str | None]":
     """Ask MLflow if there is a store; return what it knows, or what is skipped because it does not answer."""
-    from deepracer_exp.tracking.cleaning import look_over
+    from deepracer_exp.tracking.registry import read_overview
     from deepracer_exp.tracking.store import has_store, resolve_store
 
     if not has_store(uri, runs_dir):
         return None, None
     resolve_store(uri, runs_dir)  # an unusable address is bad input, not a store that does not answer
     try:
-        return look_over(uri, runs_dir), None
+        return read_overview(uri, runs_dir), None
     except BadInput as error:
         return None, f"{error}; runs deleted there, and checkpoints of runs recorded there, are left out"
 
@@ -268,17 +268,17 @@ def _overview(uri: str | None, runs_dir: Path) -> "tuple[Overview | None, str | 
 def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Console") -> None:
     from rich.table import Table
 
-    from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, total
+    from deepracer_exp.runs.clean import DELETED, FAILED_TRACE, SPARE_CHECKPOINTS, total
 
     if not items:
         return
     table = Table("size", "what", "run", box=None, pad_edge=False)
     table.columns[0].justify = "right"
     for item in items:
-        what = f"{item.what}: {_names(item)}" if item.what == CHECKPOINTS else item.what
+        what = f"{item.what}: {_names(item)}" if item.what == SPARE_CHECKPOINTS else item.what
         table.add_row(_bytes(item.size), what, str(item.run.relative_to(runs_dir)))
     table.add_row()
-    for kind in (CHECKPOINTS, TRACE, DELETED):
+    for kind in (SPARE_CHECKPOINTS, FAILED_TRACE, DELETED):
         of_kind = [item for item in items if item.what == kind]
         if of_kind:
             table.add_row(

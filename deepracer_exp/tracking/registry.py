@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
+from deepracer_exp.runs.clean import StoreOverview
 from deepracer_exp.runs.files import CHECKPOINTS, METRICS, read_metrics, read_run_id
 
 from .metadata import PICTURE, REPORT, picture, race_result
@@ -242,13 +243,24 @@ def _version_of(
     return version
 
 
-def registered_checkpoints(client: "MlflowClient") -> set[tuple[str, str]]:
-    """Return the checkpoints that are versions of a model: names of the run's and the checkpoint's folder."""
-    return {
-        (Path(version.tags[_RUN_DIR]).name, version.tags[_CHECKPOINT])
-        for version in pages(client.search_model_versions)
-        if version.tags.keys() >= {_RUN_DIR, _CHECKPOINT}
-    }
+def read_overview(uri: str | None, runs_dir: Path) -> StoreOverview:
+    """Read which runs a store has, which of them were deleted, and which checkpoints are registered.
+
+    Raises:
+        BadInput: the store does not answer.
+    """
+    with open_client("MLflow", uri, runs_dir) as client:
+        from mlflow.entities import ViewType
+
+        experiments = [one.experiment_id for one in pages(client.search_experiments, view_type=ViewType.ALL)]
+        runs = pages(client.search_runs, experiment_ids=experiments, run_view_type=ViewType.ALL)
+        deleted = {run.info.run_id: run.info.lifecycle_stage != "active" for run in runs}
+        registered = {
+            (Path(version.tags[_RUN_DIR]).name, version.tags[_CHECKPOINT])
+            for version in pages(client.search_model_versions)
+            if version.tags.keys() >= {_RUN_DIR, _CHECKPOINT}
+        }
+    return StoreOverview(deleted, registered)
 
 
 def _registered(what: str, version: Any, alias: str) -> Registered:

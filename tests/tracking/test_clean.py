@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from deepracer_exp.runs.checkpoint_files import pin
-from deepracer_exp.tracking.cleaning import CHECKPOINTS, DELETED, TRACE, look_over, remove, survey
-from deepracer_exp.tracking.registry import promote
+from deepracer_exp.runs.clean import DELETED, FAILED_TRACE, SPARE_CHECKPOINTS, remove, survey
+from deepracer_exp.tracking.registry import promote, read_overview
 
 from .conftest import FEATURES
 
@@ -38,7 +38,7 @@ def age(run: Path, seconds: float) -> None:
 
 def test_checkpoints_that_are_neither_best_nor_last_can_go(season):
     season.run("1")
-    assert listed(season) == [("1", CHECKPOINTS, ["000010"])]
+    assert listed(season) == [("1", SPARE_CHECKPOINTS, ["000010"])]
 
 
 def test_pinned_and_cloned_from_checkpoints_stay(season):
@@ -52,7 +52,7 @@ def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp
     season.clone("2", season.run("1"), checkpoint="000010")
     season.runs_dir.rename(tmp_path / "moved")
     season.runs_dir = tmp_path / "moved"
-    assert listed(season) == [("2", CHECKPOINTS, ["000010"])]
+    assert listed(season) == [("2", SPARE_CHECKPOINTS, ["000010"])]
 
 
 def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
@@ -61,38 +61,38 @@ def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, clien
     promote(run, "10", "model", "champion", FEATURES, None, season.runs_dir)
     (run / "checkpoints" / "pinned.json").unlink()
     client.delete_registered_model_alias("model", "champion")
-    assert listed(season, look_over(None, season.runs_dir)) == []
+    assert listed(season, read_overview(None, season.runs_dir)) == []
 
 
 def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(season, client):
     season.recorded(season.run("1"), client)
     season.run("2")
-    assert listed(season) == [("2", CHECKPOINTS, ["000010"])]
+    assert listed(season) == [("2", SPARE_CHECKPOINTS, ["000010"])]
     assert "tracking.uri" in kept(season)["1"]
-    assert len(listed(season, look_over(None, season.runs_dir))) == 2
+    assert len(listed(season, read_overview(None, season.runs_dir))) == 2
     (season.runs_dir / "season" / "1" / "tracking.json").write_text(json.dumps({"run_id": "0" * 32}))
-    assert len(listed(season, look_over(None, season.runs_dir))) == 1
+    assert len(listed(season, read_overview(None, season.runs_dir))) == 1
 
 
 def test_traces_of_failed_runs_can_go_and_of_no_others(season):
     for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", "hopeless")):
         shutil.rmtree(season.run(name, status=status) / "checkpoints")
-    assert listed(season) == [("2", TRACE, ["trace"])]
+    assert listed(season) == [("2", FAILED_TRACE, ["trace"])]
 
 
 def test_a_run_deleted_in_mlflow_can_go_whole_and_an_active_one_cannot(season, client):
     ids = [season.recorded(season.run(name), client) for name in ("1", "2")]
     client.delete_run(ids[0])
-    assert listed(season, look_over(None, season.runs_dir)) == [
+    assert listed(season, read_overview(None, season.runs_dir)) == [
         ("1", DELETED, ["1"]),
-        ("2", CHECKPOINTS, ["000010"]),
+        ("2", SPARE_CHECKPOINTS, ["000010"]),
     ]
 
 
 def test_runs_of_a_deleted_experiment_can_go(season, client):
     season.recorded(season.run("1"), client)
     client.delete_experiment(client.get_experiment_by_name("season").experiment_id)
-    assert listed(season, look_over(None, season.runs_dir)) == [("1", DELETED, ["1"])]
+    assert listed(season, read_overview(None, season.runs_dir)) == [("1", DELETED, ["1"])]
 
 
 def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
@@ -102,7 +102,7 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
     promote(registered, "best", "model", "champion", FEATURES, None, season.runs_dir)
     for run_id in ids:
         client.delete_run(run_id)
-    overview = look_over(None, season.runs_dir)
+    overview = read_overview(None, season.runs_dir)
     assert [item for item in listed(season, overview) if item[1] == DELETED] == []
     assert kept(season, overview)["1"] == "deleted in MLflow, but needed: 000020 cloned to 3"
     assert kept(season, overview)["2"] == "deleted in MLflow, but needed: 000020 registered as model"
@@ -114,7 +114,7 @@ def test_a_run_that_a_training_holds_stays_until_it_lets_go(season):
         fcntl.flock(held, fcntl.LOCK_EX)
         assert listed(season) == []
         assert kept(season) == {"1": "a training is running in it"}
-    assert [what for _, what, _ in listed(season)] == [CHECKPOINTS, TRACE]
+    assert [what for _, what, _ in listed(season)] == [SPARE_CHECKPOINTS, FAILED_TRACE]
 
 
 def test_a_run_without_an_end_stays_for_an_hour_after_its_last_sign(season):
@@ -124,7 +124,7 @@ def test_a_run_without_an_end_stays_for_an_hour_after_its_last_sign(season):
     age(run, HOUR_S - 120)
     assert listed(season) == []
     age(run, 240)
-    assert listed(season) == [("1", CHECKPOINTS, ["000010"])]
+    assert listed(season) == [("1", SPARE_CHECKPOINTS, ["000010"])]
     (run / "metrics.jsonl").write_text("{}\n")
     assert listed(season) == []
 

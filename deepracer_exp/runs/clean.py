@@ -1,0 +1,194 @@
+"""Find and remove what is no longer needed in run folders."""
+
+import os
+import shutil
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from deepracer_exp.errors import BadInput, RunFailed
+
+from .checkpoint_files import LINKS, kept_checkpoints, pinned, verify
+from .files import (
+    CHECKPOINTS,
+    CONFIG,
+    LINEAGE,
+    OVERRIDES,
+    PROVENANCE,
+    SUMMARY,
+    TRACE,
+    read_object,
+    read_run_id,
+)
+from .folder import RunFolder, is_held
+from .lineage import read_lineage
+
+SPARE_CHECKPOINTS = "checkpoints neither best nor last"
+FAILED_TRACE = "trace of a failed run"
+DELETED = "run deleted in MLflow"
+
+_IDLE_S = 3600.0
+"""A run without a summary that changed more recently may be training on another machine."""
+_UNKNOWN = (
+    "recorded in a store that was not read, where a checkpoint may be registered: give it as tracking.uri=URI"
+)
+
+
+@dataclass(frozen=True)
+class StoreOverview:
+    """The runs and registered checkpoints of an MLflow store."""
+
+    deleted: dict[str, bool]
+    """Whether each run, by id, was deleted there."""
+    registered: set[tuple[str, str]]
+    """Checkpoints that are versions of a model: names of the run's and the checkpoint's folder."""
+
+
+@dataclass(frozen=True)
+class Removable:
+    """Something that may be removed."""
+
+    run: Path
+    what: str
+    """SPARE_CHECKPOINTS, FAILED_TRACE or DELETED."""
+    paths: tuple[Path, ...]
+    size: int
+    """Bytes."""
+
+
+@dataclass(frozen=True)
+class Removables:
+    """Result of a search."""
+
+    removable: list[Removable] = field(default_factory=list)
+    kept: list[tuple[Path, str]] = field(default_factory=list)
+    """Runs with something that must be kept for now, and why."""
+
+
+def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
+    """Find what may be removed; nothing is changed.
+
+    Args:
+        runs_dir: where runs are.
+        overview: what MLflow knows; None: it was not read, and nothing of a run that is recorded there goes but its
+            trace.
+
+    Raises:
+        BadInput: a file that says what must be kept cannot be read.
+    """
+    found = Removables()
+    try:
+        wanted = _cloned_from(runs_dir)
+        for folder, name in () if overview is None else sorted(overview.registered):
+            wanted[folder].setdefault(name, "registered")
+        for run in _own_runs(runs_dir):
+            _search(run, wanted[run.name], overview, found)
+    except OSError as error:
+        raise BadInput(f"{error.filename}: cannot be read: {error.strerror}; nothing is removed") from error
+    return found
+
+
+def remove(item: Removable) -> bool:
+    """Remove it and return True, unless a training or a pin came meanwhile.
+
+    Raises:
+        RunFailed: it cannot be removed.
+    """
+    try:
+        folder = RunFolder(item.run)
+    except BadInput:
+        return False
+    try:
+        pins = pinned(item.run / CHECKPOINTS)
+        if (pins and item.what == DELETED) or pins.keys() & {path.name for path in item.paths}:
+            return False
+        for path in item.paths:
+            shutil.rmtree(path)
+        return True
+    except OSError as error:
+        raise RunFailed(f"{error.filename}: cannot be removed: {error.strerror}") from error
+    finally:
+        folder.release()
+
+
+def total(items: Sequence[Removable]) -> int:
+    """Return the total size in bytes."""
+    return sum(item.size for item in items)
+
+
+def _search(run: Path, wanted: dict[str, str], overview: StoreOverview | None, found: Removables) -> None:
+    if reason := _in_progress(run):
+        found.kept.append((run, reason))
+        return
+    run_id = read_run_id(run)
+    pins = wanted | {name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()}
+    if overview is not None and run_id is not None and overview.deleted.get(run_id):
+        if not pins:
+            found.removable.append(Removable(run, DELETED, (run,), _size(run)))
+            return
+        reasons = ", ".join(f"{name} {why}" for name, why in sorted(pins.items()))
+        found.kept.append((run, f"deleted in MLflow, but needed: {reasons}"))
+    spare = _spare_checkpoints(run, set(pins))
+    is_known = run_id is None or (overview is not None and run_id in overview.deleted)
+    if spare and not is_known:
+        found.kept.append((run, _UNKNOWN))
+    elif spare:
+        try:
+            verify(run / CHECKPOINTS / "last")
+        except BadInput as error:
+            found.kept.append((run, f"its other checkpoints may be needed: {error}"))
+        else:
+            found.removable.append(Removable(run, SPARE_CHECKPOINTS, spare, sum(map(_size, spare))))
+    trace = run / TRACE
+    if read_object(run / SUMMARY).get("status") == "failed" and _is_folder(trace):
+        found.removable.append(Removable(run, FAILED_TRACE, (trace,), _size(trace)))
+
+
+def _own_runs(runs_dir: Path) -> Iterator[Path]:
+    """Return the run folders, without links."""
+    for experiment in sorted(runs_dir.iterdir()):
+        for run in sorted(experiment.iterdir()) if _is_folder(experiment) else ():
+            if _is_folder(run) and all((run / name).is_file() for name in (CONFIG, OVERRIDES, PROVENANCE)):
+                yield run
+
+
+def _cloned_from(runs_dir: Path) -> dict[str, dict[str, str]]:
+    """Return the checkpoints that clones started from, by name of the run's folder."""
+    names: dict[str, dict[str, str]] = defaultdict(dict)
+    for file in runs_dir.glob(f"*/*/{LINEAGE}"):
+        lineage = read_lineage(file.parent)
+        if lineage is not None:
+            names[lineage.parent][lineage.checkpoint] = f"cloned to {file.parent.name}"
+    return names
+
+
+def _spare_checkpoints(run: Path, pins: set[str]) -> tuple[Path, ...]:
+    """Return the checkpoints that are neither best nor last nor pinned."""
+    folder = run / CHECKPOINTS
+    if not _is_folder(folder):
+        return ()
+    needed = {*LINKS, *pins, *(path.readlink().name for path in folder.iterdir() if path.is_symlink())}
+    return tuple(path for path in reversed(kept_checkpoints(folder)) if path.name not in needed)
+
+
+def _in_progress(run: Path) -> str | None:
+    if is_held(run):
+        return "a training is running in it"
+    if (run / SUMMARY).exists():
+        return None
+    newest = max(path.lstat().st_mtime for path in (run, *run.iterdir(), *(run / CHECKPOINTS).glob("*")))
+    idle_s = time.time() - newest
+    return f"has not ended and changed {idle_s / 60:.0f} minutes ago" if idle_s < _IDLE_S else None
+
+
+def _is_folder(path: Path) -> bool:
+    """Return whether it is a folder and not a link, whose target may belong to something else."""
+    return path.is_dir() and not path.is_symlink()
+
+
+def _size(folder: Path) -> int:
+    """Return the bytes of all files below, without following links."""
+    files = (Path(at, name) for at, _, names in os.walk(folder) for name in names)
+    return sum(file.lstat().st_size for file in files)
