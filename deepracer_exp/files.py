@@ -131,15 +131,36 @@ def read_json_as(file: Path, adapter: "TypeAdapter[Content]", writer: str) -> Co
     """
     if not os.path.lexists(file):
         return None
+    accepted = f"what {writer} writes there"
+    return _validated(file, read_bytes(file, accepted), adapter, accepted)
+
+
+def read_yaml_as(path: str | Path, adapter: "TypeAdapter[Content]", accepted: str) -> Content:
+    """Read a YAML file whose keys and types are those of a dataclass.
+
+    Args:
+        path: of the file.
+        adapter: of the dataclass.
+        accepted: what would be, for messages.
+
+    Raises:
+        BadInput: the file cannot be read or holds something else.
+    """
+    content = read_yaml(path, accepted)
+    with reading(path, accepted):
+        raw = json.dumps(content).encode()
+    return _validated(path, raw, adapter, accepted)
+
+
+def _validated(path: str | Path, raw: bytes, adapter: "TypeAdapter[Content]", accepted: str) -> Content:
     from pydantic import ValidationError
 
-    raw = read_bytes(file, f"what {writer} writes there")
     try:
-        return adapter.validate_json(raw, strict=True)
+        return adapter.validate_json(raw, strict=True, extra="forbid")
     except ValidationError as error:
         finding = error.errors(include_url=False)[0]
         where = "".join(f" {part}:" for part in finding["loc"])
-        raise BadInput(f"{file}:{where} {finding['msg']}; accepted: what {writer} writes there") from error
+        raise BadInput(f"{path}:{where} {finding['msg']}; accepted: {accepted}") from error
 
 
 def atomic_write(path: Path, text: str) -> Path:

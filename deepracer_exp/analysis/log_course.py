@@ -13,7 +13,6 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.recording import LogProblem, Recording
-from deepracer_exp.deepracer.routes import read_knots, read_route
 from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.files import CONFIG, read_config
@@ -86,12 +85,8 @@ def catalogue_track(name: str, reversed: bool = False) -> Track:
         BadInput: there is no such course.
     """
     path = Path(name)
-    if path.suffix == ".npy":
-        return Track.from_route(read_route(path), path.stem, reversed=reversed)
-    if path.suffix in (".yaml", ".yml"):
-        course = read_knots(path)
-        shape = course.knots, course.width_m, course.closed
-        return Track.from_knots(*shape, path.stem, title=course.title, reversed=reversed)
+    if path.suffix in (".npy", ".yaml", ".yml"):
+        return Track.from_file(path, reversed)
     if find_world(name) is None:
         raise BadInput(
             f"--track {name}: no such world{nearest(name, worlds())}; accepted: a name that `deepracer-exp tracks` "

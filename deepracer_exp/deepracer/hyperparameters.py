@@ -93,17 +93,17 @@ def read_hyperparameters(
 
     Source of the rules: deepracer-simapp, markov/sagemaker_graph_manager.py.
     """
-    json = JsonObject(path, "a hyperparameters.json", "a JSON object with batch_size, lr, ...", raw)
+    file = JsonObject(path, "a hyperparameters.json", "a JSON object with batch_size, lr, ...", raw)
     values: dict[str, int | float | str] = {}
     given = []
-    for key, value in json.data.items():
+    for key, value in file.data.items():
         try:
             if key in _WHOLE:
-                values[key] = json.whole(key, value, *_WHOLE[key])
+                values[key] = file.whole(key, value, *_WHOLE[key])
             elif key in _NUMBERS:
-                values[key] = json.number(key, value, *_NUMBERS[key])
+                values[key] = file.number(key, value, *_NUMBERS[key])
             elif key in _WORDS:
-                values[key] = json.choice(key, value, _WORDS[key])
+                values[key] = file.choice(key, value, _WORDS[key])
         except BadInput as error:
             if refused is None:
                 raise

@@ -38,42 +38,25 @@ class JsonObject:
         return BadInput(f"{self.path}: {key}: {shown}; accepted: {accepted}")
 
     def choice(self, key: str, value: object, known: Sequence[str], lower: bool = True) -> str:
-        """Return `value` stripped and by default lower-cased, as the service reads it.
-
-        Raises:
-            BadInput: it is not one of `known`.
-        """
-        accepted = ", ".join(known)
-        if not isinstance(value, str):
-            raise self.bad(key, value, accepted)
-        word = value.strip().lower() if lower else value.strip()
+        """Return one of the known words, stripped and by default lower-cased, as the service reads it."""
+        word = value.strip() if isinstance(value, str) else ""
+        word = word.lower() if lower else word
         if word not in known:
-            raise self.bad(key, value, accepted + nearest(word, known))
+            raise self.bad(key, value, ", ".join(known) + nearest(word, known))
         return word
 
     def number(self, key: str, value: object, low: float, high: float, unit: str = "") -> float:
-        """Return a number, which may be written as a string.
-
-        Raises:
-            BadInput: it is not a number from `low` to `high`.
-        """
-        accepted = f"a number from {low:g} to {high:g}{unit}"
-        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-            raise self.bad(key, value, accepted)
+        """Return a number from `low` to `high`, which may be written as a string."""
         try:
-            number = float(value)
-        except (ValueError, OverflowError) as error:
-            raise self.bad(key, value, accepted) from error
-        if not math.isfinite(number) or not low <= number <= high:
-            raise self.bad(key, value, accepted)
+            number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError, OverflowError):
+            number = math.nan
+        if not low <= number <= high:
+            raise self.bad(key, value, f"a number from {low:g} to {high:g}{unit}")
         return number
 
     def whole(self, key: str, value: object, low: int, high: int) -> int:
-        """Return a whole number, which may be written as a string.
-
-        Raises:
-            BadInput: it is not a whole number from `low` to `high`.
-        """
+        """Return a whole number from `low` to `high`, which may be written as a string."""
         number = self.number(key, value, low, high)
         if number != int(number):
             raise self.bad(key, value, f"a whole number from {low} to {high}")

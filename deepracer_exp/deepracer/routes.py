@@ -1,15 +1,16 @@
 """Course files: the service's worlds, its route arrays (.npy), and YAML files of spline knots."""
 
-import math
 import zipfile
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, TypeAdapter
 
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.files import ROUTE_BYTES, open_user_file, read_yaml
+from deepracer_exp.files import ROUTE_BYTES, open_user_file, read_yaml_as
 
 from .worlds import FILE, ROUTES, UNITS_PER_M, worlds
 
@@ -17,17 +18,23 @@ REPEAT_M = 1e-9
 """A point closer than this to the one before it repeats it."""
 FARTHEST_M = 10_000.0
 """Larger coordinates are not metres."""
-KNOT_KEYS = ("knots", "width_m", "closed", "title")
 ROUTE_ROWS = "rows of 6 numbers: centre x, y, inner x, y, outer x, y in metres"
 
 
-class Knots(NamedTuple):
-    """The content of a YAML of knots; `width_m` has one value or one per knot."""
+_Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+_Width = Annotated[float, Field(gt=0, le=FARTHEST_M)]
 
-    knots: np.ndarray
-    width_m: np.ndarray
-    closed: bool
-    title: str | None
+
+@dataclass(frozen=True)
+class Knots:
+    """The content of a YAML of knots."""
+
+    knots: tuple[tuple[_Coordinate, _Coordinate], ...]
+    """Centre-line points (x, y) in metres."""
+    width_m: _Width | tuple[_Width, ...]
+    """One value, or one per knot."""
+    closed: bool = True
+    title: str | None = None
 
 
 def read_route(path: str | Path) -> np.ndarray:
@@ -101,25 +108,19 @@ def world_rows(name: str) -> np.ndarray:
     if name not in worlds():
         known = f"`deepracer-exp tracks` lists all {len(worlds())}"
         raise BadInput(f"{name}: no such world{nearest(name, worlds())}; {known}")
-    first = 0
-    for world in worlds().values():
-        if world.name == name:
-            break
-        first += world.rows
-    rows = _units()[first : first + worlds()[name].rows] / UNITS_PER_M
+    # Each world is stored as its second differences.
+    rows = _bends()[name].astype(np.int64).cumsum(axis=0).cumsum(axis=0) / UNITS_PER_M
     rows.flags.writeable = False
     return rows
 
 
 @cache
-def _units() -> np.ndarray:
-    """Return the rows of all worlds (rows, 6) int64 in units of 0.1 mm."""
+def _bends() -> dict[str, np.ndarray]:
+    """Return the second differences of each world's rows (rows, 6) in units of 0.1 mm."""
     with zipfile.ZipFile(FILE) as file, file.open(ROUTES) as member:
         bends = np.lib.format.read_array(member, allow_pickle=False)
     ends = np.cumsum([world.rows for world in worlds().values()])
-    # Each world is stored as its second differences.
-    parts = np.split(bends.astype(np.int64), ends[:-1])
-    return np.concatenate([part.cumsum(axis=0).cumsum(axis=0) for part in parts])
+    return dict(zip(worlds(), np.split(bends, ends[:-1]), strict=True))
 
 
 def read_knots(path: str | Path) -> Knots:
@@ -131,49 +132,7 @@ def read_knots(path: str | Path) -> Knots:
     Raises:
         BadInput: The file cannot be read, a key is unknown or missing, or a value has the wrong type.
     """
-    path = Path(path)
-    content = read_yaml(path, f"a file with the keys {_keys()}")
-    if not isinstance(content, dict):
-        raise BadInput(f"{path}: no keys found; accepted are {_keys()}")
-    for key in content:
-        if key not in KNOT_KEYS:
-            hint = nearest(str(key), KNOT_KEYS)
-            raise BadInput(f"{path}: unknown key {key!r}{hint}; accepted are {_keys()}")
-    for key in ("knots", "width_m"):
-        if key not in content:
-            raise BadInput(f"{path}: key {key} is missing; accepted are {_keys()}")
-    closed = content.get("closed", True)
-    if not isinstance(closed, bool):
-        raise BadInput(f"{path}: closed is {closed!r}; accepted are true and false")
-    title = content.get("title")
-    if title is not None and not isinstance(title, str):
-        raise BadInput(f"{path}: title is {title!r}; accepted is text")
-    return Knots(_points(path, content["knots"]), _widths(path, content["width_m"]), closed, title)
-
-
-def _points(path: Path, value: Any) -> np.ndarray:
-    if not isinstance(value, list):
-        raise BadInput(f"{path}: knots is {value!r}; accepted is a list of [x, y] in metres")
-    for index, point in enumerate(value):
-        if not (isinstance(point, list) and len(point) == 2 and all(map(_is_coordinate, point))):
-            raise BadInput(
-                f"{path}: knots[{index}] is {point!r}; accepted is [x, y], numbers within +-{FARTHEST_M:g} m"
-            )
-    return np.array(value, dtype=np.float64).reshape(-1, 2)
-
-
-def _widths(path: Path, value: Any) -> np.ndarray:
-    widths = value if isinstance(value, list) else [value]
-    for width in widths:
-        if not _is_coordinate(width) or width <= 0:
-            raise BadInput(f"{path}: width_m has {width!r}; accepted are metres above 0, one or one per knot")
-    return np.array(widths, dtype=np.float64)
-
-
-def _is_coordinate(value: Any) -> bool:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number and math.isfinite(value) and abs(value) <= FARTHEST_M
-
-
-def _keys() -> str:
-    return ", ".join(KNOT_KEYS)
+    accepted = (
+        "knots: [[x, y], ...] in metres, width_m: metres, or one per knot, closed: true or false, title: text"
+    )
+    return read_yaml_as(path, TypeAdapter(Knots), accepted)

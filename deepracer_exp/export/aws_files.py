@@ -7,9 +7,7 @@ from deepracer_exp.config.custom_files import TAKEN
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import (
-    NEURAL_NETWORKS,
     Action,
-    LidarConfig,
     ModelMetadata,
     model_metadata_text,
 )
@@ -19,7 +17,6 @@ from deepracer_exp.errors import BadInput
 CONSOLE_ACTIONS = (2, 30)
 CONSOLE_STEERING_DEG = (-30.0, 30.0)
 CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
-_VERSION = 5  # what deepracer-for-cloud writes: the newest physics
 
 
 @dataclass(frozen=True)
@@ -77,17 +74,9 @@ def metadata_of(actions: ActionSpace) -> ModelMetadata:
         pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
         listed = tuple(Action(steering_deg, speed_mps) for steering_deg, speed_mps in pairs)
     return ModelMetadata(
-        action_space_type="discrete" if discrete else "continuous",
         actions=listed,
         low=None if discrete else Action(*actions.low.tolist()),
         high=None if discrete else Action(*actions.high.tolist()),
-        sensor=("FRONT_FACING_CAMERA",),
-        neural_network=NEURAL_NETWORKS[0],
-        version=_VERSION,
-        training_algorithm="clipped_ppo",
-        lidar_config=LidarConfig(),
-        given=(),
-        renumbered=False,
     )
 
 

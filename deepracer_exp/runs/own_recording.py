@@ -13,9 +13,7 @@ import pyarrow.parquet as pq
 
 from deepracer_exp.deepracer import sim_trace
 from deepracer_exp.deepracer.model_metadata import (
-    NEURAL_NETWORKS,
     Action,
-    LidarConfig,
     ModelMetadata,
     read_model_metadata,
 )
@@ -265,17 +263,9 @@ def _metadata(folder: Path, config: Mapping[str, Any], problems: list[LogProblem
         discrete = space["kind"] != "continuous"
         steering, speed = (space.get(name) for name in ("steering_angle", "speed"))
         return ModelMetadata(
-            action_space_type="discrete" if discrete else "continuous",
             actions=_actions(space) if discrete else (),
             low=None if discrete else Action(float(steering["low"]), float(speed["low"])),
             high=None if discrete else Action(float(steering["high"]), float(speed["high"])),
-            sensor=("FRONT_FACING_CAMERA",),
-            neural_network=NEURAL_NETWORKS[0],
-            version=5,
-            training_algorithm="clipped_ppo",
-            lidar_config=LidarConfig(),
-            given=(),
-            renumbered=False,
         )
     except (BadInput, TypeError, ValueError, KeyError, AttributeError) as error:
         problems.append(

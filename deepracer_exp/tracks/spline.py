@@ -1,6 +1,7 @@
 """Route rows from spline knots: a smooth centre line with borders along its normals."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from deepracer_exp.errors import BadInput
@@ -13,7 +14,7 @@ LONGEST_FOLD = 8.0
 """Length of a border's fold, in road widths, up to which it counts as the inside of a tight bend."""
 
 
-def rows_from_knots(knots: np.ndarray, width_m: np.ndarray, closed: bool) -> np.ndarray:
+def rows_from_knots(knots: ArrayLike, width_m: ArrayLike, closed: bool) -> np.ndarray:
     """Return route rows along a cubic spline through knots.
 
     The spline is periodic on a closed course and natural on an open one. It is parametrised by the
@@ -22,7 +23,7 @@ def rows_from_knots(knots: np.ndarray, width_m: np.ndarray, closed: bool) -> np.
 
     Args:
         knots: Points (k, 2) in metres; the first is not repeated at the end of a closed course.
-        width_m: Distance between the borders in metres: (1,) or (k,).
+        width_m: Distance between the borders in metres: one value or (k,).
         closed: Whether the last knot joins the first.
 
     Returns:
@@ -33,6 +34,7 @@ def rows_from_knots(knots: np.ndarray, width_m: np.ndarray, closed: bool) -> np.
         BadInput: Too few knots, repeated knots, another number of widths than of knots, or a road so
             wide that its border crosses itself.
     """
+    knots, width_m = np.asarray(knots, np.float64).reshape(-1, 2), np.atleast_1d(width_m)
     _check(knots, width_m, closed)
     width_m = np.broadcast_to(width_m, len(knots))
     if closed:

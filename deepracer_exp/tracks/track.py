@@ -66,7 +66,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Track:
-    """An immutable course; build one with `from_route`, `from_knots` or `from_config`.
+    """An immutable course; build one with `from_route`, `from_file` or `from_config`.
 
     Geometry follows deepracer-simapp (track_geom/track_data.py): projections are those of shapely, the
     road is the outer border's polygon minus the inner one's.
@@ -151,25 +151,24 @@ class Track:
         )
 
     @classmethod
-    def from_knots(
-        cls,
-        knots: np.ndarray,
-        width_m: float | np.ndarray,
-        closed: bool,
-        name: str,
-        *,
-        title: str | None = None,
-        reversed: bool = False,
-        floor: FloorConfig = PLAIN_FLOOR,
-    ) -> "Track":
-        """Build a course from spline knots (k, 2) in metres and one width or one per knot.
+    def from_file(cls, path: Path, reversed: bool = False, floor: FloorConfig = PLAIN_FLOOR) -> "Track":
+        """Build the course of a route file (.npy) or of a YAML of knots.
 
         Raises:
-            BadInput: The knots do not form a course, or the road is too wide for its bends.
+            BadInput: The file does not form a course; the message names it.
         """
-        knots, widths_m = np.asarray(knots, np.float64), np.atleast_1d(np.asarray(width_m, np.float64))
-        rows = rows_from_knots(knots, widths_m, closed)
-        return cls.from_route(rows, name, title=title, reversed=reversed, floor=floor)
+        title = None
+        if path.suffix == ".npy":
+            rows = read_route(path)
+        elif path.suffix in (".yaml", ".yml"):
+            course = read_knots(path)
+            title = course.title
+            with _naming(path):
+                rows = rows_from_knots(course.knots, course.width_m, course.closed)
+        else:
+            raise BadInput(f"{path}: ending {path.suffix!r}; accepted: .npy (route) and .yaml (knots)")
+        with _naming(path):
+            return cls.from_route(rows, path.stem, title=title, reversed=reversed, floor=floor)
 
     @classmethod
     def from_config(cls, config: TrackConfig, reversed: bool | None = None) -> "Track":
@@ -185,19 +184,14 @@ class Track:
         backwards = config.direction == "reversed" if reversed is None else reversed
         if config.file is not None:
             with _naming("track.file"):
-                return _from_file(Path(config.file), backwards, config.floor)
-        if config.knots is None:
-            rows, title = world_rows(config.name), config.title
-            return cls.from_route(rows, config.name, title=title, reversed=backwards, floor=config.floor)
+                return cls.from_file(Path(config.file), backwards, config.floor)
         with _naming(f"track {config.name}"):
-            return cls.from_knots(
-                np.array(config.knots, np.float64).reshape(-1, 2),
-                np.array(config.width_m, np.float64),
-                config.closed,
-                config.name,
-                title=config.title,
-                reversed=backwards,
-                floor=config.floor,
+            if config.knots is None or config.width_m is None:
+                rows = world_rows(config.name)
+            else:
+                rows = rows_from_knots(config.knots, config.width_m, config.closed)
+            return cls.from_route(
+                rows, config.name, title=config.title, reversed=backwards, floor=config.floor
             )
 
     @cached_property
@@ -300,21 +294,6 @@ def _points(points: np.ndarray) -> np.ndarray:
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"points have shape {points.shape}, not (n, 2)")
     return points
-
-
-def _from_file(path: Path, backwards: bool, floor: FloorConfig) -> Track:
-    title = None
-    if path.suffix == ".npy":
-        rows = read_route(path)
-    elif path.suffix in (".yaml", ".yml"):
-        course = read_knots(path)
-        title = course.title
-        with _naming(path):
-            rows = rows_from_knots(course.knots, course.width_m, course.closed)
-    else:
-        raise BadInput(f"{path}: ending {path.suffix!r}; accepted: .npy (route) and .yaml (knots)")
-    with _naming(path):
-        return Track.from_route(rows, path.stem, title=title, reversed=backwards, floor=floor)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import pandas as pd
 
 from deepracer_exp.analysis.log_course import catalogue_track
 from deepracer_exp.analysis.tables import FRONT_TO_REAR_AXLE_M
-from deepracer_exp.deepracer.model_metadata import Action, LidarConfig, ModelMetadata
+from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata
 from deepracer_exp.deepracer.recording import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS, Recording
 from deepracer_exp.tracks.track import Track
 
@@ -116,17 +116,7 @@ def made_up_recording(
 
 def _metadata(speeds: Sequence[float]) -> ModelMetadata:
     return ModelMetadata(
-        action_space_type="discrete",
         actions=tuple(Action(angle, speed) for speed in speeds for angle in STEERING_DEG),
-        low=None,
-        high=None,
-        sensor=("FRONT_FACING_CAMERA",),
-        neural_network="DEEP_CONVOLUTIONAL_NETWORK_SHALLOW",
-        version=5,
-        training_algorithm="clipped_ppo",
-        lidar_config=LidarConfig(),
-        given=("action_space",),
-        renumbered=False,
     )
 
 
