@@ -31,8 +31,7 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.agents.ppo import PPO
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.ppo import build_agent
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
@@ -100,7 +99,7 @@ def load_policy(checkpoint: Path, experiment: Experiment, setup: RaceSetup) -> T
     networks = build_actor_critic(
         experiment.network, len(feature_names(experiment.observation)), setup.actions.n, torch.Generator()
     )
-    agent = PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed)
+    agent = build_agent(networks, experiment.algorithm, experiment.lr_schedule, experiment.seed)
     Checkpoint(agent=agent).load(checkpoint)
     return networks.policy
 

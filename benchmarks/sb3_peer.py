@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from deepracer_exp.collectors.base import worker_count
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import MLPConfig
 from deepracer_exp.env.gym_env import DeepRacerVectorEnv
 from deepracer_exp.env.setup import build_setup
 
@@ -74,6 +75,7 @@ def build(experiment: Experiment, physics_threads: int) -> PPO:
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
     assert algorithm.frames_per_iteration is not None
+    assert isinstance(network, MLPConfig)
     n_cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
     hidden = list(network.hidden)
     return PPO(

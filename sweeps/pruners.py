@@ -26,7 +26,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import EntropyStopping, StoppingConfig
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.convergence import Decision, Row, Stopping
+from deepracer_exp.runs.convergence import Decision, Row, StoppingRule, build_rule
 from deepracer_exp.runs.files import METRICS, RunRecord, read_config, read_metrics
 from deepracer_exp.training.stopping_replay import action_count
 
@@ -160,18 +160,18 @@ class EntropyPruner(ExplainingPruner):
             del self._followed[next(iter(self._followed))]
         return followed.decision
 
-    def _stopping(self, path: Path) -> Stopping:
+    def _stopping(self, path: Path) -> StoppingRule:
         config = read_config(path)
         own: Any = _STOPPING.validate_python(config["stopping"])
         rules = own if isinstance(own, EntropyStopping) else self._rules
-        return Stopping(rules, action_count(RunRecord(path, config, [], {}, {})))
+        return build_rule(rules, action_count(RunRecord(path, config, [], {}, {})))
 
 
 @dataclass
 class _Followed:
     """The part of a run seen so far."""
 
-    stopping: Stopping
+    stopping: StoppingRule
     rows: int = 0
     last: Row | None = None
     decision: Decision | None = None

@@ -13,7 +13,8 @@ from torch import nn
 from torch.distributions import Categorical
 from torchrl.modules import MLP, ActorValueOperator, IndependentNormal, ProbabilisticActor, ValueOperator
 
-from deepracer_exp.config.learning import NetworkConfig
+from deepracer_exp.config.learning import MLPConfig, NetworkConfig
+from deepracer_exp.config.own_class import OwnClass, build_own
 
 CONTINUOUS_ACTION_SIZE = 2
 """Steering and speed."""
@@ -22,6 +23,9 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "e
 
 # A policy that starts almost uniform (or centred) explores evenly; the value head starts at full scale.
 _HIDDEN_GAIN, _POLICY_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
+_INITIAL_STD = (
+    0.5  # of a continuous policy, unless a network of the user's own has an attribute `initial_std`
+)
 
 
 class ActorCritic(nn.Module):
@@ -72,11 +76,32 @@ def build_actor_critic(
     """Build the networks with weights drawn from `generator`.
 
     Args:
-        network: Sizes and kind.
+        network: Sizes and kind, or a class of the user's own: a `torch.nn.Module` called with the numbers of inputs and
+            outputs, of which there is one for the policy and one for the value.
         observation_size: Length of `observation`.
         action_count: Number of discrete actions, or None for the two continuous ones.
         generator: Source of the initial weights; the global random state has no part in them.
+
+    Raises:
+        BadInput: a class of the user's own cannot be used.
     """
+    outputs = CONTINUOUS_ACTION_SIZE if action_count is None else action_count
+    if isinstance(network, OwnClass):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+            layers, value = (
+                build_own(network, "network.target", nn.Module, observation_size, size)
+                for size in (outputs, 1)
+            )
+        initial_std = float(getattr(layers, "initial_std", _INITIAL_STD))
+        policy = _policy("observation", layers, action_count is None, initial_std)
+        return ActorCritic(policy, ValueOperator(value, in_keys=["observation"]))
+    return _mlp(network, observation_size, outputs, action_count is None, generator)
+
+
+def _mlp(
+    network: MLPConfig, observation_size: int, outputs: int, continuous: bool, generator: torch.Generator
+) -> ActorCritic:
     activation = _ACTIVATIONS[network.activation]
 
     def heads(
@@ -86,8 +111,7 @@ def build_actor_critic(
             layers = MLP(in_features, outputs, num_cells=hidden, activation_class=activation)
             return _initialize(layers, gain, generator)
 
-        outputs = CONTINUOUS_ACTION_SIZE if action_count is None else action_count
-        policy = _policy(in_key, mlp(outputs, _POLICY_GAIN), action_count is None, network.initial_std)
+        policy = _policy(in_key, mlp(outputs, _POLICY_GAIN), continuous, network.initial_std)
         return policy, ValueOperator(mlp(1, _VALUE_GAIN), in_keys=[in_key])
 
     if not network.shared_trunk:

@@ -1,4 +1,4 @@
-"""Clipped proximal policy optimisation, from TorchRL's parts."""
+"""Algorithms: the base class, and clipped proximal policy optimisation from TorchRL's parts."""
 
 import math
 from dataclasses import dataclass
@@ -11,11 +11,12 @@ from torch.distributions import Distribution
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from deepracer_exp.config.learning import AlgorithmConfig
+from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig
+from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import RunFailed
 
 from .actor_critic import ActorCritic
-from .schedules import Schedule
+from .schedules import Schedule, build_schedule
 
 _VALUE_LOSSES = {"huber": "smooth_l1", "mean squared error": "l2"}
 _LOSS_NAMES = {"loss_objective": "policy loss", "loss_critic": "value loss", "loss_entropy": "entropy"}
@@ -23,7 +24,7 @@ _LOSS_NAMES = {"loss_objective": "policy loss", "loss_critic": "value loss", "lo
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateMetrics:
-    """What one update did; means over its gradient steps unless said otherwise."""
+    """What one update did; means over its gradient steps unless said otherwise. A subclass may add columns."""
 
     policy_loss: float
     value_loss: float
@@ -52,8 +53,49 @@ class _Loss(ClipPPOLoss):
         return dist.entropy().unsqueeze(-1)
 
 
-class PPO:
-    """Improves an actor-critic from batches of its own driving.
+class Algorithm:
+    """Improves an actor-critic from batches of its own driving; base class of your own algorithms."""
+
+    def __init__(
+        self, actor_critic: ActorCritic, config: AlgorithmConfig, schedule: Schedule, seed: int
+    ) -> None:
+        """Store the parts.
+
+        Args:
+            actor_critic: Updated in place.
+            config: The group `algorithm`.
+            schedule: Of the learning rate.
+            seed: Of the algorithm's own random streams.
+        """
+        self.networks, self.config, self.schedule = actor_critic, config, schedule
+
+    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
+        """Learn from one batch.
+
+        Args:
+            batch: Leading dimensions [..., T], time last and contiguous. Holds `observation`, `action`,
+                `action_log_prob` and `next` with `observation` (of a finished episode: its last one, not the
+                first of the new one), `reward`, `done`, `terminated`, each of the latter [..., T, 1].
+            iteration: Updates made before this one.
+            fraction: Share of the budget spent, 0 to 1.
+
+        Raises:
+            RunFailed: Input, loss or gradient is not finite; the networks are as before that gradient step.
+        """
+        raise NotImplementedError
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint holds: tensors and plain values; `networks` is what evaluations read."""
+        return {"networks": self.networks.state_dict(), "schedule": self.schedule.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a `state_dict`."""
+        self.networks.load_state_dict(state["networks"])
+        self.schedule.load_state_dict(state["schedule"])
+
+
+class PPO(Algorithm):
+    """Clipped PPO.
 
     The meaning of the hyperparameters is DeepRacer's: advantages standardised once over the whole batch,
     a constant clip range, every epoch a new shuffle, a last minibatch that is not full left out. Unlike
@@ -64,11 +106,8 @@ class PPO:
     def __init__(
         self, actor_critic: ActorCritic, config: AlgorithmConfig, schedule: Schedule, seed: int
     ) -> None:
-        """Set up loss, advantages and optimizer for `actor_critic`, which is updated in place.
-
-        `seed` starts the stream that shuffles the minibatches.
-        """
-        self._networks, self._config, self._schedule = actor_critic, config, schedule
+        """Set up loss, advantages and optimizer; `seed` starts the stream that shuffles the minibatches."""
+        super().__init__(actor_critic, config, schedule, seed)
         self._generator = torch.Generator().manual_seed(seed)
         self._parameters = list(actor_critic.parameters())
         device = self._parameters[0].device
@@ -95,39 +134,41 @@ class PPO:
             device=device,
         )
 
-    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
-        """Run all epochs on one batch.
+    def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses of a minibatch; override it for a loss of your own.
 
         Args:
-            batch: Leading dimensions [..., T], time last and contiguous. Holds `observation`, `action`,
-                `action_log_prob` and `next` with `observation` (of a finished episode: its last one, not the
-                first of the new one), `reward`, `done`, `terminated`, each of the latter [..., T, 1].
-            iteration: Updates made before this one.
-            fraction: Share of the budget spent, 0 to 1.
+            minibatch: [N] steps with `observation` (and the trunk's `hidden`), `action`, `action_log_prob`,
+                `advantage` and `value_target`.
 
-        Raises:
-            RunFailed: Input, loss or gradient is not finite; the networks are as before that gradient step.
+        Returns:
+            `loss_objective`, `loss_critic` and `loss_entropy`, which are added up, and `entropy`, `clip_fraction`,
+            `mean_ratio` and `kl_approx`, which are recorded.
         """
-        lr = self._config.lr * self._schedule.factor(iteration, fraction)
+        return self._loss(minibatch)
+
+    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
+        """Run all epochs on one batch, see `Algorithm.update`."""
+        lr = self.config.lr * self.schedule.factor(iteration, fraction)
         for group in self._optimizer.param_groups:
             group["lr"] = lr
         steps, explained_variance = self._prepare(batch)
         count = steps.shape[0]
-        size = min(self._config.batch_size, count)
+        size = min(self.config.batch_size, count)
         minibatches = count // size
         results = [
             self._gradient_step(minibatch)
-            for _ in range(self._config.epochs)
+            for _ in range(self.config.epochs)
             for minibatch in steps[self._shuffled(count)[: minibatches * size]].split(size)
         ]
         # One transfer for all metrics; only the test for finite numbers waits for each gradient step.
         table = torch.stack(results)
         policy_loss, value_loss, entropy, clip_fraction, _, grad_norm = table.mean(0).tolist()
         kl = table[-minibatches:, 4].mean().item()
-        self._schedule.observe(kl)
+        self.schedule.observe(kl)
         return UpdateMetrics(
             policy_loss=policy_loss,
-            value_loss=value_loss / self._config.critic_coeff,
+            value_loss=value_loss / self.config.critic_coeff,
             entropy=entropy,
             kl=kl,
             clip_fraction=clip_fraction,
@@ -139,17 +180,16 @@ class PPO:
     def state_dict(self) -> dict[str, Any]:
         """Return networks, optimizer, schedule and shuffling stream: tensors and plain values only."""
         return {
-            "networks": self._networks.state_dict(),
+            "networks": self.networks.state_dict(),
             "optimizer": self._optimizer.state_dict(),
-            "schedule": self._schedule.state_dict(),
+            "schedule": self.schedule.state_dict(),
             "generator": self._generator.get_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a `state_dict`; further updates are those of the original bit for bit."""
-        self._networks.load_state_dict(state["networks"])
+        super().load_state_dict(state)
         self._optimizer.load_state_dict(state["optimizer"])
-        self._schedule.load_state_dict(state["schedule"])
         self._generator.set_state(state["generator"])
 
     def _shuffled(self, count: int) -> Tensor:
@@ -187,13 +227,13 @@ class PPO:
 
     def _value_of(self, observation: Tensor) -> Tensor:
         steps = TensorDict({"observation": observation}, observation.shape[:-1])
-        return self._networks.value(steps)["state_value"]
+        return self.networks.value(steps)["state_value"]
 
     def _gradient_step(self, minibatch: TensorDictBase) -> Tensor:
         """Step along one minibatch's gradient and return the parts of UpdateMetrics on the device."""
-        if self._networks.trunk is not None:
-            minibatch = self._networks.trunk(minibatch)
-        losses = self._loss(minibatch)
+        if self.networks.trunk is not None:
+            minibatch = self.networks.trunk(minibatch)
+        losses = self.loss(minibatch)
         loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
         self._optimizer.zero_grad()
         loss.backward()
@@ -212,7 +252,7 @@ class PPO:
         for key, name in _LOSS_NAMES.items():
             if not torch.isfinite(losses[key]):
                 raise RunFailed(f"{name} is {losses[key].item()}; the gradient step was not made")
-        for name, parameter in self._networks.named_parameters():
+        for name, parameter in self.networks.named_parameters():
             if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
                 raise RunFailed(f"gradient of {name} is not finite; the gradient step was not made")
         raise RunFailed("norm of the gradient is not finite; the gradient step was not made")
@@ -226,3 +266,21 @@ def _require_finite(batch: TensorDictBase) -> None:
             name = " ".join(key) if isinstance(key, tuple) else key
             position = (~finite).nonzero()[0].tolist()
             raise RunFailed(f"{name} is {batch[key][tuple(position)].item()} at {position} of the batch")
+
+
+def build_agent(
+    actor_critic: ActorCritic, config: AlgorithmConfig, lr_schedule: LRScheduleConfig, seed: int
+) -> Algorithm:
+    """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
+
+    Raises:
+        BadInput: a class of the user's own cannot be used.
+    """
+    schedule = build_schedule(lr_schedule)
+    if config.target is None:
+        return PPO(actor_critic, config, schedule, seed)
+    own = OwnClass(target=config.target, kwargs=config.kwargs)
+    # Its constructor may draw weights; the global random state has no part in them.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return build_own(own, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)

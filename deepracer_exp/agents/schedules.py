@@ -5,49 +5,63 @@ iterations or in fractions of the budget, neither of which torch.optim.lr_schedu
 """
 
 import math
-from typing import assert_never
 
 from deepracer_exp.config.learning import (
     AdaptiveKLLR,
-    ConstantLR,
     CosineLR,
     ExponentialLR,
     LinearLR,
     LRScheduleConfig,
+    PresetLR,
     StepLR,
 )
+from deepracer_exp.config.own_class import OwnClass, build_own
 
 # A warm-up counted in fractions of the budget begins at fraction 0; its first update must still learn.
 _LOWEST_WARMUP_FACTOR = 0.01
 
 
 class Schedule:
-    """The factor of the learning rate at each point of a run.
-
-    Warm-up and decay are both counted from the start of the run and multiplied.
-    """
-
-    def __init__(self, config: LRScheduleConfig) -> None:
-        self._config = config
-        self._adapted = 1.0
+    """The factor of the learning rate at each point of a run; base class of your own schedules."""
 
     def factor(self, iteration: int, fraction: float) -> float:
-        """Return the factor for the coming update.
+        """Return the factor of `algorithm.lr` for the coming update.
 
         Args:
             iteration: Updates made before this one.
             fraction: Share of the budget spent, 0 to 1.
         """
+        raise NotImplementedError
+
+    def observe(self, kl: float) -> None:
+        """Take note of how far the last update moved the policy (KL divergence)."""
+
+    def state_dict(self) -> dict[str, float]:
+        """Return what a resumed run needs of `observe`."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Restore a `state_dict`."""
+
+
+class PresetSchedule(Schedule):
+    """Warm-up and decay, both counted from the start of the run and multiplied."""
+
+    def __init__(self, config: PresetLR) -> None:
+        self._config = config
+        self._adapted = 1.0
+
+    def factor(self, iteration: int, fraction: float) -> float:
+        """Return the product of warm-up and decay."""
         by_iteration = self._config.by == "iteration"
         position = iteration if by_iteration else fraction
         # The first of n warm-up iterations is worth 1/n, the last the full rate.
         return self._warmup(iteration + 1 if by_iteration else fraction) * self._decay(position)
 
     def observe(self, kl: float) -> None:
-        """Take note of how far the last update moved the policy (only `adaptive_kl` acts on it).
+        """Adapt the rate of `adaptive_kl`: down where `kl` is above twice the target, up where it is below half of it.
 
-        The rate falls where `kl` is above twice the target and rises where it is below half of it: the rule
-        of torchrl.objectives.KLAdaptiveLR, kept apart from the optimizer so that a warm-up can multiply it.
+        The rule of torchrl.objectives.KLAdaptiveLR, kept apart from the optimizer so that a warm-up can multiply it.
         """
         if not isinstance(self._config, AdaptiveKLLR):
             return
@@ -57,11 +71,11 @@ class Schedule:
         self._adapted = min(highest, max(lowest, self._adapted * change))
 
     def state_dict(self) -> dict[str, float]:
-        """Return what `observe` has learned."""
+        """Return the adapted factor."""
         return {"adapted": self._adapted}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Take over a `state_dict`."""
+        """Restore it."""
         self._adapted = state["adapted"]
 
     def _warmup(self, position: float) -> float:
@@ -71,8 +85,6 @@ class Schedule:
 
     def _decay(self, position: float) -> float:
         match self._config:
-            case ConstantLR():
-                return 1.0
             case LinearLR(length=length, end_factor=end):
                 return 1 + (end - 1) * min(position / length, 1.0)
             case CosineLR(length=length, end_factor=end):
@@ -81,7 +93,15 @@ class Schedule:
                 return factor ** math.floor(position / length)
             case ExponentialLR(length=length, factor=factor):
                 return factor ** (position / length)
-            case AdaptiveKLLR():
-                return self._adapted
-            case _:
-                assert_never(self._config)
+        return self._adapted
+
+
+def build_schedule(config: LRScheduleConfig) -> Schedule:
+    """Return the schedule of the group `lr_schedule`.
+
+    Raises:
+        BadInput: a class of the user's own cannot be used.
+    """
+    if isinstance(config, OwnClass):
+        return build_own(config, "lr_schedule.target", Schedule)
+    return PresetSchedule(config)

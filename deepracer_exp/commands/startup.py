@@ -54,12 +54,15 @@ def check_changes(run_dir: Path, overrides: "Sequence[str]") -> "Experiment":
     """Return the experiment of a stored run with overrides applied.
 
     Raises:
-        BadInput: an override names something unknown or gives a value that is not accepted.
+        BadInput: an override names something unknown or gives a value that is not accepted, or a class of the user's
+            own is not named again.
     """
-    from deepracer_exp.config.parse import parse_experiment
+    from deepracer_exp.config.parse import import_own_classes, parse_experiment
     from deepracer_exp.config.stored import with_overrides
 
-    return parse_experiment(with_overrides(read_config(run_dir), {}, overrides).mapping)
+    experiment = parse_experiment(with_overrides(read_config(run_dir), {}, overrides).mapping)
+    import_own_classes(experiment)
+    return experiment
 
 
 def check_sweep(request: "SweepRequest") -> None:

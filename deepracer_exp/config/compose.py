@@ -35,7 +35,8 @@ from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
 from .experiment import Experiment
 from .options import conf_dirs, find, groups, listed, options
 from .overrides import PLAIN_TEXT, line_for_hydra, override_line, parse_single, parse_sweep
-from .parse import parse_config, parse_experiment
+from .own_class import allow, allow_given, own_option
+from .parse import import_own_classes, parse_config, parse_experiment
 from .track_options import ALL, by_world_name, complete, register_worlds, several_tracks, without_placeholders
 from .track_options import GROUP as TRACK
 
@@ -86,6 +87,7 @@ def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Compositio
     composition = compose_entry("train", overrides)
     experiment = parse_experiment(composition.mapping)
     _check_names(experiment.evaluation)
+    import_own_classes(experiment)
     return experiment, composition
 
 
@@ -130,6 +132,8 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         BadInput: an override cannot be parsed or names something unknown, or a file cannot be used.
     """
     overrides = without_passwords(list(overrides))
+    if entry != "train":  # it reads a stored run, whose classes are its own
+        overrides = allow_given(overrides)
     given = [parse_single(override) for override in overrides]
     own = [by_world_name(override) for override in given if override.key_or_group != custom_files.KEY]
     for override in own:
@@ -161,6 +165,7 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     elif several is not None:
         several.move_to_track(mapping)
         choices[TRACK] = f"[{','.join(several.names)}]"
+    allow(mapping)
     return Composition(
         overrides=tuple(overrides),
         choices={group: option for group, option in choices.items() if group in groups(entry)},
@@ -172,7 +177,10 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
 
 
 class OptionFiles(FileConfigSource):
-    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file."""
+    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
+
+    `GROUP/package.module:Class` is an option without a file.
+    """
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Read an option.
@@ -181,23 +189,36 @@ class OptionFiles(FileConfigSource):
             BadInput: the file cannot be read, or is not YAML with keys and values.
         """
 
+        def result(config: Any, head: str) -> ConfigResult:
+            header = self._get_header_dict(head)
+            return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
+
         def load(text: str) -> ConfigResult:
             config = OmegaConf.load(StringIO(text))
             if not isinstance(config, DictConfig):
                 raise ValueError("has no keys")
-            header = self._get_header_dict(text[:512])
-            return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
+            return result(config, text[:512])
 
+        own = self._own(config_path)
+        if own is not None:
+            return result(OmegaConf.create(own), "")
         return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
 
     def is_config(self, config_path: str) -> bool:
         """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
         path = self._file(config_path)
+        if self._own(config_path) is not None:
+            return True
         return self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
 
     def is_group(self, config_path: str) -> bool:
         """Return whether there is such a folder."""
         return self._is_below(config_path) and super().is_group(config_path)
+
+    @staticmethod
+    def _own(config_path: str) -> dict[str, Any] | None:
+        group, _, name = config_path.removesuffix(".yaml").rpartition("/")
+        return own_option(group, name)
 
     def _file(self, config_path: str) -> Path:
         return Path(self.path, self._normalize_file_name(config_path))
@@ -254,7 +275,11 @@ def check_option(group: str, name: object, key: str | None = None) -> None:
     known, key = options(group), key or group
     if not isinstance(name, str):
         raise BadInput(f"{override_line(key, name)}: no such {group}; options: {listed(group, known)}")
-    if name.removesuffix(".yaml") in known or (group == TRACK and find_world(name)):
+    if (
+        name.removesuffix(".yaml") in known
+        or (group == TRACK and find_world(name))
+        or own_option(group, name)
+    ):
         return
     hint = nearest(name, known)
     if key == group and f"{group}.file" in PLAIN_TEXT and Path(name).suffix in _FILES:

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import AfterValidator, Field
 
 from .bounds import Finite, Fraction, Natural, NonNegative, Positive, Seconds, UpTo100
+from .own_class import OwnClass
 
 SpeedMps = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 SteeringDeg = Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
@@ -82,6 +83,8 @@ class ObservationConfig:
     lookahead_scale_m: Positive
     speed_scale_mps: Positive
     yaw_rate_scale_radps: Positive
+    parts: tuple[OwnClass, ...] = ()
+    """Classes of your own that add features."""
 
 
 @dataclass(frozen=True, kw_only=True)

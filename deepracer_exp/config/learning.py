@@ -1,11 +1,12 @@
 """Network, algorithm and learning-rate schedule."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, Tag
 
 from .bounds import Fraction, NonNegative, Positive, UpTo1000
+from .own_class import OURS_OR_OWN, OwnClass, Reference
 
 # Eight layers of so many take seconds to begin with; of twice as many, minutes.
 Units = Annotated[int, Field(ge=1, le=2048)]
@@ -15,7 +16,7 @@ By = Literal["iteration", "fraction"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkConfig:
+class MLPConfig:
     """A multi-layer perceptron for policy and value."""
 
     hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)]
@@ -27,9 +28,15 @@ class NetworkConfig:
     """Standard deviation of a continuous policy at the start, in units of the action range -1..1."""
 
 
+NetworkConfig = Annotated[
+    Annotated[MLPConfig, Tag("ours")] | Annotated[OwnClass, Tag("own")],
+    OURS_OR_OWN,
+]
+
+
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfig:
-    """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them."""
+    """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them; or an algorithm of your own with them."""
 
     lr: Positive
     batch_size: Annotated[int, Field(ge=1, le=10**6)]
@@ -51,6 +58,15 @@ class AlgorithmConfig:
     """Control steps, over all cars, between two updates; null when episodes_per_iteration is used."""
     episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
     """Finished episodes between two updates (`num_episodes_between_training`); null when frames are used."""
+    target: Reference | None = None
+    """A class of your own in place of PPO, `package.module:Class`."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of its constructor."""
+
+    def __post_init__(self) -> None:
+        """Refuse arguments for a class that is not named."""
+        if self.kwargs and self.target is None:
+            raise ValueError("kwargs are arguments of a class of your own; give target=package.module:Class")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +138,8 @@ class AdaptiveKLLR:
     highest_factor: Positive
 
 
+PresetLR = ConstantLR | LinearLR | CosineLR | StepLR | ExponentialLR | AdaptiveKLLR
 LRScheduleConfig = Annotated[
-    ConstantLR | LinearLR | CosineLR | StepLR | ExponentialLR | AdaptiveKLLR, Field(discriminator="kind")
+    Annotated[PresetLR, Field(discriminator="kind"), Tag("ours")] | Annotated[OwnClass, Tag("own")],
+    OURS_OR_OWN,
 ]

@@ -11,6 +11,8 @@ from deepracer_exp.deepracer.worlds import worlds
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.files import read_bytes, read_text
 
+from .own_class import registered
+
 MOST_LISTED = 24
 """Most options that a message lists."""
 
@@ -58,9 +60,9 @@ def groups(entry: str = "train") -> list[str]:
 
 
 def options(group: str) -> list[str]:
-    """Return the sorted names of a group's options; the service's worlds are tracks without a file."""
+    """Return the sorted names of a group's options; the service's worlds and entry points have no file."""
     files = {path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")}
-    return sorted(files | worlds().keys() if group == "track" else files)
+    return sorted(files | (worlds() if group == "track" else registered(group)).keys())
 
 
 def listed(group: str, known: Sequence[str]) -> str:

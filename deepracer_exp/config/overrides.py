@@ -10,8 +10,10 @@ from hydra.errors import OverrideParseException
 
 from deepracer_exp.errors import BadInput, reading
 
+from .own_class import GROUPS
+
 # An override may add keys to these mappings.
-OPEN_MAPPINGS = ("reward.constants",)
+OPEN_MAPPINGS = ("reward.constants", *(f"{group}.kwargs" for group in GROUPS))
 # Options of these groups may omit keys, which are filled in and checked after Hydra.
 COMPLETED = ("track", "several_tracks")
 # Values of these keys are taken literally: without quotes, Hydra's grammar accepts no umlaut, bracket or second

@@ -9,6 +9,7 @@ from deepracer_exp.deepracer.worlds import worlds
 from deepracer_exp.errors import BadInput, nearest
 
 from .experiment import Experiment
+from .own_class import OwnClass, load_class
 from .track import TrackConfig
 
 Config = TypeVar("Config")
@@ -100,6 +101,22 @@ def _check_combinations(experiment: Experiment) -> None:
             f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted: "
             f"at least {-(-len(experiment.tracks) // (collector.processes or 1))}"
         )
+
+
+def import_own_classes(experiment: Experiment) -> None:
+    """Import the classes of the user's own that a training needs.
+
+    Raises:
+        BadInput: one is named by a stored run only, or cannot be imported.
+    """
+    for group in ("network", "lr_schedule", "stopping", "tracking"):
+        config = getattr(experiment, group)
+        if isinstance(config, OwnClass):
+            load_class(config.target, f"{group}.target")
+    if experiment.algorithm.target is not None:
+        load_class(experiment.algorithm.target, "algorithm.target")
+    for part in experiment.observation.parts:
+        load_class(part.target, "observation.target")
 
 
 def _check_shape(key: str, track: TrackConfig) -> None:

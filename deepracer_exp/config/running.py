@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, Tag
 
 from .bounds import Count, Positive, UpTo1000
+from .own_class import OURS_OR_OWN, OwnClass
 
 Newest = Annotated[int, Field(ge=1, le=100_000)]
 Percent = Annotated[int, Field(ge=1, le=100)]
@@ -69,8 +70,10 @@ class WandbTracking:
     """Offline: into the run folder only, for `wandb sync`."""
 
 
+PresetTracking = TrackingOff | MLflowTracking | TensorBoardTracking | WandbTracking
 TrackingConfig = Annotated[
-    TrackingOff | MLflowTracking | TensorBoardTracking | WandbTracking, Field(discriminator="kind")
+    Annotated[PresetTracking, Field(discriminator="kind"), Tag("ours")] | Annotated[OwnClass, Tag("own")],
+    OURS_OR_OWN,
 ]
 
 

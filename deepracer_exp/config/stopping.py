@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, Tag
 
 from .bounds import Count, Fraction, Natural, NonNegative
+from .own_class import OURS_OR_OWN, OwnClass
 
 Percent = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 
@@ -115,6 +116,8 @@ class EntropyStopping:
     not_learning: NotLearningRule | None
 
 
+PresetStopping = NoStopping | ReliableStopping | PlateauStopping | EntropyStopping
 StoppingConfig = Annotated[
-    NoStopping | ReliableStopping | PlateauStopping | EntropyStopping, Field(discriminator="kind")
+    Annotated[PresetStopping, Field(discriminator="kind"), Tag("ours")] | Annotated[OwnClass, Tag("own")],
+    OURS_OR_OWN,
 ]

@@ -11,6 +11,7 @@ from . import custom_files
 from .compose import Composition, compose_entry
 from .options import groups
 from .overrides import OPEN_MAPPINGS, parse_single
+from .own_class import allow, allow_given
 
 _WHOLE = ("experiment", custom_files.KEY)
 ABSENT = "\N{EN DASH}"
@@ -30,7 +31,10 @@ def with_overrides(
     Raises:
         BadInput: an override cannot be parsed, names something unknown or would replace the whole experiment.
     """
-    parsed = [parse_single(override) for override in overrides]
+    # The parts of an observation are a list: naming one again changes no value.
+    parts = [override for override in overrides if override.startswith("observation.target=")]
+    allow_given(parts)
+    parsed = [parse_single(override) for override in overrides if override not in parts]
     values = copy.deepcopy(dict(config))
     chosen = [one for one in parsed if one.key_or_group in groups() and not one.is_delete()]
     for one in parsed:
@@ -86,6 +90,7 @@ def _set(values: dict[str, Any], key: str, value: Any) -> None:
         node = node[part]
     if not isinstance(node, dict) or (leaf not in node and ".".join(path) not in OPEN_MAPPINGS):
         raise _unknown(key, key, node)
+    allow({leaf: value})
     node[leaf] = value
 
 

@@ -1,14 +1,54 @@
 """The features of an observation."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from deepracer_exp.config.driving import ObservationConfig
+from deepracer_exp.config.own_class import build_own
 
 from .state import Measures
 
 
+class ObservationPart:
+    """Features of your own, after ours; without memory, because a resumed run builds it again.
+
+    Attributes:
+        names: of its features, in their order.
+    """
+
+    names: tuple[str, ...] = ()
+
+    def compute(self, now: Measures, steering_deg: np.ndarray, commanded_mps: np.ndarray) -> np.ndarray:
+        """Return the features of N cars, shape (N, len(names)), each scaled to about -1..1.
+
+        Args:
+            now: poses against the track, arrays with one row per car.
+            steering_deg: last commanded steering (N,).
+            commanded_mps: last commanded speed (N,).
+        """
+        raise NotImplementedError
+
+
+def build_parts(config: ObservationConfig) -> tuple[ObservationPart, ...]:
+    """Build the parts of the user's own.
+
+    Raises:
+        BadInput: a class cannot be used.
+    """
+    return tuple(build_own(part, "observation.target", ObservationPart) for part in config.parts)
+
+
 def feature_names(config: ObservationConfig) -> tuple[str, ...]:
-    """Return the names of the features, in their order."""
+    """Return the names of the features, in their order.
+
+    Raises:
+        BadInput: a part of the user's own cannot be used.
+    """
+    return _names(config, build_parts(config))
+
+
+def _names(config: ObservationConfig, parts: Sequence[ObservationPart]) -> tuple[str, ...]:
     return (
         "offset",
         "heading_error_sin",
@@ -18,6 +58,7 @@ def feature_names(config: ObservationConfig) -> tuple[str, ...]:
         "last_steering",
         "last_speed",
         *(f"ahead_{axis}_{distance:g}" for distance in config.lookahead_m for axis in "xy"),
+        *(name for part in parts for name in part.names),
     )
 
 
@@ -28,17 +69,23 @@ class Features:
     and `heading_error_cos` of the car's yaw against the centre line; `speed` and `yaw_rate` as measured;
     `last_steering` and `last_speed` as last commanded, over the largest of the action space; then for each
     look-ahead distance `ahead_x_D` and `ahead_y_D`: the centre line's point D metres further on in the frame
-    of the car's front point, x forward and y to the left.
+    of the car's front point, x forward and y to the left; then those of the parts.
     """
 
     def __init__(
-        self, config: ObservationConfig, lengths_m: np.ndarray, steering_max_deg: float, speed_max_mps: float
+        self,
+        config: ObservationConfig,
+        lengths_m: np.ndarray,
+        steering_max_deg: float,
+        speed_max_mps: float,
+        parts: Sequence[ObservationPart] = (),
     ):
         self._config = config
         self._ahead_ndist = np.asarray(config.lookahead_m) / lengths_m[:, None]
         self._steering_max_deg = steering_max_deg
         self._speed_max_mps = speed_max_mps
-        self.names = feature_names(config)
+        self._parts = parts
+        self.names = _names(config, parts)
         self.size = len(self.names)
 
     def ahead(self, ndist: np.ndarray, track_index: np.ndarray) -> np.ndarray:
@@ -75,6 +122,10 @@ class Features:
         dy = road[:, :, 1] - now.front[:, None, 1]
         cos = np.cos(now.yaw_rad)[:, None] / config.lookahead_scale_m
         sin = np.sin(now.yaw_rad)[:, None] / config.lookahead_scale_m
-        out[:, 7::2] = dx * cos + dy * sin
-        out[:, 8::2] = dy * cos - dx * sin
+        end = 7 + 2 * road.shape[1]
+        out[:, 7:end:2] = dx * cos + dy * sin
+        out[:, 8:end:2] = dy * cos - dx * sin
+        for part in self._parts:
+            begin, end = end, end + len(part.names)
+            out[:, begin:end] = part.compute(now, steering_deg, commanded_mps)
         return out

@@ -83,7 +83,13 @@ class Race:
         low, high = setup.actions.low, setup.actions.high
         # A space that only drives straight ahead has no largest angle to divide by.
         steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
-        self._features = Features(setup.observation, self.rules.tracks.length_m, steering_max_deg, high[1])
+        self._features = Features(
+            setup.observation,
+            self.rules.tracks.length_m,
+            steering_max_deg,
+            high[1],
+            setup.observation_parts,
+        )
         self.randomization = Randomization(
             randomizations or [setup.randomization] * n_cars,
             self.cars.tolist(),

@@ -16,6 +16,7 @@ from deepracer_exp.rewards.source import RewardSource, load_reward_source
 from deepracer_exp.tracks.track import Track
 
 from .action_space import ActionSpace, build_action_space
+from .observation import ObservationPart, build_parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +81,8 @@ class RaceSetup:
     car: CarConfig
     actions: ActionSpace
     observation: ObservationConfig
+    observation_parts: tuple[ObservationPart, ...]
+    """Built here: a worker process imports the classes because its training sends them, not by their names."""
     randomization: RandomizationConfig
     episode: EpisodeConfig
     reward: RewardSource
@@ -107,6 +110,7 @@ def build_setup(experiment: Experiment) -> RaceSetup:
         car=experiment.car,
         actions=build_action_space(experiment.action_space),
         observation=experiment.observation,
+        observation_parts=build_parts(experiment.observation),
         randomization=experiment.randomization,
         episode=experiment.episode,
         reward=load_reward_source(experiment.reward),

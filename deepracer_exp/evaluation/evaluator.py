@@ -17,6 +17,7 @@ from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.observation import build_parts
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.errors import BadInput
@@ -87,6 +88,7 @@ class Evaluator:
             car=experiment.car,
             actions=build_action_space(experiment.action_space),
             observation=experiment.observation,
+            observation_parts=build_parts(experiment.observation),
             randomization=conditions[USUAL],
             # Time is the protocol' business.
             episode=replace(experiment.episode, max_steps=0),

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
-from deepracer_exp.agents.ppo import PPO
+from deepracer_exp.agents.ppo import Algorithm
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.checkpoint_files import pinned, write_hashes
 
@@ -48,7 +48,7 @@ class CheckpointStore:
 
     def save(
         self,
-        agent: PPO,
+        agent: Algorithm,
         counters: Mapping[str, Any],
         training: Mapping[str, Any] | None = None,
         *,
@@ -97,7 +97,7 @@ class CheckpointStore:
                 (self.folder / label).unlink(missing_ok=True)
 
     def _write(
-        self, name: str, agent: PPO, counters: Mapping[str, Any], training: Mapping[str, Any] | None
+        self, name: str, agent: Algorithm, counters: Mapping[str, Any], training: Mapping[str, Any] | None
     ) -> None:
         # Memory-mapped tensors, the default, would end the process by SIGBUS on a full disk.
         archive = StateDictCheckpointAdapter("archive")
@@ -162,7 +162,7 @@ def read_training(folder: Path) -> dict[str, Any]:
     return dict(state.values)
 
 
-def read_agent(folder: Path, agent: PPO) -> None:
+def read_agent(folder: Path, agent: Algorithm) -> None:
     """Give an agent the networks, optimizer and schedule of a checkpoint.
 
     Raises:

@@ -1,12 +1,12 @@
 """Convergence and overfitting: the rules by which a run stops, and by which a report judges a training.
 
-`Stopping` decides row by row while a run is trained. `convergence` and `overfitting` judge a whole table of iterations,
-for reports: of a run of ours with the values of its own rule, of other logs with `LOG_RULE`.
+A `StoppingRule` decides row by row while a run is trained. `convergence` and `overfitting` judge a whole table of
+iterations, for reports: of a run of ours with the values of its own rule, of other logs with `LOG_RULE`.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.stopping import (
     CollapsedRule,
     ConvergedRule,
@@ -60,18 +61,15 @@ class Decision:
     """Why a run should end."""
 
     rule: str
-    """`reliable`, `plateau`, `converged`, `overfitting`, `collapsed` or `not_learning`."""
+    """`reliable`, `plateau`, `converged`, `overfitting`, `collapsed`, `not_learning`, or the name of another rule."""
     why: str
     """The rule's reason in words."""
-    values: dict[str, float]
+    values: dict[str, float] = field(default_factory=dict)
     """What was compared; entropy as a share, see `entropy_share`."""
-    thresholds: dict[str, Any]
+    thresholds: dict[str, Any] = field(default_factory=dict)
     """The keys of the rule."""
-
-    @property
-    def hopeless(self) -> bool:
-        """Whether more training would have led nowhere, so that the result is of no use."""
-        return self.rule in ("collapsed", "not_learning")
+    hopeless: bool = False
+    """Whether more training would have led nowhere: the run is stopped early, and its result is of no use."""
 
     def __str__(self) -> str:
         """Return rule and reason, e.g. ``reliable: 94% of the last 50 episodes completed the lap``."""
@@ -79,7 +77,7 @@ class Decision:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for summary.json."""
-        return {**asdict(self), "hopeless": self.hopeless}
+        return asdict(self)
 
     def tags(self) -> dict[str, str]:
         """Return it as tags of a run."""
@@ -113,10 +111,42 @@ def entropy_share(entropy: float, at_start: float, action_count: int | None) -> 
     return entropy / math.log(action_count) if action_count > 1 else 0.0
 
 
-class Stopping:
-    """A stopping rule and what it has seen of a run; the same rows give the same decisions."""
+class StoppingRule:
+    """Never ends a run (`stopping=none`); base class of all rules, yours included.
 
-    def __init__(self, config: StoppingConfig, action_count: int | None):
+    The same rows must give the same decisions: a resumed run passes its rows again.
+    """
+
+    def observe(self, row: Row) -> Decision | None:
+        """Return why the run should end after this iteration, None to continue.
+
+        Args:
+            row: of metrics.jsonl, in their order.
+        """
+        return None
+
+
+class ReliableRule(StoppingRule):
+    """Ends a run once a share of the last episodes completed the lap, on every track."""
+
+    def __init__(self, config: ReliableStopping):
+        self._config = config
+
+    def observe(self, row: Row) -> Decision | None:
+        """Compare the share of complete laps."""
+        share = row["lap_share"]
+        if share is None or share < self._config.lap_share:
+            return None
+        tracks = sum(key.startswith("lap_share/") for key in row)
+        more, where = (" or more", f" on each of {tracks} tracks") if tracks else ("", "")
+        why = f"{share:.0%}{more} of the last {self._config.episodes} episodes completed the lap{where}"
+        return _decision("reliable", why, {"lap_share": share}, self._config)
+
+
+class TrendRule(StoppingRule):
+    """The rules `plateau` and `entropy`, which look at moving averages."""
+
+    def __init__(self, config: PlateauStopping | EntropyStopping, action_count: int | None):
         """Set up the rule.
 
         Args:
@@ -127,19 +157,15 @@ class Stopping:
         self._action_count = action_count
         self._entropy_at_start: float | None = None
         self._before = (0, 0)
-        window = config.window if isinstance(config, PlateauStopping | EntropyStopping) else 1
+        window = config.window
         names = ("entropy", "completion", "mean_return", "laps_per_1000_steps", *EVALUATED)
         self._seen = {name: _Average(window) for name in names}
         self._race_scores_s: list[float] = []  # infinite where none is known
         self._rows = 0
 
     def observe(self, row: Row) -> Decision | None:
-        """Return why the run should end after this iteration, None to go on; rows come in their order."""
+        """Add the row to the averages and apply the rule."""
         config = self._config
-        if isinstance(config, ReliableStopping):
-            return _reliable(config, row)
-        if not isinstance(config, PlateauStopping | EntropyStopping):
-            return None
         self._rows += 1
         for name, value in self._watched(row).items():
             self._seen[name].add(value)
@@ -327,14 +353,24 @@ class _Average:
         return max(before), max(self.last(patience))
 
 
-def _reliable(config: ReliableStopping, row: Row) -> Decision | None:
-    share = row["lap_share"]
-    if share is None or share < config.lap_share:
-        return None
-    tracks = sum(key.startswith("lap_share/") for key in row)
-    more, where = (" or more", f" on each of {tracks} tracks") if tracks else ("", "")
-    why = f"{share:.0%}{more} of the last {config.episodes} episodes completed the lap{where}"
-    return _decision("reliable", why, {"lap_share": share}, config)
+def build_rule(config: StoppingConfig, action_count: int | None) -> StoppingRule:
+    """Return the rule of the group `stopping`.
+
+    Args:
+        config: the group.
+        action_count: number of discrete actions, None for a continuous action space.
+
+    Raises:
+        BadInput: a class of the user's own cannot be used.
+    """
+    match config:
+        case OwnClass():
+            return build_own(config, "stopping.target", StoppingRule)
+        case ReliableStopping():
+            return ReliableRule(config)
+        case PlateauStopping() | EntropyStopping():
+            return TrendRule(config, action_count)
+    return StoppingRule()
 
 
 def _decision(rule: str, why: str, values: dict[str, float], config: Any) -> Decision:
@@ -344,6 +380,7 @@ def _decision(rule: str, why: str, values: dict[str, float], config: Any) -> Dec
         why=why,
         values={key: round(value, 6) for key, value in values.items()},
         thresholds=thresholds,
+        hopeless=rule in ("collapsed", "not_learning"),
     )
 
 

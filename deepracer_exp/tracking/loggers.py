@@ -17,6 +17,7 @@ from typing import Any
 
 from typing_extensions import override
 
+from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.running import (
     MLflowTracking,
     TensorBoardTracking,
@@ -43,8 +44,10 @@ def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
     """Return the tracker of a config; MLflow is loaded in the background.
 
     Raises:
-        BadInput: `tracking.uri` can never work, or a package is not installed.
+        BadInput: `tracking.uri` can never work, a package is not installed, or a class cannot be used.
     """
+    if isinstance(config, OwnClass):
+        return build_own(config, "tracking.target", Tracker)
     if isinstance(config, TrackingOff):
         return Tracker()
     if isinstance(config, MLflowTracking):

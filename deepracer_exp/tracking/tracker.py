@@ -8,7 +8,7 @@ from .tracking_file import Status
 
 
 class Tracker:
-    """Records one run. This base class records nothing (`tracking=off`).
+    """Records one run. This base class of all trackers, yours included, records nothing (`tracking=off`).
 
     No method waits for a store, except `finish`. Each metric is recorded once per step, even if processes are killed
     and resumed: points wait until a checkpoint covers them (`safe_until`), so that no resumed run contradicts them,

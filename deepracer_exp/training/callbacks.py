@@ -10,7 +10,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
-from deepracer_exp.runs.convergence import Decision, Stopping
+from deepracer_exp.runs.convergence import Decision, StoppingRule, build_rule
 from deepracer_exp.runs.files import (
     BEST_LAP,
     CHECKPOINTS,
@@ -67,7 +67,7 @@ def standard_callbacks(
     """
     return [
         EvalCallback(experiment, console),
-        StoppingCallback(Stopping(experiment.stopping, setup.actions.n), tracker),
+        StoppingCallback(build_rule(experiment.stopping, setup.actions.n), tracker),
         *own,
         BudgetCallback(Alerts(experiment.budget), tracker),
         RecordCallback(),
@@ -126,7 +126,7 @@ class EvalCallback(Callback):
 class StoppingCallback(Callback):
     """Ends the run by its stopping rule."""
 
-    def __init__(self, rule: Stopping, tracker: Tracker):
+    def __init__(self, rule: StoppingRule, tracker: Tracker):
         self._rule, self._tracker = rule, tracker
         self._decision: Decision | None = None
         self._reliable: dict[str, float] | None = None

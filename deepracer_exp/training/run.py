@@ -340,7 +340,7 @@ def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> l
         why.append("with collector=async the cars begin new episodes, and workers take turns as they come")
     clocks = ("minutes", "max_cost", "experiment_minutes", "experiment_max_cost", "experiment_env_steps")
     by_clock = [name for name in clocks if getattr(experiment.budget, name) is not None]
-    if by_clock and experiment.lr_schedule.by == "fraction":
+    if by_clock and getattr(experiment.lr_schedule, "by", "fraction") == "fraction":
         why.append(f"the learning rate follows the clock (budget.{by_clock[0]}, lr_schedule.by=fraction)")
     if any(isinstance(node, ast.Global) for node in ast.walk(ast.parse(setup.reward.text))):
         why.append(

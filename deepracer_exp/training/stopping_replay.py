@@ -10,7 +10,7 @@ from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.convergence import Decision, Row, Stopping
+from deepracer_exp.runs.convergence import Decision, Row, StoppingRule, build_rule
 from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord
 
 NOTHING = "\N{EN DASH}"
@@ -64,7 +64,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
         raise BadInput(f"{record.path / METRICS}: has no iteration; nothing to apply a rule to")
     if isinstance(config, ReliableStopping):
         _check_memory(record, config)
-    stopping = Stopping(config, action_count(record))
+    stopping = build_rule(config, action_count(record))
     decision, count = None, len(rows)
     for number, row in enumerate(rows, 1):
         decision = _observed(stopping, row, record, number)
@@ -122,7 +122,7 @@ def _of(value: float | None, whole: float | None, number: str, unit: str) -> str
     return f"{NOTHING if value is None else number.format(value)} of {number.format(whole)} {unit}"
 
 
-def _observed(stopping: Stopping, row: Row, record: RunRecord, number: int) -> Decision | None:
+def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) -> Decision | None:
     try:
         return stopping.observe(row)
     except KeyError as error:

@@ -14,8 +14,7 @@ import torch
 from tensordict import TensorDictBase
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.agents.ppo import PPO, UpdateMetrics
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
 from deepracer_exp.collectors.base import Collector, worker_count
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
@@ -177,13 +176,11 @@ class Trainer:
         # update took 25 times as long.
         torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
-        with reading(f"network.hidden={list(experiment.network.hidden)}", "a network that fits into memory"):
+        with reading(f"network={experiment.network}", "a network that fits into memory"):
             self.networks = build_actor_critic(
                 experiment.network, len(feature_names(experiment.observation)), setup.actions.n, generator
             )
-        self.agent = PPO(
-            self.networks, experiment.algorithm, Schedule(experiment.lr_schedule), experiment.seed
-        )
+        self.agent = build_agent(self.networks, experiment.algorithm, experiment.lr_schedule, experiment.seed)
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}
         self.evaluation: EvalResult | None = None

@@ -8,8 +8,8 @@ from tensordict import TensorDict
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
-from deepracer_exp.agents.schedules import Schedule
-from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
+from deepracer_exp.agents.schedules import PresetSchedule
+from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig, MLPConfig
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -25,7 +25,7 @@ def load(group, name, type_):
 @pytest.mark.parametrize("action_count", [7, None])
 @pytest.mark.parametrize("name", options("network"))
 def test_every_network_acts_and_judges(name, action_count):
-    config = load("network", name, NetworkConfig)
+    config = load("network", name, MLPConfig)
     networks = build_actor_critic(config, 11, action_count, torch.Generator())
     steps = networks.value(networks.policy(TensorDict({"observation": torch.randn(3, 11)}, [3])))
     assert steps["action"].shape == ((3,) if action_count else (3, 2))
@@ -34,16 +34,16 @@ def test_every_network_acts_and_judges(name, action_count):
 
 @pytest.mark.parametrize("name", options("lr_schedule"))
 def test_every_schedule_keeps_a_positive_rate_over_a_run(name):
-    schedule = Schedule(load("lr_schedule", name, LRScheduleConfig))
+    schedule = PresetSchedule(load("lr_schedule", name, LRScheduleConfig))
     assert all(0 < schedule.factor(i, i / 100) <= 1 for i in range(101))
 
 
 @pytest.mark.parametrize("name", options("algorithm"))
 def test_every_algorithm_builds_and_names_one_length_of_an_iteration(name):
     config = load("algorithm", name, AlgorithmConfig)
-    network = load("network", "mlp_small", NetworkConfig)
+    network = load("network", "mlp_small", MLPConfig)
     networks = build_actor_critic(network, 11, 7, torch.Generator())
-    PPO(networks, config, Schedule(load("lr_schedule", "constant", LRScheduleConfig)), seed=0)
+    PPO(networks, config, PresetSchedule(load("lr_schedule", "constant", LRScheduleConfig)), seed=0)
     assert (config.frames_per_iteration is None) != (config.episodes_per_iteration is None)
 
 

@@ -1,7 +1,7 @@
 import pytest
 from pydantic import TypeAdapter
 
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.learning import LRScheduleConfig
 
 PARAMETERS = {
@@ -14,9 +14,9 @@ PARAMETERS = {
 }
 
 
-def make(kind: str, by: str = "iteration", warmup: float = 0, **changes: float) -> Schedule:
+def make(kind: str, by: str = "iteration", warmup: float = 0, **changes: float) -> PresetSchedule:
     values = {"kind": kind, "by": by, "warmup": warmup, **PARAMETERS[kind], **changes}
-    return Schedule(TypeAdapter(LRScheduleConfig).validate_python(values))
+    return PresetSchedule(TypeAdapter(LRScheduleConfig).validate_python(values))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 import yaml
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import conf_dir, groups, options
@@ -103,7 +103,7 @@ def test_every_network_is_built(name):
 
 @pytest.mark.parametrize("name", options("lr_schedule"))
 def test_every_schedule_gives_a_rate(name):
-    schedule = Schedule(composed("lr_schedule", name)[0].lr_schedule)
+    schedule = PresetSchedule(composed("lr_schedule", name)[0].lr_schedule)
     assert 0 <= schedule.factor(0, 0.0) <= 1
 
 

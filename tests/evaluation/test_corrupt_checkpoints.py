@@ -13,7 +13,7 @@ import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
@@ -33,7 +33,7 @@ def make_agent(experiment: Experiment, seed: int) -> PPO:
         build_action_space(experiment.action_space).n,
         torch.Generator().manual_seed(seed),
     )
-    return PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), seed)
+    return PPO(networks, experiment.algorithm, PresetSchedule(experiment.lr_schedule), seed)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from torchrl.checkpoint import Checkpoint
 import deepracer_exp
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
@@ -31,7 +31,7 @@ def make_agent(seed: int) -> PPO:
     with torch.no_grad():
         for parameter in networks.parameters():  # the same in every process, whatever its threads
             parameter.fill_(seed)
-    return PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), seed)
+    return PPO(networks, experiment.algorithm, PresetSchedule(experiment.lr_schedule), seed)
 
 
 def weights(agent: PPO) -> dict[str, torch.Tensor]:

@@ -11,7 +11,7 @@ from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
@@ -36,7 +36,7 @@ def agent_of(folder, name: str) -> PPO:
         build_action_space(experiment.action_space).n,
         torch.Generator(),
     )
-    agent = PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), 0)
+    agent = PPO(networks, experiment.algorithm, PresetSchedule(experiment.lr_schedule), 0)
     Checkpoint(agent=agent).load(folder / "checkpoints" / name)
     return agent
 

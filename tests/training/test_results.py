@@ -3,7 +3,7 @@ import pytest
 
 from deepracer_exp.config.stopping import NoStopping, ReliableStopping
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
-from deepracer_exp.runs.convergence import Stopping
+from deepracer_exp.runs.convergence import build_rule
 from deepracer_exp.training.metrics import RunMetrics
 
 RULE = ReliableStopping(kind="reliable", lap_share=0.75, episodes=4)
@@ -76,7 +76,7 @@ def test_the_summary_has_each_track_by_its_name_with_what_was_known_last():
 def reliable(results: RunMetrics) -> str | None:
     """Return what the stopping rule says of the results."""
     shares = {f"lap_share/{label}": None for label in results.labels}
-    decision = Stopping(RULE, 5).observe({"lap_share": results.lap_share, **shares})
+    decision = build_rule(RULE, 5).observe({"lap_share": results.lap_share, **shares})
     return decision and decision.why
 
 

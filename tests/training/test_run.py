@@ -11,7 +11,7 @@ from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
-from deepracer_exp.agents.schedules import Schedule
+from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.env.observation import Features, feature_names
@@ -316,7 +316,7 @@ def test_a_checkpoint_loads_back_into_a_fresh_agent(trained):
     networks = build_actor_critic(
         experiment.network, len(feature_names(experiment.observation)), out.shape[0], torch.Generator()
     )
-    agent = PPO(networks, experiment.algorithm, Schedule(experiment.lr_schedule), 7)
+    agent = PPO(networks, experiment.algorithm, PresetSchedule(experiment.lr_schedule), 7)
     for name in ("best", "last"):
         Checkpoint(agent=agent).load(ended.folder / "checkpoints" / name)
     loaded = agent.state_dict()["networks"]

@@ -8,7 +8,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
-from deepracer_exp.runs.convergence import Decision, Stopping, entropy_share
+from deepracer_exp.runs.convergence import Decision, build_rule, entropy_share
 
 ACTIONS = 15
 LONG = 400
@@ -23,7 +23,7 @@ def rule(*overrides: str, option: str = "entropy") -> StoppingConfig:
 def stopped_at(
     rows: Sequence[dict], config: StoppingConfig, actions: int | None = ACTIONS
 ) -> tuple[int, Decision] | tuple[None, None]:
-    stopping = Stopping(config, actions)
+    stopping = build_rule(config, actions)
     for number, row in enumerate(rows, 1):
         decision = stopping.observe(row)
         if decision is not None:

@@ -1,0 +1,144 @@
+"""Classes of your own in the configuration, by `package.module:Class` or by an entry point.
+
+Code is imported only if this command, an option file or a script names its class, or an installed package registers it.
+A stored run names its classes too, but only as text: a copied or downloaded run loads nothing by itself.
+"""
+
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import Discriminator, Field
+
+from deepracer_exp.errors import BadInput, reading
+
+GROUPS = ("network", "algorithm", "lr_schedule", "observation", "stopping", "tracking")
+"""Groups whose option may be a class of your own. Entry points are registered under `deepracer_exp.GROUP`."""
+_REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
+Reference = Annotated[str, Field(pattern=rf"^{_REFERENCE}$")]
+_GIVEN = re.compile(rf"(?:{'|'.join(GROUPS)})\.target=({_REFERENCE})")
+_allowed: set[str] = set()
+
+Base = TypeVar("Base")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnClass:
+    """A class of your own in place of one of ours."""
+
+    target: Reference
+    """`package.module:Class`, installed or in the working folder."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of its constructor."""
+
+    @property
+    def kind(self) -> str:
+        """The kind of a group whose other options have a key `kind`."""
+        return "own"
+
+
+OURS_OR_OWN = Discriminator(lambda value: "own" if isinstance(value, dict) and "target" in value else "ours")
+"""Chooses `OwnClass` where a group has a `target`; tags `ours` and `own`."""
+
+
+def own_option(group: str, name: str) -> dict[str, Any] | None:
+    """Return the values of the option `GROUP=package.module:Class` or of an entry point; None if it is neither."""
+    if group not in GROUPS:
+        return None
+    target = name if re.fullmatch(_REFERENCE, name) else registered(group).get(name)
+    if target is None:
+        return None
+    own = {"target": target, "kwargs": {}}
+    if group == "algorithm":
+        return {"defaults": ["ppo", "_self_"], **own}
+    if group == "observation":
+        return {"defaults": ["features", "_self_"], "parts": [own]}
+    return own
+
+
+@cache
+def registered(group: str) -> dict[str, str]:
+    """Return the classes that installed packages register for a group, by name."""
+    return {point.name: point.value for point in entry_points(group=f"deepracer_exp.{group}")}
+
+
+def allow(values: Any) -> None:
+    """Allow the import of every class that values of the user's own command or option files name."""
+    _allowed.update(_references(values))
+
+
+def allow_given(overrides: Sequence[str]) -> list[str]:
+    """Allow the classes of overrides `GROUP.target=package.module:Class` and return the other overrides."""
+    given = {line: found[1] for line in overrides if (found := _GIVEN.fullmatch(line))}
+    _allowed.update(given.values())
+    return [line for line in overrides if line not in given]
+
+
+def load_class(target: str, key: str) -> type:
+    """Import a class.
+
+    Args:
+        target: `package.module:Class`.
+        key: the configuration's key, for messages.
+
+    Raises:
+        BadInput: only a stored run names it, or it cannot be imported.
+    """
+    if target not in _allowed and not any(target in registered(group).values() for group in GROUPS):
+        raise BadInput(
+            f"{key}={target}: named by a stored run, which imports no code by itself; if you trust the class, repeat "
+            f"{key}={target} on the command line, or install a package that registers it as an entry point"
+        )
+    # At the end: a file of the working folder never replaces an installed module.
+    if (folder := str(Path.cwd())) not in sys.path:
+        sys.path.append(folder)
+    module, _, name = target.partition(":")
+    with reading(f"{key}={target}", "package.module:Class, installed or in the working folder"):
+        found = getattr(importlib.import_module(module), name)
+    if not isinstance(found, type):
+        raise BadInput(f"{key}={target}: is a {type(found).__name__}; accepted: a class")
+    return found
+
+
+def build_own(own: OwnClass, key: str, base: type[Base], *arguments: Any) -> Base:
+    """Build an object of a class of the user's own.
+
+    Args:
+        own: the class and its keyword arguments.
+        key: of `own.target`, for messages.
+        base: that it must derive from.
+        arguments: positional arguments, before the keyword arguments.
+
+    Raises:
+        BadInput: it cannot be imported, has another base or signature, or its constructor fails.
+    """
+    kind = load_class(own.target, key)
+    if not issubclass(kind, base):
+        raise BadInput(f"{key}={own.target}: accepted: a subclass of {base.__module__}.{base.__qualname__}")
+    signature = inspect.signature(kind)
+    try:
+        signature.bind(*arguments, **own.kwargs)
+    except TypeError as error:
+        raise BadInput(
+            f"{key}={own.target}: {error}; {kind.__name__}{signature} is called with {len(arguments)} arguments and "
+            f"kwargs {', '.join(own.kwargs) or 'none'}"
+        ) from error
+    with reading(f"{key}={own.target}"):
+        return kind(*arguments, **own.kwargs)
+
+
+def _references(values: Any) -> Iterator[str]:
+    if isinstance(values, dict):
+        if isinstance(values.get("target"), str):
+            yield values["target"]
+        values = list(values.values())
+    if isinstance(values, list):
+        for value in values:
+            yield from _references(value)

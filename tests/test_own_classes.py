@@ -1,0 +1,186 @@
+"""Classes of the user's own: the examples of docs/extending.md are trained, resumed, raced and refused."""
+
+import re
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+
+from deepracer_exp import load_policy
+from deepracer_exp.config import own_class
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.options import options
+from deepracer_exp.config.own_class import build_own
+
+from .conftest import IN_PROCESS, call_in
+
+PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+OWN = (
+    *("network=my_network:ResidualNet", "network.kwargs.width=16"),
+    *("algorithm=my_algorithm:DecayedPPO", "algorithm.kwargs.decay=1e-3"),
+    *("algorithm.frames_per_iteration=1024", "algorithm.batch_size=256"),
+    *("lr_schedule=my_schedule:Triangle", "lr_schedule.kwargs.period=4"),
+    "observation=my_features:SideForce",
+    *("stopping=my_rule:LapUnder", "stopping.kwargs.seconds=1.0"),
+)
+NAMED = (
+    *("network.target=my_network:ResidualNet", "algorithm.target=my_algorithm:DecayedPPO"),
+    *("lr_schedule.target=my_schedule:Triangle", "observation.target=my_features:SideForce"),
+    *("stopping.target=my_rule:LapUnder", "tracking.target=my_tracker:JsonTracker"),
+)
+TIMES = ["wall_clock_s", "collect_s", "update_s", "env_steps_per_s"]
+
+
+def write_examples(folder: Path) -> Path:
+    text = PAGE.read_text(encoding="utf-8")
+    for name, content in re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', text, re.DOTALL | re.MULTILINE):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _forgotten(monkeypatch):
+    """Begin like a new command, which has imported none of these classes."""
+    monkeypatch.setattr(own_class, "_allowed", set())
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for name in [name for name in sys.modules if name.startswith("my_")]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """Train with every kind of own class; return the run's folder, below the examples' folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", list(sys.path))
+        folder = write_examples(tmp_path_factory.mktemp("own"))
+        ended = call_in(folder, "train", *IN_PROCESS, *OWN, "tracking=my_tracker:JsonTracker")
+        assert ended.code == 0, ended.stderr
+        return ended.folder
+
+
+def metrics(run: Path) -> pd.DataFrame:
+    return pd.read_json(run / "metrics.jsonl", lines=True).drop(columns=TIMES)
+
+
+def curves(run: Path) -> pd.DataFrame:
+    return pd.read_json(run / "curves.jsonl", lines=True).drop(columns=TIMES)
+
+
+def at_home(run: Path) -> Path:
+    return run.parents[2]
+
+
+def test_every_class_does_its_part(run, monkeypatch):
+    monkeypatch.chdir(at_home(run))
+    rows = metrics(run)
+    assert rows["lr"].tolist() == pytest.approx([1e-3, 5.5e-4, 1e-4, 5.5e-4])
+    assert curves(run)["completion"].dropna().tolist() == pytest.approx(rows["completion"].tolist())
+    compose_experiment(OWN)  # names the classes for this process
+    policy = load_policy(run, "last", run.parents[1])
+    first = next(policy.parameters())
+    assert first.shape == (16, 20)
+
+
+def test_a_run_stores_names_of_classes_and_no_code(run):
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["network"] == {"target": "my_network:ResidualNet", "kwargs": {"width": 16}}
+    for file in run.rglob("*"):
+        if file.is_file() and file.suffix != ".png":
+            assert b"class ResidualNet" not in file.read_bytes(), file
+
+
+@pytest.mark.parametrize("command", ["resume", "clone", "evaluate", "export"])
+def test_a_stored_run_imports_no_code_by_itself(run, command):
+    extra = {"resume": ["budget.env_steps=8192"], "export": ["format=onnx"]}.get(command, [])
+    ended = call_in(at_home(run), command, run.name, *extra)
+    assert ended.code == 2
+    assert "named by a stored run, which imports no code by itself" in ended.complaint
+    assert ".target=my_" in ended.complaint
+    assert not [name for name in sys.modules if name.startswith("my_")]
+
+
+def test_a_run_is_raced_where_its_classes_are_named_again(run):
+    trials = ("evaluation.trials=1", "evaluation.laps=1", "evaluation.time_s=5", "evaluation.held_out=null")
+    ended = call_in(at_home(run), "evaluate", run.name, *trials, *NAMED[:1], NAMED[3], "checkpoint=last")
+    assert ended.code == 0, ended.stderr
+
+
+def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path):
+    write_examples(tmp_path)
+    options = (*IN_PROCESS, *OWN, "tracking=my_tracker:JsonTracker")
+    half = call_in(tmp_path, "train", *options, "budget.env_steps=2048").folder
+    own_class._allowed.clear()
+    ended = call_in(tmp_path, "resume", half.name, *NAMED, "budget.env_steps=4096")
+    assert ended.code == 0, ended.stderr
+    pd.testing.assert_frame_equal(metrics(half), metrics(run))
+    pd.testing.assert_frame_equal(curves(half), curves(run))
+
+
+def test_a_resumed_run_needs_the_same_class_importable(run, tmp_path):
+    ended = call_in(tmp_path, "evaluate", str(run), *NAMED)
+    assert ended.code == 2
+    assert "observation.target=my_features:SideForce: ModuleNotFoundError" in ended.complaint
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("network=nowhere:Net", "network.target=nowhere:Net: ModuleNotFoundError: No module named 'nowhere'"),
+        ("network=my_network:Wide", "AttributeError: module 'my_network' has no attribute 'Wide'"),
+        ("network=my_network:nn", "network.target=my_network:nn: is a module; accepted: a class"),
+        ("network=my_rule:LapUnder", "accepted: a subclass of torch.nn.modules.module.Module"),
+        ("lr_schedule=my_rule:LapUnder", "accepted: a subclass of deepracer_exp.agents.schedules.Schedule"),
+        ("algorithm=my_rule:LapUnder", "accepted: a subclass of deepracer_exp.agents.ppo.Algorithm"),
+        (
+            "observation=my_rule:LapUnder",
+            "accepted: a subclass of deepracer_exp.env.observation.ObservationPart",
+        ),
+        ("tracking=my_rule:LapUnder", "accepted: a subclass of deepracer_exp.tracking.tracker.Tracker"),
+        (
+            "stopping=my_rule:LapUnder",
+            "stopping.target=my_rule:LapUnder: missing a required argument: 'seconds'",
+        ),
+        ("algorithm.kwargs.decay=1", "algorithm: kwargs are arguments of a class of your own"),
+        ("network.kwargs.width=1", "network.kwargs: no such key"),
+    ],
+)
+def test_a_class_that_cannot_be_used_is_refused_in_one_line(override, words, tmp_path):
+    ended = call_in(write_examples(tmp_path), "train", *IN_PROCESS, override)
+    ended.assert_bad_input(words)
+
+
+def test_a_file_of_the_working_folder_replaces_no_installed_module(tmp_path):
+    (tmp_path / "colorsys.py").write_text("class Net: ...\n")
+    sys.modules.pop("colorsys", None)
+    ended = call_in(tmp_path, "train", *IN_PROCESS, "network=colorsys:Net")
+    ended.assert_bad_input("module 'colorsys' has no attribute 'Net'")
+
+
+def test_an_entry_point_is_an_option_that_stored_runs_may_use(tmp_path, monkeypatch):
+    write_examples(tmp_path)
+    package = tmp_path / "my_package-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
+    (package / "entry_points.txt").write_text("[deepracer_exp.network]\nresnet = my_network:ResidualNet\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    own_class.registered.cache_clear()
+    try:
+        assert "resnet" in options("network")
+        experiment, _ = compose_experiment(["network=resnet", "network.kwargs.width=8"])
+        own_class._allowed.clear()
+        net = build_own(experiment.network, "network.target", torch.nn.Module, 3, 2)
+        assert net(torch.zeros(3)).shape == (2,)
+    finally:
+        own_class.registered.cache_clear()
+
+
+@pytest.mark.slow
+def test_workers_drive_with_own_classes(run_at, tmp_path):
+    write_examples(tmp_path)
+    options = ("experiment=tiny", "tracking=my_tracker:JsonTracker", "collector.processes=2", *OWN)
+    ended = run_at(tmp_path, "train", *options)
+    assert ended.code == 0, ended.stderr
