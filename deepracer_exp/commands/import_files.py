@@ -28,15 +28,14 @@ def add_import(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def _import(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.config.custom_files import KEY, read_custom_files
-    from deepracer_exp.config.import_files import import_files
+    from deepracer_exp.config.custom_files import KEY, import_files, read_custom_files
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.rewards.source import load_reward_source
 
     files = read_custom_files(args.folder)
     experiment, composition = compose_experiment([override_line(KEY, args.folder)])
     load_reward_source(experiment.reward)
-    written = import_files(files, args.name, composition)
+    written = import_files(files, args.name, composition.mapping)
     print_notes(composition.notes)
     for path in written:
         print(path)

@@ -1,17 +1,24 @@
-"""The files of a DeepRacer model as overrides: which values are used, and which do not apply here."""
+"""The files of a DeepRacer model, as overrides (`custom_files=DIR`) and as option files of your own (`import`)."""
 
+import contextlib
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperparameters
 from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_bytes
 
-from .overrides import override_line
+from .experiment import safe_name
+from .options import conf_dirs
+from .overrides import override_line, parse_single
 
 KEY = "custom_files"
 
@@ -258,3 +265,90 @@ def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, 
 
 def _remarks(file: str, findings: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{file}: {what}: {why}" for what, why in findings]
+
+
+_GROUPS = {
+    "reward_function.py": "reward",
+    "model_metadata.json": "action_space",
+    "hyperparameters.json": "algorithm",
+}
+
+
+def import_files(files: CustomFiles, name: str, mapping: Mapping[str, Any]) -> list[Path]:
+    """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
+
+    Args:
+        files: the files of a folder.
+        name: name of the new options.
+        mapping: the experiment that the files describe, validated.
+
+    Returns:
+        The files written, the experiment's last.
+
+    Raises:
+        BadInput: the name cannot be used or is taken, or a file cannot be written; then none is.
+    """
+    _check_name(name)
+    texts: dict[Path, bytes] = {}
+    imported = {file: group for file, group in _GROUPS.items() if file in files.paths}
+    for file, group in imported.items():
+        values = dict(mapping[group])
+        if group == "reward":
+            texts[Path("conf/reward", f"{name}.py")] = read_bytes(files.paths[file], "a Python file")
+            values |= {"name": name, "file": f"${{conf:'reward/{name}.py'}}"}
+        elif group == "algorithm":
+            keys = [target.removeprefix("algorithm.") for target in (*TAKEN.values(), FRAMES)]
+            values = {"defaults": ["ppo"]} | {key: values[key] for key in keys if key in values}
+        texts[Path("conf", group, f"{name}.yaml")] = _option(files.paths[file], values)
+    experiment: dict[str, Any] = {
+        "defaults": [{f"override /{group}": name} for group in imported.values()],
+        "name": name,
+    }
+    if (iterations := files.learning.get("term_cond_max_episodes")) is not None:
+        experiment["budget"] = {"iterations": iterations}
+    texts[Path("conf/experiment", f"{name}.yaml")] = b"# @package _global_\n" + _option(
+        files.folder, experiment
+    )
+    searched = conf_dirs()
+    for path in texts:
+        for folder in (Path("conf"), *searched):
+            taken = folder / path.relative_to("conf")
+            if os.path.lexists(taken):
+                raise BadInput(f"--name {name}: {taken} exists already; accepted: a new name")
+    _write_all(texts)
+    return list(texts)
+
+
+def _check_name(name: str) -> None:
+    try:
+        safe_name(name)
+        plain = parse_single(f"experiment={name}").value() == name == yaml.safe_load(name)
+    except ValueError as error:
+        raise BadInput(f"--name {name!r}: {error}") from error
+    if not plain or name.endswith(".yaml"):
+        raise BadInput(
+            f"--name {name}: would not be read as a name; accepted: a name that begins with a letter"
+        )
+
+
+def _option(source: str, values: Mapping[str, Any]) -> bytes:
+    """Return the text of an option file that says where its values come from."""
+    # On one line even if the path has line breaks.
+    comment = f"# Imported from {re.sub(r'[^ -~]+', ' ', str(Path(source).resolve()))}.\n"
+    return (comment + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)).encode()
+
+
+def _write_all(texts: Mapping[Path, bytes]) -> None:
+    """Write all files or none."""
+    try:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(text)
+    except OSError as error:
+        for path in texts:
+            for remove in (path.unlink, path.parent.rmdir, path.parent.parent.rmdir):
+                with contextlib.suppress(OSError):  # not there, or a folder with other files
+                    remove()
+        raise BadInput(
+            f"{error.filename}: cannot be written ({error.strerror}); your own options are written to ./conf"
+        ) from error

@@ -44,11 +44,6 @@ def test_values_override_a_chosen_experiment():
     )
 
 
-def test_an_experiment_is_frozen():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        compose_experiment([])[0].seed = 3
-
-
 @pytest.mark.parametrize("prefix", ["", "+", "++"])
 def test_a_constant_of_the_reward_needs_no_plus(prefix):
     experiment, _ = compose_experiment([f"{prefix}reward.constants.SPEED_WEIGHT=2.5"])
@@ -75,40 +70,19 @@ def test_what_is_printed_can_be_read_back(overrides):
 
 # --- Paths and addresses are typed as they are
 
-KEYS = ["track.file", "reward.file", "action_space.file", "runs_dir", "tracking.uri"]
-
-
-def value_of(key: str, experiment: object) -> object:
-    for part in key.split("."):
-        experiment = getattr(experiment, part)
-    return experiment
-
-
-def test_every_path_and_address_is_taken_as_typed():
-    experiment, _ = compose_experiment([f"{key}=a b, (ü)=c/{key}" for key in KEYS])
-    assert [value_of(key, experiment) for key in KEYS] == [f"a b, (ü)=c/{key}" for key in KEYS]
-
 
 @pytest.mark.parametrize(
     "text",
     [
-        "/data/my tracks/oval.npy",
-        "Strecken/Nürburg (alt)/größe.npy",
-        "a,b/c=d.npy",
-        "it's/here.py",
-        'say "hi".py',
+        "a b,ü/c=d (alt).npy",
         r"C:\cars\new\it's.py",
-        "folder\\",
         "http://localhost:5000/?a=b&c={d}#e",
-        "[1]",
         "2024",
-        "true",
-        "日本/鈴鹿.npy",
-        "50%:$x.npy",
-        " leading and trailing ",
     ],
 )
 def test_a_path_or_address_needs_no_quotes(text):
+    for key in ("track.file", "reward.file", "action_space.file", "runs_dir", "tracking.uri"):
+        assert parse_single(f"{key}={text}").value() == text
     assert compose_experiment([f"reward.file={text}"])[0].reward.file == text
 
 
@@ -121,24 +95,14 @@ def test_any_text_is_taken_as_a_path(text):
     assert parse_single(f"reward.file={text}").value() == text
 
 
-@pytest.mark.parametrize("quote", ["'", '"'])
-def test_hydras_quotes_are_understood(quote):
-    override = f"track.file={quote}a b,(1)=ä.npy{quote}"
-    assert compose_experiment([override])[0].track.file == "a b,(1)=ä.npy"
-
-
-def test_a_path_may_be_taken_back():
-    assert compose_experiment(["track.file=a.npy", "track.file=null"])[0].track.file is None
-
-
-def test_the_home_folder_is_filled_in(monkeypatch, tmp_path):
+def test_quotes_home_and_environment_variables_are_understood(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert compose_experiment(["track.file=~/a.npy"])[0].track.file == str(tmp_path / "a.npy")
-
-
-def test_an_environment_variable_is_filled_in(monkeypatch):
     monkeypatch.setenv("RACES", "/data/ä b")
-    assert compose_experiment(["runs_dir=${oc.env:RACES}/x"])[0].runs_dir == "/data/ä b/x"
+    overrides = ["track.file=~/a.npy", "runs_dir=${oc.env:RACES}/x", "reward.file='a b,(1)=ä.py'"]
+    experiment, _ = compose_experiment([*overrides, "action_space.file=a.json", "action_space.file=null"])
+    assert experiment.track.file == str(tmp_path / "a.npy")
+    assert experiment.runs_dir == "/data/ä b/x"
+    assert (experiment.reward.file, experiment.action_space.file) == ("a b,(1)=ä.py", None)
 
 
 # --- What is refused
@@ -247,9 +211,7 @@ def test_values_that_contradict_each_other_are_both_named(overrides, both):
         assert part in message
 
 
-@pytest.mark.parametrize(
-    "override", ["seed", "", "=3", "seed: 1", "seed=1=2", "--multirun", "name=ü", "seed==1"]
-)
+@pytest.mark.parametrize("override", ["seed", "", "=3", "seed=1=2", "--multirun", "name=ü"])
 def test_what_is_no_override_is_told_how_to_write_one(override):
     assert "GROUP=OPTION or KEY=VALUE" in refusal(override)
 
@@ -286,14 +248,14 @@ def test_a_grid_is_every_combination_the_last_key_fastest():
     ]
 
 
-def test_a_grid_of_nothing_is_one_run():
-    assert expand_grid([]) == [[]]
-    assert expand_grid(["seed=3"]) == [["seed=3"]]
-
-
 def test_ranges_and_choices_are_lists():
     assert expand_grid(["seed=range(1,4)"]) == [["seed=1"], ["seed=2"], ["seed=3"]]
     assert expand_grid(["seed=choice(5,7)"]) == [["seed=5"], ["seed=7"]]
+    assert expand_grid(["seed=3"]) == [["seed=3"]]
+    assert expand_grid([]) == [[]]
+    for many in (["seed=range(1001)"], [f"seed={','.join(map(str, range(40)))}", "name=range(40)"]):
+        with pytest.raises(BadInput, match="more than 1,000 runs"):
+            expand_grid(many)
 
 
 @pytest.mark.parametrize(
@@ -311,15 +273,17 @@ def test_a_grid_of_paths_gives_each_path(override, files):
     assert [compose_experiment(run)[0].reward.file for run in runs] == files
 
 
-@pytest.mark.parametrize("override", ["algorithm.lr=interval(0,1)", "track=glob(re*)"])
-def test_what_is_no_plain_grid_is_refused(override):
-    with pytest.raises(BadInput, match="lists and ranges"):
-        expand_grid([override])
-
-
-def test_a_grid_of_a_malformed_override_is_refused():
-    with pytest.raises(BadInput, match="GROUP=OPTION or KEY=VALUE"):
-        expand_grid(["seed=1,2", "seed"])
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("algorithm.lr=interval(0,1)", "lists and ranges"),
+        ("track=glob(re*)", "lists and ranges"),
+        ("seed", "GROUP=OPTION or KEY=VALUE"),
+    ],
+)
+def test_a_malformed_grid_is_refused(override, says):
+    with pytest.raises(BadInput, match=says):
+        expand_grid(["name=a,b", override])
 
 
 def test_the_configuration_stays_usable_after_a_refusal(tmp_path, monkeypatch):
@@ -332,12 +296,6 @@ def test_the_configuration_stays_usable_after_a_refusal(tmp_path, monkeypatch):
 # --- An option by itself
 
 
-@pytest.mark.parametrize("option", options_of("randomization"))
-def test_an_option_by_itself_is_what_an_experiment_has_with_it(option):
-    alone = compose_option("randomization", option, RandomizationConfig)
-    assert alone == compose_experiment([f"randomization={option}"])[0].randomization
-
-
 def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
     own = tmp_path / "conf" / "randomization"
     own.mkdir(parents=True)
@@ -345,6 +303,7 @@ def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     wet, usual = (compose_option("randomization", name, RandomizationConfig) for name in ("wet", "sim2real"))
     assert wet == dataclasses.replace(usual, friction_scale=(0.3, 0.4))
+    assert usual == compose_experiment(["randomization=sim2real"])[0].randomization
 
 
 @pytest.mark.parametrize(
@@ -353,8 +312,8 @@ def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
         ("friction_scale: [0.3, wet]", ["randomization=mine", "friction_scale", "wet"]),
         ("friction: [0.3, 0.4]", ["randomization=mine", "friction", "no such key"]),
         ("friction_scale: ${car.nothing}", ["randomization=mine", "car.nothing"]),
-        ("x: [1", ["randomization/mine.yaml"]),
-        ("a: &a [*a]", ["randomization/mine.yaml"]),
+        ("x: [1", ["conf/randomization/mine.yaml"]),
+        ("a: &a [*a]", ["conf/randomization/mine.yaml"]),
     ],
 )
 def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, monkeypatch):
@@ -372,21 +331,3 @@ def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, mon
 def test_an_option_by_itself_that_is_not_there_is_refused_with_the_nearest():
     with pytest.raises(BadInput, match=r"randomization=sim2rael: no such .*did you mean sim2real"):
         compose_option("randomization", "sim2rael", RandomizationConfig)
-
-
-def test_an_option_that_is_no_mapping_is_refused(tmp_path, monkeypatch):
-    own = tmp_path / "conf" / "randomization"
-    own.mkdir(parents=True)
-    (own / "mine.yaml").write_text("- a\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(BadInput, match=r"mine\.yaml: .*has no keys"):
-        compose_option("randomization", "mine", RandomizationConfig)
-
-
-@pytest.mark.parametrize("raw", [b"x: [1", b"x: \xff", b"a: &a [*a]"])
-def test_an_option_file_that_is_no_yaml_is_named(raw, tmp_path, monkeypatch):
-    own = tmp_path / "conf" / "reward"
-    own.mkdir(parents=True)
-    (own / "mine.yaml").write_bytes(raw)
-    monkeypatch.chdir(tmp_path)
-    assert refusal("reward=mine").startswith(str(own / "mine.yaml"))

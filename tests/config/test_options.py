@@ -10,8 +10,10 @@ from deepracer_exp.errors import BadInput, nearest
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Stand in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    folder = tmp_path / "mein Ordner, (ü) = '$x'"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
 
 
 def own(folder: Path, name: str, text: str) -> Path:
@@ -27,15 +29,11 @@ BUDGET = "defaults: [default, _self_]\nenv_steps: 777\n"
 def test_options_of_the_working_folder_stand_beside_the_projects(here):
     before = options("budget")
     own(here, "budget/mine.yaml", BUDGET)
-    assert options("budget") == sorted([*before, "mine"])
+    own(here, "budget/other.yaml", "defaults: [short]\niterations: 3\n")
+    assert options("budget") == sorted([*before, "mine", "other"])
     experiment, composition = compose_experiment(["budget=mine"])
     assert (experiment.budget.env_steps, composition.choices["budget"]) == (777, "mine")
-    assert compose_experiment(["budget=short"])[0].budget.env_steps == 200_000
-
-
-def test_an_option_of_ones_own_may_begin_with_one_of_the_projects(here):
-    own(here, "budget/mine.yaml", "defaults: [short]\niterations: 3\n")
-    budget = compose_experiment(["budget=mine"])[0].budget
+    budget = compose_experiment(["budget=other"])[0].budget
     assert (budget.env_steps, budget.iterations) == (200_000, 3)
 
 
@@ -57,7 +55,9 @@ def test_a_namesake_that_is_not_the_same_is_refused_whatever_is_chosen(here):
         options("track")
 
 
-def test_the_projects_own_folder_is_searched_once(monkeypatch):
+def test_the_projects_own_folder_is_searched_once(here, monkeypatch):
+    (here / "conf").write_text("a file of that name")
+    assert conf_dirs() == [conf_dir().resolve()]
     monkeypatch.chdir(conf_dir().parent)
     assert conf_dirs() == [conf_dir().resolve()]
 
@@ -69,19 +69,6 @@ def test_a_conf_folder_of_something_else_does_no_harm(here):
     (here / "conf/budget").write_text("a file")
     assert groups() == before
     assert compose_experiment([])[0].seed == 0
-
-
-def test_a_file_called_conf_does_no_harm(here):
-    (here / "conf").write_text("")
-    assert conf_dirs() == [conf_dir().resolve()]
-
-
-def test_any_path_of_the_working_folder_will_do(tmp_path, monkeypatch):
-    folder = tmp_path / "mein Ordner, (ü) = '$x'"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    own(folder, "budget/mine.yaml", BUDGET)
-    assert compose_experiment(["budget=mine"])[0].budget.env_steps == 777
 
 
 @pytest.mark.parametrize(
@@ -108,9 +95,6 @@ def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(here):
     several = compose_experiment(["track=[mine,Oval_track]", "track.mine.weight=2"])[0].tracks
     assert [(track.name, track.weight) for track in several.values()] == [("mine", 2), ("Oval_track", 1)]
     assert "mine" in compose_experiment(["track=all"])[0].tracks
-
-
-def test_a_track_of_ones_own_does_not_take_the_name_of_a_world(here):
     own(here, "track/Oval_track.yaml", "width_m: 0.76\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
     with pytest.raises(BadInput, match=r"Oval_track\.yaml: the project has another track of that name"):
         compose_experiment([])
