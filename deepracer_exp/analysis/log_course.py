@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
 
+from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.deepracer.worlds import find_world, worlds
@@ -52,27 +51,29 @@ def find_courses(recording: Recording) -> Courses:
     course without a known name, or with one that does not match where the car drove, is recognised by its waypoint
     numbers, its length and the positions of the car.
     """
-    own, problems = _own_courses(recording)
+    own: Mapping[str, TrackConfig] = {}
+    problems: list[LogProblem] = []
+    for file in recording.files:
+        if file.name == CONFIG:
+            try:
+                own = parse_experiment(read_config(file.parent)).tracks
+            except BadInput as error:
+                problems.append(LogProblem(str(file), None, str(error)))
+            break
     tracks: dict[str, Track] = {}
-    names = recording.steps["track"].astype("category")
-    for code, name in enumerate(names.cat.categories):
-        rows = np.flatnonzero(names.cat.codes.to_numpy() == code)
-        if not len(rows):
-            continue
-        sample = recording.steps.iloc[rows[:: max(1, len(rows) // _SAMPLE)]]
-        logged = str(name) or recording.track or ""
-        config, world = own.get(logged), None if logged in own else _recognised(logged, sample)
-        if config is None and world is None:
-            problems.append(LogProblem(recording.name, None, _unknown(logged, sample)))
-            continue
+    names = recording.steps["track"].astype(str).to_numpy()
+    for name in pd.unique(names):
+        rows = recording.steps.iloc[np.flatnonzero(names == name)]
+        sample = rows.iloc[:: max(1, len(rows) // _SAMPLE)]
+        logged = name or recording.track or ""
         try:
-            both = [
-                Track.from_config(config, reversed=back)
-                if config is not None
-                else world_track(str(world), back)
-                for back in (False, True)
-            ]
-            tracks[str(name)] = directed(both[0], both[1], recording.steps.iloc[rows])
+            if logged in own:
+                both = [Track.from_config(own[logged], reversed=back) for back in (False, True)]
+            elif (world := _recognised(logged, sample)) is not None:
+                both = [world_track(world, back) for back in (False, True)]
+            else:
+                raise BadInput(_unknown(logged, sample))
+            tracks[name] = directed(both[0], both[1], rows)
         except BadInput as error:
             problems.append(LogProblem(recording.name, None, str(error)))
     return Courses(tracks=tracks, problems=tuple(problems))
@@ -93,33 +94,6 @@ def catalogue_track(name: str, reversed: bool = False) -> Track:
             "lists, or the file of a route (.npy) or of knots (.yaml)"
         )
     return world_track(name, reversed)
-
-
-def _own_courses(recording: Recording) -> tuple[dict[str, TrackConfig], list[LogProblem]]:
-    """Return the courses of a run's config.yaml by their names in its trace."""
-    for file in recording.files:
-        if file.name == CONFIG:
-            try:
-                track = read_config(file.parent).get("track")
-                one = isinstance(track, Mapping) and "name" in track
-                parts = (
-                    {} if not isinstance(track, Mapping) else {str(track["name"]): track} if one else track
-                )
-                return {str(name): _typed(part, str(file)) for name, part in parts.items()}, []
-            except BadInput as error:
-                return {}, [LogProblem(str(file), None, str(error))]
-    return {}, []
-
-
-def _typed(values: Mapping[str, Any], source: str) -> TrackConfig:
-    try:
-        return TypeAdapter(TrackConfig).validate_python(dict(values))
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise BadInput(
-            f"{source}: track.{key}: {first['msg']}; accepted: a course as in conf/track/"
-        ) from None
 
 
 def _recognised(logged: str, sample: pd.DataFrame) -> str | None:
@@ -159,21 +133,19 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
     if np.mean((waypoint == found.previous) | (waypoint == found.next)) >= _SAME_NUMBERS:
         return course
     # The first waypoint of a closed course is at 0 and at 1, so the mean is taken on the circle.
-    circle = pd.DataFrame({"x": np.cos(2 * np.pi * found.ndist), "y": np.sin(2 * np.pi * found.ndist)})
-    mean = circle.groupby(waypoint).mean()
-    known = mean.index.to_numpy()
-    place = np.unwrap(np.arctan2(mean["y"], mean["x"]) / (2 * np.pi), period=1.0)
+    turn = pd.Series(np.exp(2j * np.pi * found.ndist)).groupby(waypoint).sum()
+    known = turn.index.to_numpy()
+    place = np.unwrap(np.angle(turn) / (2 * np.pi), period=1.0)
     if len(known) < 2 or (np.diff(place) <= 0).any() or place[-1] - place[0] >= 1.0:
         return course
     numbers = np.arange(known[-1] + 1)
     pace = (place[-1] - place[0]) / (known[-1] - known[0])
     placed = np.interp(numbers, known, place) + pace * np.minimum(numbers - known[0], 0)
     # No car drove beyond the highest number in the log, so the spacing there is arbitrary.
-    rest = np.arange(placed[-1] + pace, placed[0] + 1.0 - 0.5 * pace, pace)
-    at = np.concatenate([placed, rest])
+    at = np.concatenate([placed, np.arange(placed[-1] + pace, placed[0] + 1.0 - 0.5 * pace, pace)]) % 1.0
     own = waypoint_positions(course)
-    borders = (course.inner[:, 0], course.inner[:, 1], course.outer[:, 0], course.outer[:, 1])
-    rows = np.column_stack([course.points_at(at % 1.0), *(np.interp(at % 1.0, own, one) for one in borders)])
+    borders = [np.interp(at, own, axis) for axis in (*course.inner.T, *course.outer.T)]
+    rows = np.column_stack([course.points_at(at), *borders])
     rows = np.vstack([rows, rows[:1]]) if course.closed else rows
     return Track.from_route(rows, course.name, title=course.title, floor=course.floor)
 
@@ -186,12 +158,10 @@ def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
     """
     rows = steps[(steps["closest_waypoint"] >= 0) & (steps["episode_status"] != "prepare")]
     middle = rows.groupby("closest_waypoint")[["X", "Y"]].median()
-    known = middle.index.to_numpy()
-    length_m = float(rows["track_len"].median()) if len(rows) else 0.0
-    if len(known) < _LEAST_WAYPOINTS or len(known) < _INSIDE * (known[-1] + 1):
+    if len(middle) < max(_LEAST_WAYPOINTS, _INSIDE * (int(rows["closest_waypoint"].max()) + 1)):
         return None
-    numbers = np.arange(known[-1] + 1)
-    center = np.column_stack([np.interp(numbers, known, middle[axis]) for axis in ("X", "Y")])
+    center = middle.reindex(range(int(middle.index[-1]) + 1)).interpolate(limit_direction="both").to_numpy()
+    length_m = float(rows["track_len"].median())
     ring = np.vstack([center, center[:1]])
     steps_m = np.linalg.norm(np.diff(ring, axis=0), axis=1)
     if abs(steps_m.sum() - length_m) > _ESTIMATE_NEAR * length_m or steps_m[-1] > 10 * np.median(steps_m):
@@ -201,15 +171,13 @@ def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     on_road = rows[rows["all_wheels_on_track"].to_numpy(bool)]
     at = on_road["closest_waypoint"].to_numpy(np.intp)
-    aside = ((on_road[["X", "Y"]].to_numpy(np.float64) - center[at]) * left[at]).sum(axis=1)
-    half_m = float(np.quantile(np.abs(aside), 0.98)) + _HALF_CAR_M if len(aside) else 2 * _HALF_CAR_M
-    counter_clockwise = shapely.is_ccw(shapely.LinearRing(ring))
-    side = left if counter_clockwise else -left
+    aside = np.abs(((on_road[["X", "Y"]].to_numpy(np.float64) - center[at]) * left[at]).sum(axis=1))
+    half_m = _HALF_CAR_M + (float(np.quantile(aside, 0.98)) if len(aside) else _HALF_CAR_M)
+    side = left if shapely.is_ccw(shapely.LinearRing(ring)) else -left
     route = np.column_stack([center, center + half_m * side, center - half_m * side])
+    title = f"{name or 'unknown'} (drawn from recorded positions)"
     try:
-        return Track.from_route(
-            np.vstack([route, route[:1]]), name, title=f"{name or 'unknown'} (drawn from recorded positions)"
-        )
+        return Track.from_route(np.vstack([route, route[:1]]), name, title=title)
     except BadInput:
         return None
 
@@ -223,13 +191,11 @@ def waypoint_positions(course: Track) -> NDArray[np.float64]:
 def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
     """Return the course in the direction in which progress grows in most of the first rows."""
     head = steps.iloc[: 10 * _SAMPLE].sort_values("episode", kind="stable")
-    points = head[["X", "Y"]].to_numpy(np.float64)
-    gone = np.diff(forward.project(points).ndist)
+    gone = np.diff(forward.project(head[["X", "Y"]].to_numpy(np.float64)).ndist)
     gone = (gone + 0.5) % 1.0 - 0.5 if forward.closed else gone
     gained = np.diff(head["progress"].to_numpy(np.float64))
-    same = head["episode"].to_numpy()[1:] == head["episode"].to_numpy()[:-1]
-    looked_at = same & (np.abs(gained) < 20.0) & np.isfinite(gone)
-    return backward if float(np.sum((gone * gained)[looked_at])) < 0.0 else forward
+    counted = (np.diff(head["episode"]) == 0) & (np.abs(gained) < 20.0) & np.isfinite(gone)
+    return backward if float(np.sum((gone * gained)[counted])) < 0.0 else forward
 
 
 def _unknown(name: str, rows: pd.DataFrame) -> str:

@@ -1,5 +1,6 @@
 """The report of a log: one HTML page with findings, figures and tables that needs no other file."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,11 +36,10 @@ from .charts.rewards import (
     scatter_time_reward,
     value_map,
 )
-from .charts.runs import generalisation_matrix, generations, runs_compared
+from .charts.runs import generalisation_matrix, generations, run_folder, runs_compared
 from .charts.training import evaluations, learning_vs_lap_time, quarters, stability, training_progress
 from .findings import Finding, findings
 from .log_tables import (
-    MOST_FILES,
     best_laps,
     candidate_rows,
     count,
@@ -47,14 +47,13 @@ from .log_tables import (
     headline,
     iteration_rows,
     problem_rows,
-    settings,
 )
 from .log_view import LogView, prepare
 from .next_steps import next_steps, outcome
 from .page import Plot, plot_of, render
 from .reward_comparison import RewardComparison
-from .run_folders import clone_chain, evaluation_results, run_folder
 
+MOST_FILES = 400
 _BESIDE, _PAID = "Generations, runs and tracks", "What the reward pays for"
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "How it learned": (training_progress, learning_vs_lap_time, evaluations, quarters, stability),
@@ -85,65 +84,6 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
 
 
 @dataclass(frozen=True)
-class Section:
-    """Figures that belong together."""
-
-    title: str
-    charts: Sequence[Chart]
-
-
-def draw_sections(
-    view: LogView, others: Sequence[LogView] = (), terms: pd.DataFrame | None = None
-) -> list[Section]:
-    """Return all figures for which there is data, in the order of the page.
-
-    Args:
-        view: the recording.
-        others: recordings to compare it with.
-        terms: of its reward function, as `reward_terms` takes them.
-    """
-    sections = SECTIONS if view.trained else RACES
-    charts: dict[str, list[Chart | None]] = {
-        title: [draw_one(view) for draw_one in some] for title, some in sections.items()
-    }
-    if terms is not None:
-        charts[_PAID].append(reward_terms(view, terms))
-    views = [view, *others]
-    charts[_BESIDE] = [
-        runs_compared(views),
-        generations(clone_chain(views) or [view]),
-        generalisation_matrix(views, [evaluation_results(one) for one in views]),
-    ]
-    known = {title: [chart for chart in some if chart is not None] for title, some in charts.items()}
-    return [Section(title, some) for title, some in known.items() if some]
-
-
-def write_report(
-    recording: Recording,
-    path: Path,
-    compare: Sequence[Recording] = (),
-    target_s: float | None = None,
-    replay: RewardComparison | None = None,
-) -> Path:
-    """Write the page of a recording atomically.
-
-    Args:
-        recording: of any format.
-        path: of the page.
-        compare: other recordings to compare it with.
-        target_s: lap time whose chance is estimated.
-        replay: of another reward function.
-
-    Raises:
-        BadInput: a recording has no steps.
-        OSError: the page cannot be written.
-    """
-    view = prepare(recording)
-    others = [prepare(other) for other in compare]
-    return write_page(path, LogPage(view, findings(view, target_s), others, replay))
-
-
-@dataclass(frozen=True)
 class LogPage:
     """The contents of a page."""
 
@@ -158,6 +98,17 @@ class LogPage:
     """What each term of the reward function contributed, as `reward_terms` takes it."""
 
 
+def write_report(recording: Recording, path: Path) -> Path:
+    """Write the page of a recording atomically.
+
+    Raises:
+        BadInput: the recording has no steps.
+        OSError: the page cannot be written.
+    """
+    view = prepare(recording)
+    return write_page(path, LogPage(view, findings(view)))
+
+
 def write_page(path: Path, page: LogPage) -> Path:
     """Write the page of a prepared recording atomically.
 
@@ -167,23 +118,36 @@ def write_page(path: Path, page: LogPage) -> Path:
     return atomic_write(path, html(page))
 
 
+def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
+    """Return all figures for which there is data by their section, in the order of the page."""
+    view, views = page.view, [page.view, *page.others]
+    drawn: dict[str, list[Chart | None]] = {}
+    if page.replay is not None:
+        drawn["Another reward function"] = list(page.replay.charts)
+    sections = SECTIONS if view.trained else RACES
+    drawn |= {title: [draw_one(view) for draw_one in some] for title, some in sections.items()}
+    drawn[_BESIDE] += [runs_compared(views), generations(views), generalisation_matrix(views)]
+    if page.terms is not None:
+        drawn[_PAID].append(reward_terms(view, page.terms))
+    known = {title: [chart for chart in some if chart is not None] for title, some in drawn.items()}
+    return {title: some for title, some in known.items() if some}
+
+
 def html(page: LogPage) -> str:
     """Return the page of a prepared recording."""
     view, recording = page.view, page.view.recording
-    sections = draw_sections(view, page.others, page.terms)
-    if page.replay is not None and page.replay.charts:
-        sections = [Section("Another reward function", page.replay.charts), *sections]
-    plots = {chart.name: plot_of(chart) for section in sections for chart in section.charts}
-    captions = {chart.name: chart.caption for section in sections for chart in section.charts}
-    came_of_it, steps = _first_screen(page)
+    sections = draw_sections(page)
+    plots = {chart.name: plot_of(chart) for some in sections.values() for chart in some}
+    outcome_rows, steps = _first_screen(page)
     files = [readable(str(file)) for file in recording.files]
+    settings = sorted((recording.hyperparameters or {}).items())
     return render(
         __package__,
         "log_report.html.j2",
         list(plots.values()),
         name=view.name,
         headline=headline(view),
-        outcome=came_of_it,
+        outcome=outcome_rows,
         steps=steps,
         picture=plots.get("lap_line"),
         findings=[_finding(one, plots) for one in page.findings],
@@ -192,11 +156,11 @@ def html(page: LogPage) -> str:
         replay=page.replay,
         candidates=candidate_rows(view),
         laps=best_laps(view),
-        sections=[(one.title, [plots[chart.name] for chart in one.charts]) for one in sections],
-        captions=captions,
+        sections=[(title, [plots[chart.name] for chart in some]) for title, some in sections.items()],
+        captions={chart.name: chart.caption for some in sections.values() for chart in some},
         iterations=iteration_rows(view),
         facts=facts(view),
-        settings=settings(recording.hyperparameters),
+        settings=[(key, value if isinstance(value, str) else json.dumps(value)) for key, value in settings],
         reward=recording.reward_source,
         file_count=count(len(files), "file"),
         files=files[:MOST_FILES],
@@ -221,13 +185,12 @@ def _first_screen(page: LogPage) -> tuple[list[tuple[str, str]], list[tuple[str,
 
 
 def _finding(one: Finding, plots: Mapping[str, Plot]) -> dict[str, Any]:
-    numbers = [*one.values.items(), *((f"{key} (threshold)", value) for key, value in one.thresholds.items())]
+    numbers = dict(one.values) | {f"{key} (threshold)": value for key, value in one.thresholds.items()}
     return {
         "sentence": one.sentence,
         "figure": one.figure if one.figure in plots else None,
-        "numbers": [(key.replace("_", " "), _shown(value)) for key, value in numbers],
+        "numbers": [
+            (key.replace("_", " "), f"{value:.5g}" if isinstance(value, float) else str(value))
+            for key, value in numbers.items()
+        ],
     }
-
-
-def _shown(value: object) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)

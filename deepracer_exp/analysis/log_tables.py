@@ -1,10 +1,8 @@
-"""The tables of a report: iterations, candidates, best laps, facts, settings, and problems while reading."""
+"""The tables of a report: iterations, candidates, best laps, facts, and problems while reading."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 
@@ -15,128 +13,6 @@ NONE = "\N{EN DASH}"
 MOST_ITERATIONS = 300
 MOST_LAPS = 10
 MOST_PROBLEMS = 200
-MOST_FILES = 400
-
-
-@dataclass(frozen=True)
-class Table:
-    """Texts in rows."""
-
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    words: int = 0
-    """The first columns that hold words; the others hold numbers."""
-    left_out: int = 0
-    """Number of rows that were left out to keep the page short."""
-
-
-def iteration_rows(view: LogView) -> Table:
-    """Return results and metrics of each iteration; of very many, every second, third, ... and the last."""
-    table = view.iterations
-    known = {
-        name: column
-        for name, column in _ITERATION_COLUMNS.items()
-        if (table[name] != "" if name == "checkpoint" else table[name].notna()).any()
-    }
-    every = math.ceil(len(table) / MOST_ITERATIONS) or 1
-    shown = table.iloc[::-1].iloc[::every].iloc[::-1]
-    return _table(shown, known, len(table) - len(shown))
-
-
-def candidate_rows(view: LogView) -> Table:
-    """Return the iterations whose policy is worth submitting, the best first."""
-    return _table(candidates_of(view), _CANDIDATE_COLUMNS)
-
-
-def best_laps(view: LogView) -> Table:
-    """Return the fastest complete laps of the training, the fastest first."""
-    laps = view.episodes.dropna(subset="lap_time_s").sort_values("lap_time_s", kind="stable")
-    columns = _LAP_COLUMNS
-    if not view.trained:
-        columns = {"stream": ("Race", "")} | {k: v for k, v in columns.items() if k != "iteration"}
-    return _table(laps.head(MOST_LAPS), columns, max(0, len(laps) - MOST_LAPS))
-
-
-def problem_rows(view: LogView) -> Table:
-    """Return what could not be read, where and why."""
-    rows = [
-        (problem.file, NONE if problem.line is None else f"{problem.line:,}", problem.reason)
-        for problem in view.problems[:MOST_PROBLEMS]
-    ]
-    return Table(("File", "Line", "Why"), tuple(rows), 3, max(0, len(view.problems) - MOST_PROBLEMS))
-
-
-def facts(view: LogView) -> list[tuple[str, str]]:
-    """Return course, action space and evaluations in names and values."""
-    recording, course = view.recording, view.course
-    found: list[tuple[str, str]] = []
-    if course is not None:
-        way = ", reversed" if course.reversed else ""
-        found.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
-    others = [name for name in recording.steps["track"].unique() if str(name) not in ("", view.track_name)]
-    if others:
-        found.append(("Other courses in it", ", ".join(map(str, others))))
-    if recording.metadata is not None:
-        actions = recording.metadata.actions
-        space = "continuous" if not actions else f"{len(actions)} actions"
-        found.append(("Action space", f"{space}; sensors {', '.join(recording.metadata.sensor) or NONE}"))
-    if len(view.evaluation_episodes):
-        streams = view.evaluation_episodes["stream"].nunique()
-        found.append(
-            ("Evaluations", f"{len(view.evaluation_episodes):,} episodes in {count(streams, 'evaluation')}")
-        )
-    return found
-
-
-def settings(values: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """Return hyperparameters as texts."""
-    return [
-        (str(key), value if isinstance(value, str) else json.dumps(value))
-        for key, value in sorted((values or {}).items())
-    ]
-
-
-def headline(view: LogView) -> str:
-    """Return in one sentence how much was driven and how well; episodes cut off by the end of the log do not count."""
-    finished = count(int(view.episodes["ended"].sum()), "finished episode")
-    laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
-    if view.trained:
-        sentence = f"{count(len(view.steps), 'control step')} in {finished} and "
-        sentence += count(len(view.iterations), "iteration")
-        more = int(view.iterations["episodes"].sum()) - int(view.episodes["ended"].sum())
-        if more > 0:
-            sentence += f"; {count(more, 'more episode')} known from metrics files only"
-            laps = int(view.iterations["complete"].sum())
-            best_s = view.iterations["lap_time_best_s"].min()
-    else:
-        races = count(view.episodes["stream"].nunique(), "race")
-        sentence = f"No training; {count(len(view.steps), 'control step')} in {finished} of {races}"
-    if not laps:
-        return f"{sentence}; no complete lap."
-    best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
-    return f"{sentence}; {count(laps, 'complete lap')}{best}."
-
-
-def count(number: int, what: str) -> str:
-    """Return a number of things in words."""
-    return f"{number:,} {what}{'s' * (number != 1)}"
-
-
-def number(value: Any, form: str) -> str:
-    """Return a value as text, a dash where it is not known."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return NONE
-    return format(value, form)
-
-
-def _table(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]], left_out: int = 0) -> Table:
-    """Return columns with their heads and formats."""
-    rows = [
-        tuple(number(value, columns[name][1]) for name, value in row.items())
-        for row in table[list(columns)].to_dict("records")
-    ]
-    return Table(tuple(head for head, _ in columns.values()), tuple(rows), left_out=left_out)
-
 
 _ITERATION_COLUMNS = {
     "iteration": ("Iteration", "d"),
@@ -155,6 +31,7 @@ _ITERATION_COLUMNS = {
     "eval_completion": ("Evaluated, %", ".1f"),
     "held_out_completion": ("Held out, %", ".1f"),
 }
+"""Columns with their heads and formats."""
 _CANDIDATE_COLUMNS = {
     "iteration": ("Iteration", "d"),
     "lap_time_p25_s": ("25th percentile, s", ".2f"),
@@ -174,3 +51,109 @@ _LAP_COLUMNS = {
     "speed_mps": ("Speed commanded, m/s", ".2f"),
     "reward": ("Reward", ".4g"),
 }
+
+
+@dataclass(frozen=True)
+class Table:
+    """Texts in rows."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    words: int = 0
+    """The first columns that hold words; the others hold numbers."""
+    left_out: int = 0
+    """Number of rows that were left out to keep the page short."""
+
+
+def table_of(rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], left_out: int = 0) -> Table:
+    """Return columns of a table as texts, by their heads and formats; a dash where a number is not known."""
+    texts = [
+        tuple(
+            NONE if isinstance(row[name], float) and not math.isfinite(row[name]) else format(row[name], form)
+            for name, (_, form) in columns.items()
+        )
+        for row in rows.to_dict("records")
+    ]
+    return Table(tuple(head for head, _ in columns.values()), tuple(texts), left_out=left_out)
+
+
+def iteration_rows(view: LogView) -> Table:
+    """Return results and metrics of each iteration; of very many, every second, third, ... and the last."""
+    table = view.iterations
+    known = table.replace({"checkpoint": ""}, None).notna().any()
+    every = math.ceil(len(table) / MOST_ITERATIONS) or 1
+    shown = table.iloc[::-1].iloc[::every].iloc[::-1]
+    columns = {name: column for name, column in _ITERATION_COLUMNS.items() if known[name]}
+    return table_of(shown, columns, len(table) - len(shown))
+
+
+def candidate_rows(view: LogView) -> Table:
+    """Return the iterations whose policy is worth submitting, the best first."""
+    return table_of(candidates_of(view), _CANDIDATE_COLUMNS)
+
+
+def best_laps(view: LogView) -> Table:
+    """Return the fastest complete laps of the training, or of races without one, the fastest first."""
+    laps = view.episodes.dropna(subset="lap_time_s").sort_values("lap_time_s", kind="stable")
+    columns = _LAP_COLUMNS
+    if not view.trained:
+        columns = {"stream": ("Race", "")} | {k: v for k, v in columns.items() if k != "iteration"}
+    return table_of(laps.head(MOST_LAPS), columns, max(0, len(laps) - MOST_LAPS))
+
+
+def problem_rows(view: LogView) -> Table:
+    """Return what could not be read, where and why."""
+    rows = [
+        (problem.file, NONE if problem.line is None else f"{problem.line:,}", problem.reason)
+        for problem in view.problems[:MOST_PROBLEMS]
+    ]
+    return Table(("File", "Line", "Why"), tuple(rows), 3, max(0, len(view.problems) - MOST_PROBLEMS))
+
+
+def facts(view: LogView) -> list[tuple[str, str]]:
+    """Return course, action space and evaluations in names and values."""
+    recording, course = view.recording, view.course
+    found: list[tuple[str, str]] = []
+    if course is not None:
+        way = ", reversed" if course.reversed else ""
+        found.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
+    others = [
+        str(name) for name in recording.steps["track"].unique() if str(name) not in ("", view.track_name)
+    ]
+    if others:
+        found.append(("Other courses in it", ", ".join(others)))
+    if recording.metadata is not None:
+        actions = recording.metadata.actions
+        space = "continuous" if not actions else f"{len(actions)} actions"
+        found.append(("Action space", f"{space}; sensors {', '.join(recording.metadata.sensor) or NONE}"))
+    driven = view.evaluation_episodes
+    if len(driven):
+        streams = count(driven["stream"].nunique(), "evaluation")
+        found.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))
+    return found
+
+
+def headline(view: LogView) -> str:
+    """Return in one sentence how much was driven and how well; episodes cut off by the end of the log do not count."""
+    ended = int(view.episodes["ended"].sum())
+    finished, steps = count(ended, "finished episode"), count(len(view.steps), "control step")
+    laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
+    if view.trained:
+        sentence = f"{steps} in {finished} and {count(len(view.iterations), 'iteration')}"
+        more = int(view.iterations["episodes"].sum()) - ended
+        if more > 0:
+            sentence += f"; {count(more, 'more episode')} known from metrics files only"
+            laps = int(view.iterations["complete"].sum())
+            best_s = view.iterations["lap_time_best_s"].min()
+    else:
+        races = count(view.episodes["stream"].nunique(), "race")
+        sentence = f"No training; {steps} in {finished} of {races}"
+    if not laps:
+        return f"{sentence}; no complete lap."
+    best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
+    return f"{sentence}; {count(laps, 'complete lap')}{best}."
+
+
+def count(number: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{number:,} {what}{'s' * (number != 1)}"

@@ -42,10 +42,8 @@ class LogView:
     """Their episodes, `tables.EPISODE_COLUMNS`."""
     iterations: pd.DataFrame
     """Their iterations, `tables.ITERATION_COLUMNS`."""
-    evaluations: pd.DataFrame
-    """Steps on the course of all other streams, ordered by stream, episode and time, with the same columns."""
     evaluation_episodes: pd.DataFrame
-    """Their episodes, with `stream`."""
+    """Episodes on the course of all other streams, with `stream`."""
     problems: tuple[LogProblem, ...]
     """Those of the recording and of its courses."""
     discount: float
@@ -134,27 +132,21 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     name = track if track in logged else logged[0]
     if track is not None and track not in logged and len(logged) > 1:
         raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {', '.join(logged)}")
-    courses = find_courses(recording)
+    found = find_courses(recording)
     here = (names == name).to_numpy()
-    course, problems = courses.tracks.get(name), courses.problems
-    if track is not None and track not in logged:
-        course, problems = directed(catalogue_track(track), catalogue_track(track, True), steps[here]), ()
     driven_on = steps[here]
+    course, problems = found.tracks.get(name), found.problems
+    if track is not None and track not in logged:
+        course, problems = directed(catalogue_track(track), catalogue_track(track, True), driven_on), ()
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
-    trained, first = _ordered(steps, here & training)
-    driven, evaluation_first = _ordered(steps, here & ~training)
-    trained = add_derived(trained, first, course, discount)
-    driven = add_derived(driven, evaluation_first, course, discount)
-    episodes = episode_table(trained, first)
-    evaluation_episodes = episode_table(driven, evaluation_first)
-    streams = driven["stream"].to_numpy()[np.flatnonzero(evaluation_first)]
-    evaluation_episodes = evaluation_episodes.assign(stream=streams)
+    trained, episodes = _episodes(steps, here & training, course, discount)
+    driven, raced = _episodes(steps, here & ~training, course, discount)
+    raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
     iterations = iteration_table(recording, trained, episodes)
     if not training.any():
-        number = np.cumsum(evaluation_first) - 1
-        trained = driven.assign(episode=number)
-        episodes = evaluation_episodes.assign(episode=np.arange(len(evaluation_episodes)))
+        trained = driven.assign(episode=np.cumsum(first_rows(driven)) - 1)
+        episodes = raced.assign(episode=np.arange(len(raced)))
     return LogView(
         name=recording.name,
         trained=bool(training.any()),
@@ -164,18 +156,22 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         steps=trained,
         episodes=episodes,
         iterations=iterations,
-        evaluations=driven,
-        evaluation_episodes=evaluation_episodes,
+        evaluation_episodes=raced,
         problems=(*recording.problems, *problems),
         discount=discount,
     )
 
 
-def _ordered(steps: pd.DataFrame, wanted: NDArray[np.bool_]) -> tuple[pd.DataFrame, NDArray[np.bool_]]:
-    """Return the wanted rows, episode by episode, and whether each is its episode's first one."""
+def _episodes(
+    steps: pd.DataFrame, wanted: NDArray[np.bool_], course: Track | None, discount: float
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the wanted rows, episode by episode and with derived columns, and the table of their episodes."""
     rows = steps if wanted.all() else steps[wanted]
     streams, episodes = rows["stream"].astype("category").cat.codes.to_numpy(), rows["episode"].to_numpy()
     key = streams.astype(np.int64) * (int(episodes.max(initial=0)) + 1) + episodes
     if (np.diff(key) < 0).any():
         rows = rows.iloc[np.argsort(key, kind="stable")]
-    return rows.reset_index(drop=True), first_rows(rows)
+    rows = rows.reset_index(drop=True)
+    first = first_rows(rows)
+    rows = add_derived(rows, first, course, discount)
+    return rows, episode_table(rows, first)

@@ -58,11 +58,6 @@ class OffTrackPlace:
     """Key of `JUDGEMENTS` for at least half of the times, None where there is none."""
     judgements: Mapping[str, int]
 
-    @property
-    def risk(self) -> float:
-        """Share of the episodes that ran off here of those that came here."""
-        return self.count / self.passes
-
 
 def off_track_rows(steps: pd.DataFrame) -> Rows:
     """Return the rows at which the car is off the road for the first time.
@@ -94,34 +89,32 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
     half = PLACE_M / 2 / float(steps["track_len"].median())
     judged = judge(steps, rows)
     episode = np.cumsum(first_rows(steps))
-    offset = steps["offset_m"].to_numpy(np.float64)
-    left = np.ones(len(rows), bool)
+    offset = np.nan_to_num(steps["offset_m"].to_numpy(np.float64))
+    at, left = position[rows], np.ones(len(rows), bool)
     found: list[OffTrackPlace] = []
     while len(found) < PLACES and left.any():
-        at = position[rows]
-        busiest = int(neighbours(at, at[left], half).argmax())
-        here = left & (_apart(at, at[busiest]) <= half)
-        if here.sum() < LEAST:
-            break
-        left &= ~(_apart(at, at[busiest]) <= 2 * half)
-        counts = Counter(judged[here].tolist())
-        most, times = counts.most_common(1)[0]
-        passes = len(np.unique(episode[_apart(position, at[busiest]) <= half]))
+        center = at[neighbours(at, at[left], half).argmax()]
+        here = left & (_apart(at, center) <= half)
         offs = int(here.sum())
+        if offs < LEAST:
+            break
+        left &= _apart(at, center) > 2 * half
+        judgements = Counter(judged[here].tolist())
+        most, times = judgements.most_common(1)[0]
+        passes = len(np.unique(episode[_apart(position, center) <= half]))
         low, high = map(float, wilson(offs, max(passes, offs)))
-        ahead = (at[here] - at[busiest] + 0.5) % 1.0
-        middle = rows[here][np.argsort(ahead, kind="stable")[len(ahead) // 2]]
+        middle = rows[here][np.argsort((at[here] - center + 0.5) % 1.0, kind="stable")[offs // 2]]
         found.append(
             OffTrackPlace(
                 lap_position=float(position[middle]),
                 waypoint=int(steps["closest_waypoint"].to_numpy()[middle]),
-                side="left" if np.nanmedian(np.r_[offset[rows[here]], 0.0]) > 0 else "right",
-                count=int(here.sum()),
+                side="left" if np.median(offset[rows[here]]) > 0 else "right",
+                count=offs,
                 passes=passes,
                 low=low,
                 high=high,
-                judgement=most if 2 * times >= here.sum() else None,
-                judgements=dict(counts),
+                judgement=most if 2 * times >= offs else None,
+                judgements=judgements,
             )
         )
     return found
@@ -197,3 +190,32 @@ def _apart(a: Values | float, b: Values | float) -> Values:
     """Return the distance of lap positions on the shorter way round."""
     difference = np.abs(np.asarray(a) - np.asarray(b))
     return np.minimum(difference, 1.0 - difference)
+
+
+def risk_counts(episodes: pd.DataFrame, n: int, reach: int = 0) -> tuple[Values, Values]:
+    """Return for each of n waypoints how many episodes passed it, and how many left the road there.
+
+    An episode passes every waypoint from that of its first row to that of its last row, also those that a control
+    step jumped over; a complete lap passes all of them.
+
+    Args:
+        episodes: of a `LogView`, or some of them.
+        n: number of waypoints.
+        reach: waypoints to either side that count as well.
+    """
+    first, last = (episodes[name].to_numpy(np.int64) for name in ("first_waypoint", "last_waypoint"))
+    progress = episodes["progress"].to_numpy(np.float64)
+    ahead = (last - first) % n
+    # A car that ends a little before or behind its start drove hardly anything or nearly the whole lap.
+    back = (ahead > 0.75 * n) & (progress < 50.0)
+    first, ahead = np.where(back, last, first), np.where(back, 0, ahead)
+    whole = episodes["complete"].to_numpy(bool) | ((ahead < 0.25 * n) & (progress > 50.0))
+    ahead = np.minimum(np.where(whole, n, ahead) + 2 * reach, n - 1)
+    first = (first - reach) % n
+    change = np.zeros(2 * n + 1)
+    np.add.at(change, first, 1.0)
+    np.add.at(change, first + ahead + 1, -1.0)
+    passed = np.cumsum(change)[: 2 * n]
+    left = np.bincount(last[(episodes["status"] == "off_track").to_numpy()], minlength=n)
+    near = np.sum([np.roll(left, by) for by in range(-reach, reach + 1)], axis=0)
+    return passed[:n] + passed[n:], near.astype(np.float64)

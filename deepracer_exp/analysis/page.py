@@ -99,7 +99,7 @@ def render(package: str, template: str, plots: Sequence[Plot], **values: Any) ->
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["themed"] = _themed
-    script = _script()
+    script = (files(__package__) / "page.js").read_text(encoding="utf-8")
     return environment.get_template(template).render(
         policy=_policy(script, get_plotlyjs()),
         contents=[],
@@ -121,19 +121,12 @@ def _policy(*scripts: str) -> str:
 
     Plotly compiles functions from text to draw with WebGL.
     """
-    hashes = " ".join(f"'sha256-{_sha256(script)}'" for script in scripts)
+    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
+    hashes = " ".join(f"'sha256-{digest}'" for digest in digests)
     return (
         f"default-src 'none'; script-src {hashes} 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; "
         "base-uri 'none'; form-action 'none'"
     )
-
-
-def _sha256(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
-
-
-def _script() -> str:
-    return (files(__package__) / "page.js").read_text(encoding="utf-8")
 
 
 @cache

@@ -52,8 +52,8 @@ class Line:
 
 def center_line(course: Track) -> Line:
     """Return the centre line."""
-    center, _, _, lap_position = _sampled(course)
-    return _line(course, center, np.zeros(len(center)), center, lap_position)
+    lap_position = _places(course)
+    return _line(course, lap_position, np.zeros(len(lap_position)), course.points_at(lap_position))
 
 
 @lru_cache(maxsize=8)
@@ -63,65 +63,56 @@ def minimum_curvature_line(course: Track) -> Line:
     Moving point i sideways changes the second differences linearly; given the direction and the pace of the last
     round's line, their component across it is the curvature. So each round is a bounded linear least squares problem.
     """
-    center, left_m, right_m, lap_position = _sampled(course)
-    along = _tangents(course, center)
-    sideways = np.column_stack([-along[:, 1], along[:, 0]])
-    low, high = np.minimum(MARGIN_M - right_m, -1e-6), np.maximum(left_m - MARGIN_M, 1e-6)
-    first, second = _first_differences(course, len(center)), _second_differences(course, len(center))
-    inner = slice(None) if course.closed else slice(1, -1)
+    lap_position = _places(course)
+    center = course.points_at(lap_position)
+    first, second = _differences(course.closed, len(center))
+    along = first @ center
+    sideways = _turned_left(along) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    own, rooms_m = waypoint_positions(course), []
+    for border in (course.inner, course.outer):
+        points = np.column_stack([np.interp(lap_position, own, axis) for axis in border.T])
+        rooms_m.append(((points - center) * sideways).sum(axis=1))
+    bounds = (
+        np.minimum(np.minimum(*rooms_m) + MARGIN_M, -1e-6),
+        np.maximum(np.maximum(*rooms_m) - MARGIN_M, 1e-6),
+    )
     offset_m = np.zeros(len(center))
     for _ in range(ROUNDS):
-        velocity = (first @ (center + offset_m[:, None] * sideways))[inner]
+        velocity = first @ (center + offset_m[:, None] * sideways)
         pace = np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
         # n / pace**2 turns a second difference into curvature; sqrt(pace) makes the sum one over the way.
-        weight = np.column_stack([-velocity[:, 1], velocity[:, 0]]) / pace[:, None] ** 2.5
+        weight = _turned_left(velocity) / pace[:, None] ** 2.5
         matrix = weight[:, :1] * second * sideways[:, 0] + weight[:, 1:] * second * sideways[:, 1]
-        wanted_m = lsq_linear(matrix, -(weight * (second @ center)).sum(axis=1), (low, high), tol=1e-4).x
+        wanted_m = lsq_linear(matrix, -(weight * (second @ center)).sum(axis=1), bounds, tol=1e-4).x
         offset_m = 0.5 * (offset_m + wanted_m)
-    return _line(course, center, offset_m, center + offset_m[:, None] * sideways, lap_position)
+    return _line(course, lap_position, offset_m, center + offset_m[:, None] * sideways)
 
 
-def _sampled(course: Track) -> tuple[Values, Values, Values, Values]:
-    """Return centre points, the room to their left and right in m, and their places on the lap."""
+def _places(course: Track) -> Values:
     count = int(np.clip(course.length_m / SAMPLE_M, 20, MOST))
-    lap_position = np.linspace(0.0, 1.0, count, endpoint=not course.closed)
-    center = course.points_at(lap_position)
-    pose = course.start_pose(lap_position)
-    sideways = np.column_stack([-np.sin(pose.yaw_rad), np.cos(pose.yaw_rad)])
-    rows = waypoint_positions(course)
-    rooms = []
-    for border in (course.inner, course.outer):
-        points = np.column_stack([np.interp(lap_position, rows, border[:, k]) for k in (0, 1)])
-        rooms.append(((points - center) * sideways).sum(axis=1))
-    return center, np.maximum(*rooms), -np.minimum(*rooms), lap_position
+    return np.linspace(0.0, 1.0, count, endpoint=not course.closed)
 
 
-def _first_differences(course: Track, n: int) -> Values:
-    ahead = np.roll(np.eye(n), 1, axis=1)
-    first = 0.5 * (ahead - ahead.T)
-    if not course.closed:
-        first[0], first[-1] = ahead[0] - np.eye(n)[0], np.eye(n)[-1] - ahead.T[-1]
-    return first
+def _differences(closed: bool, n: int) -> tuple[Values, Values]:
+    """Return the matrices (n, n) of first and second differences; an open line does not bend at its ends."""
+    here = np.eye(n)
+    ahead, behind = np.roll(here, 1, axis=1), np.roll(here, -1, axis=1)
+    first, second = 0.5 * (ahead - behind), ahead - 2.0 * here + behind
+    if not closed:
+        first[0], first[-1] = ahead[0] - here[0], here[-1] - behind[-1]
+        second[[0, -1]] = 0.0
+    return first, second
 
 
-def _second_differences(course: Track, n: int) -> Values:
-    ahead = np.roll(np.eye(n), 1, axis=1)
-    second = ahead - 2.0 * np.eye(n) + ahead.T
-    return second if course.closed else second[1:-1]
+def _turned_left(vectors: Values) -> Values:
+    return np.column_stack([-vectors[:, 1], vectors[:, 0]])
 
 
-def _tangents(course: Track, points: Values) -> Values:
-    along = _first_differences(course, len(points)) @ points
-    return along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-
-
-def _line(course: Track, center: Values, offset_m: Values, points: Values, lap_position: Values) -> Line:
-    n = len(points)
-    velocity = _first_differences(course, n) @ points
-    bend = np.zeros((n, 2))
-    bend[slice(None) if course.closed else slice(1, -1)] = _second_differences(course, n) @ points
+def _line(course: Track, lap_position: Values, offset_m: Values, points: Values) -> Line:
+    first, second = _differences(course.closed, len(points))
+    velocity = first @ points
     pace = np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
-    curvature_pm = (velocity[:, 0] * bend[:, 1] - velocity[:, 1] * bend[:, 0]) / pace**3
+    curvature_pm = (_turned_left(velocity) * (second @ points)).sum(axis=1) / pace**3
     if course.closed:  # back to where it began, so that places behind the last point find their values
         lap_position = np.r_[lap_position, 1.0]
         offset_m, curvature_pm = np.r_[offset_m, offset_m[0]], np.r_[curvature_pm, curvature_pm[0]]

@@ -38,84 +38,52 @@ class Sector:
     end: float
     first_waypoint: int
     last_waypoint: int
-    radius_m: float
-    """Of the mean curvature; infinite where it is none."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sectors:
-    """All sectors of a course, from waypoint 0 on."""
-
-    parts: tuple[Sector, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the sectors."""
-        return tuple(part.name for part in self.parts)
-
-    @property
-    def bounds(self) -> Values:
-        """Lap positions between the sectors, from 0 to 1."""
-        return np.array([0.0, *(part.end for part in self.parts)])
-
-    def of(self, lap_position: Values) -> NDArray[np.intp]:
-        """Return in which sector places lie, -1 where they are not known."""
-        found = np.searchsorted(self.bounds[1:-1], lap_position, side="right")
-        return np.where(np.isfinite(lap_position), found, -1)
-
-
-def sectors_of(course: Track) -> Sectors:
-    """Divide a course into bends and straights by the curvature of its centre line."""
+def sectors_of(course: Track) -> list[Sector]:
+    """Divide a course into bends and straights by the curvature of its centre line, from waypoint 0 on."""
     count = max(20, round(course.length_m / _SAMPLE_M))
     edges = np.linspace(0.0, 1.0, count + 1)
     curvature = _curvature(course, (edges[1:] + edges[:-1]) / 2)
     kinds = np.where(np.abs(curvature) < BEND_PM, 0, np.sign(curvature)).astype(int)
     cuts = [0, *(np.flatnonzero(np.diff(kinds)) + 1), count]
-    shortest = SHORTEST_M / course.length_m * count
-    while len(cuts) > 2:
-        lengths = np.diff(cuts)
-        at = int(lengths.argmin())
-        if lengths[at] >= shortest:
-            break
+    while len(cuts) > 2 and np.diff(cuts).min() * course.length_m / count < SHORTEST_M:
+        at = int(np.diff(cuts).argmin())
         means = [float(curvature[a:b].mean()) for a, b in pairwise(cuts)]
         neighbours = [k for k in (at - 1, at + 1) if 0 <= k < len(means)]
         like = min(neighbours, key=lambda k: abs(means[k] - means[at]))
         del cuts[max(at, like)]
-    return Sectors(parts=tuple(_named(course, curvature, edges, _joined(cuts, curvature))))
-
-
-def _joined(cuts: Sequence[int], curvature: Values) -> list[int]:
-    """Drop the cuts between neighbours that are of one kind by now."""
-    kept = [cuts[0]]
-    for before, cut, after in zip(cuts[:-2], cuts[1:-1], cuts[2:], strict=True):
-        if _kind(float(curvature[before:cut].mean())) != _kind(float(curvature[cut:after].mean())):
-            kept.append(cut)
-    return [*kept, cuts[-1]]
-
-
-def _named(course: Track, curvature: Values, edges: Values, cuts: Sequence[int]) -> list[Sector]:
+    # By now neighbours may be of one kind.
+    merged = [_kind(curvature[a:b]) for a, b in pairwise(cuts)]
+    bounds = [0, *(cut for cut, (a, b) in zip(cuts[1:-1], pairwise(merged), strict=True) if a != b), count]
     waypoint_at = waypoint_positions(course)
     last = len(waypoint_at) - 1 - course.closed
     found = []
-    for number, (a, b) in enumerate(pairwise(cuts), start=1):
-        mean = float(curvature[a:b].mean())
+    for number, (a, b) in enumerate(pairwise(bounds), start=1):
+        kind = _kind(curvature[a:b])
         inside = np.flatnonzero((waypoint_at >= edges[a]) & (waypoint_at < edges[b]))
         found.append(
             Sector(
-                name=f"{_kind(mean)} {number}",
-                kind=_kind(mean),
+                name=f"{kind} {number}",
+                kind=kind,
                 begin=float(edges[a]),
                 end=float(edges[b]),
                 first_waypoint=int(inside[0]) if len(inside) else 0,
                 last_waypoint=min(int(inside[-1]), last) if len(inside) else 0,
-                radius_m=1.0 / abs(mean) if mean else float("inf"),
             )
         )
     return found
 
 
-def _kind(curvature_pm: float) -> str:
-    return "straight" if abs(curvature_pm) < BEND_PM else "left" if curvature_pm > 0 else "right"
+def sector_at(sectors: Sequence[Sector], lap_position: Values) -> NDArray[np.intp]:
+    """Return in which sector places lie, -1 where they are not known."""
+    found = np.searchsorted([part.end for part in sectors[:-1]], lap_position, side="right")
+    return np.where(np.isfinite(lap_position), found, -1)
+
+
+def _kind(curvature_pm: Values) -> str:
+    mean = float(curvature_pm.mean())
+    return "straight" if abs(mean) < BEND_PM else "left" if mean > 0 else "right"
 
 
 def _curvature(course: Track, place: Values) -> Values:
@@ -169,14 +137,11 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     return pd.DataFrame(spent_s, index=laps)
 
 
-def times_by_sector(steps: pd.DataFrame, sectors: Sectors) -> pd.DataFrame:
-    """Return `interval_times` of the sectors, columns by their names."""
-    return interval_times(steps, sectors.bounds).set_axis(list(sectors.names), axis=1)
-
-
-def theoretical_best_s(times: pd.DataFrame) -> float:
-    """Return the sum of the best times of all sectors, NaN without a lap."""
-    return float(times.min().sum()) if len(times) else float("nan")
+def times_by_sector(steps: pd.DataFrame, sectors: Sequence[Sector]) -> pd.DataFrame:
+    """Return `interval_times` of the sectors, columns by their names; of laps whose times are all known."""
+    bounds = np.array([0.0, *(part.end for part in sectors)])
+    times = interval_times(steps, bounds).set_axis([part.name for part in sectors], axis=1)
+    return times[np.isfinite(times).all(axis=1)]
 
 
 def time_lost(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""Statistics of what was driven: moving averages, histograms, fits, intervals, and sums by place."""
+"""Statistics of what was driven: histograms, intervals, and sums by place."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Values = NDArray[np.float64]
-MOVING = 3
-"""Iterations in a moving average, as racers have used since 2020."""
 RESAMPLES = 2000
 CONFIDENCE = 0.95
-
-
-def moving_average(values: Values, over: int = MOVING) -> Values:
-    """Return the mean of each value and those before it without unknown ones; NaN where the value itself is NaN."""
-    series = pd.Series(values, dtype=np.float64)
-    return series.rolling(over, min_periods=1).mean().where(series.notna()).to_numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +26,7 @@ def histogram(values: Values, least: int = 8, most: int = 50) -> Histogram:
     if high - low <= 1e-6 * max(abs(high), abs(low)):
         return Histogram(np.array([low]), np.array([float(len(values))]), max(0.05 * abs(low), 1e-6))
     spread = float(np.subtract(*np.percentile(values, [75, 25])))
-    width = 2 * spread / len(values) ** (1 / 3)
-    width = float(np.clip(width, (high - low) / most, (high - low) / least))
+    width = float(np.clip(2 * spread / len(values) ** (1 / 3), (high - low) / most, (high - low) / least))
     grain = _grain(values)
     if grain > 0:
         # Bins with different numbers of possible values would look like a comb.
@@ -55,39 +46,6 @@ def _grain(values: Values) -> float:
     return grain if np.abs(apart / grain - (apart / grain).round()).max() < 0.01 else 0.0
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A curve through points, by least squares."""
-
-    coefficients: tuple[float, ...]
-    """Of the highest power first."""
-    r_squared: float
-    """Share of the variance of y that it explains."""
-
-    def at(self, x: Values) -> Values:
-        """Return the curve."""
-        return np.polyval(np.array(self.coefficients), x)
-
-
-def fit_polynomial(x: Values, y: Values, degree: int) -> Fit | None:
-    """Fit a polynomial, None where the points do not decide on one."""
-    if len(np.unique(x)) <= degree + 1 or np.ptp(y) == 0:
-        return None
-    middle, scale = float(x.mean()), float(x.std())
-    polynomial = np.polynomial.Polynomial.fit(x, y, degree, domain=[middle - scale, middle + scale])
-    residual = y - polynomial(x)
-    found = polynomial.convert().coef[::-1]
-    padded = np.concatenate([np.zeros(degree + 1 - len(found)), found])
-    return Fit(tuple(float(c) for c in padded), 1 - float(residual.var() / y.var()))
-
-
-def correlation(x: Values, y: Values) -> float:
-    """Return Pearson's r, NaN where one of them does not vary."""
-    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return float("nan")
-    return float(np.corrcoef(x, y)[0, 1])
-
-
 def median_band(curves: Values) -> tuple[Values, Values, Values]:
     """Return the median of curves and its bootstrap interval (95 per cent, percentile method, Efron 1979).
 
@@ -98,32 +56,18 @@ def median_band(curves: Values) -> tuple[Values, Values, Values]:
     Returns:
         median, low and high, each (m,).
     """
-    known = np.isfinite(curves)
-    enough = known.sum(axis=0) >= max(1.0, len(curves) / 2)
-    median, low, high = (np.full(curves.shape[1], np.nan) for _ in range(3))
+    median, low, high = np.full((3, curves.shape[1]), np.nan)
     dice = np.random.default_rng(0)
-    groups: dict[bytes, list[int]] = {}
-    for column in np.flatnonzero(enough):
-        groups.setdefault(known[:, column].tobytes(), []).append(int(column))
-    for pattern, columns in groups.items():
-        rows = np.flatnonzero(np.frombuffer(pattern, dtype=bool))
-        values = curves[rows][:, columns]
-        median[columns] = np.median(values, axis=0)
-        if len(rows) > 1:
-            drawn = dice.integers(len(rows), size=(RESAMPLES, len(rows)))
-            # A few columns at a time: all of them may be hundreds of MB.
-            for first in range(0, len(columns), 50):
-                part = columns[first : first + 50]
-                medians = np.median(values[:, first : first + 50][drawn], axis=1)
-                tail = 50 * (1 - CONFIDENCE)
-                low[part], high[part] = np.percentile(medians, [tail, 100 - tail], axis=0)
+    for column, values in enumerate(curves.T):
+        known = values[np.isfinite(values)]
+        if len(known) < max(1.0, len(values) / 2):
+            continue
+        median[column] = np.median(known)
+        if len(known) > 1:
+            medians = np.median(dice.choice(known, (RESAMPLES, len(known))), axis=1)
+            tail = (1 - CONFIDENCE) / 2
+            low[column], high[column] = np.quantile(medians, [tail, 1 - tail])
     return median, low, high
-
-
-def percentiles_by(group: NDArray[np.int64], values: Values, at: tuple[float, ...]) -> pd.DataFrame:
-    """Return percentiles of the values of each group, indexed by it, one column each."""
-    groups = pd.Series(values).groupby(group)
-    return pd.DataFrame({p: groups.quantile(p / 100) for p in at})
 
 
 def subsample(count: int, most: int) -> NDArray[np.intp]:
@@ -149,23 +93,9 @@ def means(place: NDArray[np.intp], values: ArrayLike, n: int, least: int = 1) ->
 
 
 def quantiles(place: NDArray[np.intp], values: ArrayLike, n: int, shares: tuple[float, ...]) -> Values:
-    """Return quantiles (len(shares), n) of the values at each of n places, between two values the lower one."""
-    numbers = np.asarray(values, np.float64)
-    known = (place >= 0) & np.isfinite(numbers)
-    place, numbers = place[known], numbers[known]
-    order = np.argsort(numbers)
-    # Stable, so that the values of each place stay in order.
-    numbers = numbers[order][
-        np.argsort(place[order].astype(np.int16 if n < 2**15 else np.int32), kind="stable")
-    ]
-    count = np.bincount(place, minlength=n)
-    first = np.r_[0, np.cumsum(count)[:-1]]
-    if not len(numbers):
-        return np.full((len(shares), n), np.nan)
-    found = [
-        numbers[np.minimum(first + ((count - 1) * share).astype(int), len(numbers) - 1)] for share in shares
-    ]
-    return np.where(count > 0, np.stack(found), np.nan)
+    """Return quantiles (len(shares), n) of the values at each of n places; NaN where none is known."""
+    groups = pd.Series(np.asarray(values, np.float64)).groupby(place)
+    return np.stack([groups.quantile(share).reindex(range(n)).to_numpy() for share in shares])
 
 
 def wilson(hits: ArrayLike, tries: ArrayLike, z: float = 1.959964) -> tuple[Values, Values]:

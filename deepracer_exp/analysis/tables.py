@@ -98,48 +98,41 @@ def add_derived(
         course: what was driven on.
         discount: factor on the reward of the next step.
     """
-    x, y, yaw = (steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw"))
+    x, y, yaw, time_s, progress, reward = (
+        steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw", "tstamp", "progress", "reward")
+    )
     lap_position, offset_m, center_deg = _places(steps, first, course)
-    reward = steps["reward"].to_numpy(np.float64)
-    time_s, progress = (steps[name].to_numpy(np.float64) for name in ("tstamp", "progress"))
-    columns = _motion(first & ~flying_rows(steps, first), x, y, yaw, time_s)
-    passed_s = np.where(first | (columns["delta_time_s"] <= 0), np.nan, columns["delta_time_s"])
-    columns["progress_speed_pps"] = _since(progress, first) / passed_s
-    # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
-    center_turned = _wrapped(_since(center_deg, first))
-    columns["skew_deg"] = _wrapped(columns["true_bearing_deg"] - (center_deg - center_turned / 2))
-    columns["lap_position"], columns["offset_m"] = lap_position, offset_m
-    columns["discounted_future_reward"] = _discounted(np.nan_to_num(reward), first, discount)
-    return steps.assign(**{name: columns[name] for name in DERIVED_COLUMNS})
-
-
-def _motion(first: NDArray[np.bool_], x: Values, y: Values, yaw: Values, time_s: Values) -> dict[str, Values]:
-    delta_time_s = _since(time_s, first)
-    dx, dy = _since(x, first), _since(y, first)
+    stopped = first & ~flying_rows(steps, first)
+    delta_time_s, dx, dy = (_since(values, stopped) for values in (time_s, x, y))
     delta_dist_m = np.hypot(dx, dy)
-    moving = ~first & (delta_dist_m >= STILL_M)
+    moving = ~stopped & (delta_dist_m >= STILL_M)
     passed_s = np.where(delta_time_s > 0, delta_time_s, np.nan)
     track_speed_mps = delta_dist_m / passed_s
-    change = _change(track_speed_mps, time_s, first)
-    turned = _wrapped(_since(yaw, first))
+    change = _change(track_speed_mps, time_s, stopped)
+    turned = _wrapped(_since(yaw, stopped))
     bearing = np.where(moving, np.degrees(np.arctan2(dy, dx)), np.nan)
     heading = np.radians(yaw)
-    rear_x, rear_y = (
-        place - FRONT_TO_REAR_AXLE_M * part(heading) for place, part in ((x, np.cos), (y, np.sin))
-    )
-    rear_dx, rear_dy = _since(rear_x, first), _since(rear_y, first)
-    rear_deg = np.degrees(np.arctan2(rear_dy, rear_dx))
-    slide = np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), rear_deg - (yaw - turned / 2), np.nan)
-    return {
+    rear_dx = _since(x - FRONT_TO_REAR_AXLE_M * np.cos(heading), stopped)
+    rear_dy = _since(y - FRONT_TO_REAR_AXLE_M * np.sin(heading), stopped)
+    slide = _wrapped(np.degrees(np.arctan2(rear_dy, rear_dx)) - (yaw - turned / 2))
+    # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
+    center_turned = _wrapped(_since(center_deg, first))
+    columns = {
         "delta_time_s": delta_time_s,
         "delta_dist_m": delta_dist_m,
         "track_speed_mps": track_speed_mps,
+        "progress_speed_pps": _since(progress, first) / np.where(first, np.nan, passed_s),
         "acceleration_mps2": np.maximum(change, 0.0),
         "braking_mps2": np.maximum(-change, 0.0),
         "yaw_rate_dps": turned / passed_s,
         "true_bearing_deg": bearing,
-        "slide_deg": _wrapped(slide),
+        "slide_deg": np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), slide, np.nan),
+        "skew_deg": _wrapped(bearing - (center_deg - center_turned / 2)),
+        "lap_position": lap_position,
+        "offset_m": offset_m,
+        "discounted_future_reward": _discounted(np.nan_to_num(reward), first, discount),
     }
+    return steps.assign(**columns)
 
 
 def _places(
@@ -150,13 +143,11 @@ def _places(
         found = course.project(steps[["X", "Y"]].to_numpy(np.float64))
         return found.ndist, found.offset_m, np.degrees(found.heading_rad)
     unknown = np.full(len(steps), np.nan)
-    waypoint = steps["closest_waypoint"].to_numpy(np.float64)
-    if not len(waypoint):
+    if not len(steps):
         return unknown, unknown, unknown
-    start = waypoint[first][np.cumsum(first) - 1] / (waypoint.max() + 1.0)
-    progress = steps["progress"].to_numpy(np.float64)
-    started = progress[first][np.cumsum(first) - 1]
-    return (start + (progress - started) / 100.0) % 1.0, unknown, unknown
+    waypoint, progress = (steps[name].to_numpy(np.float64) for name in ("closest_waypoint", "progress"))
+    start = waypoint / (waypoint.max() + 1.0) - progress / 100.0
+    return (start[first][np.cumsum(first) - 1] + progress / 100.0) % 1.0, unknown, unknown
 
 
 def _since(values: Values, first: NDArray[np.bool_]) -> Values:
@@ -234,57 +225,44 @@ def episode_table(steps: pd.DataFrame, first: NDArray[np.bool_]) -> pd.DataFrame
     """
     begin = np.flatnonzero(first)
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
-    rows = end - begin + 1
 
-    def values(name: str) -> NDArray[np.float64]:
-        return steps[name].to_numpy(np.float64)
+    def combined(name: str, how: np.ufunc = np.add) -> Values:
+        return how.reduceat(steps[name].to_numpy(np.float64), begin)
 
-    def total(name: str) -> NDArray[np.float64]:
-        return np.add.reduceat(values(name), begin)
-
-    number, waypoint = steps["steps"].to_numpy(), steps["closest_waypoint"].to_numpy()
-    progress, time_s, reward = (
-        np.maximum.reduceat(values("progress"), begin),
-        total("delta_time_s"),
-        total("reward"),
-    )
+    progress, time_s, reward = combined("progress", np.maximum), combined("delta_time_s"), combined("reward")
+    number = steps["steps"].to_numpy()
     complete = progress >= 100.0
     per_lap = np.divide(100.0, progress, out=np.full(len(begin), np.nan), where=progress > 0)
+    first_row, last_row = (steps.iloc[at].reset_index(drop=True) for at in (begin, end))
+    status = last_row["episode_status"].astype(str)
+    unknown, ended = status == "", last_row["done"].astype(bool)
+    off = unknown & ended & ~last_row["all_wheels_on_track"].astype(bool)
+    lap = complete & (unknown | (status == "in_progress"))  # in races the next lap follows
     order = np.arange(len(begin))
     return pd.DataFrame(
         {
-            "iteration": steps["iteration"].to_numpy()[end],
-            "episode": steps["episode"].to_numpy()[begin],
-            "worker": steps["worker"].to_numpy()[begin],
+            "iteration": last_row["iteration"],
+            "episode": first_row["episode"],
+            "worker": first_row["worker"],
             "steps": np.maximum.reduceat(number, begin) - np.minimum.reduceat(number, begin) + 1,
-            "start_at": waypoint[begin],
+            "start_at": first_row["closest_waypoint"],
             "progress": progress,
             "time_s": time_s,
-            "dist_m": total("delta_dist_m"),
+            "dist_m": combined("delta_dist_m"),
             "reward": reward,
-            "speed_mps": total("throttle") / rows,
+            "speed_mps": combined("throttle") / (end - begin + 1),
             "time_if_complete_s": time_s * per_lap,
             "reward_if_complete": reward * per_lap,
-            "ended": complete | steps["done"].to_numpy(bool)[end],
+            "ended": complete | ended,
             "complete": complete,
             "lap_time_s": np.where(complete & whole_from_start(steps, first) & (time_s > 0), time_s, np.nan),
-            "status": _status(steps, end, complete),
-            "first_waypoint": waypoint[begin],
-            "last_waypoint": waypoint[end],
+            "status": status.mask(lap, "lap_complete").mask(off & ~complete, "off_track"),
+            "first_waypoint": first_row["closest_waypoint"],
+            "last_waypoint": last_row["closest_waypoint"],
             "quarter": 1 + 4 * order // len(order),
             "quintile": 1 + 5 * order // len(order),
         }
     )
-
-
-def _status(steps: pd.DataFrame, end: NDArray[np.intp], complete: NDArray[np.bool_]) -> NDArray[np.object_]:
-    last = steps.iloc[end]
-    status = last["episode_status"].astype(str).to_numpy(dtype=object)
-    unknown = status == ""
-    off = unknown & last["done"].to_numpy(bool) & ~last["all_wheels_on_track"].to_numpy(bool)
-    status[complete & (unknown | (status == "in_progress"))] = "lap_complete"  # in races the next lap follows
-    status[off & ~complete] = "off_track"
-    return status
 
 
 def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -292,9 +270,8 @@ def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.Data
 
     Episodes whose end is not recorded are left out: those still driving when a run ended would count as bad ones.
     """
-    groups = pd.concat([episodes[episodes["ended"]], _from_metrics_only(recording, episodes)]).groupby(
-        "iteration"
-    )
+    ended = pd.concat([episodes[episodes["ended"]], _from_metrics_only(recording, episodes)])
+    groups = ended.groupby("iteration")
     laps = groups["lap_time_s"]
     table = pd.DataFrame(
         {
@@ -309,16 +286,14 @@ def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.Data
             "speed_mps": groups["speed_mps"].mean(),
         }
     )
-    driven = np.bincount(steps["iteration"].to_numpy()) if len(steps) else np.zeros(0, np.int64)
+    driven = steps.groupby("iteration").size()
     updates = recording.updates.groupby("iteration")[list(_REPORTED)].mean()
-    known = pd.Index(np.flatnonzero(driven)).union(table.index).union(updates.index)
-    table = table.reindex(known).join(updates).join(_evaluated(recording))
-    table["steps"] = [int(driven[k]) if k < len(driven) else 0 for k in known]
-    counts = table[["episodes", "complete"]].fillna(0).astype(np.int64)
-    table = table.assign(episodes=counts["episodes"], complete=counts["complete"])
-    table.index.name = "iteration"
+    known = driven.index.union(table.index).union(updates.index)
+    table = table.reindex(known).join(updates).join(_evaluated(recording)).assign(steps=driven)
+    table = table.fillna({"episodes": 0, "complete": 0, "steps": 0})
     table["checkpoint"] = [recording.checkpoints.get(k, "") for k in known]
-    return table.reset_index()[list(ITERATION_COLUMNS)].astype({"iteration": np.int64})
+    whole = dict.fromkeys(("iteration", "episodes", "steps", "complete"), np.int64)
+    return table.rename_axis("iteration").reset_index()[list(ITERATION_COLUMNS)].astype(whole)
 
 
 def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -328,19 +303,11 @@ def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataF
     counts = rows.groupby("iteration").size()
     if len(counts) > 1 and counts.iloc[-1] < FINISHED * counts.median():
         rows = rows[rows["iteration"] != counts.index[-1]]  # the job ended within it
-    rows = rows[~rows["episode"].isin(episodes["episode"])]
-    complete = rows["completion"] >= 100.0
-    return pd.DataFrame(
-        {
-            "iteration": rows["iteration"],
-            "episode": rows["episode"],
-            "progress": rows["completion"],
-            "reward": rows["reward"],
-            "complete": complete,
-            "lap_time_s": rows["time_s"].where(complete),
-            "speed_mps": np.nan,
-        }
-    ).astype({"complete": bool})
+    rows = rows[~rows["episode"].isin(episodes["episode"])].rename(columns={"completion": "progress"})
+    complete = rows["progress"] >= 100.0
+    rows = rows.assign(complete=complete, lap_time_s=rows["time_s"].where(complete), speed_mps=np.nan)
+    columns = ["iteration", "episode", "progress", "reward", "complete", "lap_time_s", "speed_mps"]
+    return rows[columns].astype({"complete": bool})
 
 
 def _evaluated(recording: Recording) -> pd.DataFrame:
@@ -350,9 +317,5 @@ def _evaluated(recording: Recording) -> pd.DataFrame:
         return own.rename(columns={"completion": "eval_completion"})
     rows = recording.metrics
     rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
-    return (
-        rows.groupby("iteration")["completion"]
-        .mean()
-        .to_frame("eval_completion")
-        .assign(held_out_completion=np.nan)
-    )
+    means = rows.groupby("iteration")["completion"].mean().to_frame("eval_completion")
+    return means.assign(held_out_completion=np.nan)

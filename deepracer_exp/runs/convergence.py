@@ -50,8 +50,8 @@ PATIENCE_SHARE = 0.2
 """Share of all iterations of such a log that must be without growth."""
 POOR = 50.0
 """Completion below which a training that no longer grows has not learned to drive, per cent."""
-EVALUATION_DROP = 10.0
-"""Fall of the evaluation from its best that counts, in points of completion."""
+LOG_OVERFITTING = OverfittingRule(warmup=0, patience=3, held_out_drop=10.0, return_drop=0.05)
+"""Likewise; such a log has an evaluation after each iteration."""
 UNDECIDED = {"stopping.rule": "none", "stopping.hopeless": "false"}
 """Tags of a run that is resumed after a rule had ended it; the values by which it did stay beside them."""
 
@@ -424,7 +424,7 @@ def convergence(
     if count <= patience:
         return None
     grown = ("completion_mean", "reward_mean", "lap_share")
-    series = {name: _moving_average(table[name].to_numpy(np.float64)) for name in grown}
+    series = {name: moving_average(table[name].to_numpy(np.float64)) for name in grown}
     completion = series["completion_mean"]
     gains = {
         "completion_mean": rule.completion_gain,
@@ -453,7 +453,7 @@ def convergence(
 
 
 def _entropy_change(entropy: NDArray[np.float64], action_count: int | None, patience: int) -> float:
-    known = _moving_average(entropy)
+    known = moving_average(entropy)
     known = known[np.isfinite(known)]
     if len(known) <= patience:
         return math.nan
@@ -464,57 +464,70 @@ def _entropy_change(entropy: NDArray[np.float64], action_count: int | None, pati
 
 @dataclass(frozen=True, kw_only=True)
 class Overfitting:
-    """How training and evaluation went since the evaluation's best."""
+    """How the evaluations of a training went, and whether its rule calls that overfitting."""
 
-    overfits: bool
+    decision: Decision | None
+    """Of the stopping rule after the last iteration; None: no sign of overfitting."""
     evaluated: str
     """`held-out evaluation` or `evaluation`."""
     best: float
     """Completion, per cent, mean of three evaluations."""
     best_iteration: int
     now: float
-    training_best: float
-    training_now: float
+    rule: OverfittingRule
 
 
-def overfitting(iterations: pd.DataFrame) -> Overfitting | None:
-    """Return whether completion in training holds while that of the evaluations falls; None with fewer than six.
+def overfitting(iterations: pd.DataFrame, stopping: Mapping[str, Any] | None = None) -> Overfitting | None:
+    """Apply the stopping rule of overfitting to a table of iterations; None with fewer than six evaluations.
 
-    Evaluations on held-out conditions count before others. All series are moving averages of three.
+    Evaluations on held-out conditions count; in logs without them the others do.
+
+    Args:
+        iterations: a row each, with `reward_mean`, `held_out_completion` and `eval_completion`.
+        stopping: of a run of ours, its group `stopping`, whose rule is applied if it has one; None: LOG_OVERFITTING.
     """
+    own = _entropy_stopping(stopping)
+    rule = (own and own.overfitting) or LOG_OVERFITTING
     for column, name in (("held_out_completion", "held-out evaluation"), ("eval_completion", "evaluation")):
-        known = iterations[iterations[column].notna() & iterations["completion_mean"].notna()]
+        known = iterations[iterations[column].notna()]
         if len(known) < 6:
             continue
-        evaluated = _moving_average(known[column].to_numpy(np.float64))
-        training = _moving_average(known["completion_mean"].to_numpy(np.float64))
-        best = 2 + int(evaluated[2:].argmax())  # the first two are of fewer than three
-        holds = training[-1] >= training[2:].max() - LOG_RULE.completion_near
+        only = EntropyStopping(
+            kind="entropy", window=3, converged=None, overfitting=rule, collapsed=None, not_learning=None
+        )
+        stopper, decision = Stopping(only, None), None
+        for returned, completion in zip(iterations["reward_mean"], iterations[column], strict=True):
+            row = {"mean_return": returned, "held_out_completion": completion, "laps": 0, "env_steps": 0}
+            decision = stopper.observe(row)
+        averages = moving_average(known[column].to_numpy(np.float64))
+        best = 2 + int(averages[2:].argmax())  # the first two are of fewer than three
         return Overfitting(
-            overfits=bool(holds and evaluated[-1] <= evaluated[best] - EVALUATION_DROP),
+            decision=decision,
             evaluated=name,
-            best=float(evaluated[best]),
+            best=float(averages[best]),
             best_iteration=int(known["iteration"].iloc[best]),
-            now=float(evaluated[-1]),
-            training_best=float(training[2:].max()),
-            training_now=float(training[-1]),
+            now=float(averages[-1]),
+            rule=rule,
         )
     return None
 
 
 def convergence_rule(stopping: Mapping[str, Any] | None) -> ConvergedRule:
     """Return the rule of convergence of a group `stopping`, LOG_RULE if it has none."""
-    if stopping is None:
-        return LOG_RULE
+    own = _entropy_stopping(stopping)
+    return (own and own.converged) or LOG_RULE
+
+
+def _entropy_stopping(stopping: Mapping[str, Any] | None) -> EntropyStopping | None:
     adapter: TypeAdapter[StoppingConfig] = TypeAdapter(StoppingConfig)
     try:
         config = adapter.validate_python(stopping)
-    except ValidationError:  # of another version
-        return LOG_RULE
-    own = config.converged if isinstance(config, EntropyStopping) else None
-    return own or LOG_RULE
+    except ValidationError:  # none, or of another version
+        return None
+    return config if isinstance(config, EntropyStopping) else None
 
 
-def _moving_average(values: NDArray[np.float64], over: int = 3) -> NDArray[np.float64]:
+def moving_average(values: NDArray[np.float64], over: int = 3) -> NDArray[np.float64]:
+    """Return the mean of each value and those before it without unknown ones; NaN where the value itself is NaN."""
     series = pd.Series(values, dtype=np.float64)
     return series.rolling(over, min_periods=1).mean().where(series.notna()).to_numpy()

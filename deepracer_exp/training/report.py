@@ -18,21 +18,13 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     # Half a second of import that no training waits for.
     import pandas as pd
 
-    from deepracer_exp.analysis.charts.run_pictures import (
-        LINE_COLUMNS,
-        driven_line,
-        driven_lines,
-        learning_curves,
-    )
+    from deepracer_exp.analysis.charts.run_pictures import LINE_COLUMNS, driven_lines, learning_curves
 
     metrics_file = run_dir / METRICS
     if not metrics_file.is_file() or not metrics_file.stat().st_size:
         return
     trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
-    if len(courses) == 1:
-        figure = driven_line(trace, courses[0].tracks[0])
-    else:
-        figure = driven_lines(trace, {course.name: course.tracks[0] for course in courses})
+    figure = driven_lines(trace, {course.name: course.tracks[0] for course in courses})
     figure.savefig(run_dir / BEST_LAP, dpi=120)
     learning_curves(pd.read_json(metrics_file, lines=True)).savefig(run_dir / LEARNING, dpi=120)
 

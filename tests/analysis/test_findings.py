@@ -1,6 +1,5 @@
 """Rules of the findings on made-up logs whose answers are known."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +8,15 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from deepracer_exp.analysis.candidates import candidates, lap_chance
+from deepracer_exp.analysis.candidates import candidates
 from deepracer_exp.analysis.findings import Finding, findings
-from deepracer_exp.analysis.log_report import draw_sections
+from deepracer_exp.analysis.log_report import LogPage, draw_sections
 from deepracer_exp.analysis.log_tables import best_laps, headline
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.runs.convergence import LOG_RULE, convergence
+from deepracer_exp.runs.convergence import LOG_RULE
 
 from .made_up import Drive, made_up_course, made_up_recording
 
@@ -30,7 +29,7 @@ def of(view: LogView, rule: str, target_s: float | None = None) -> Finding:
     return found
 
 
-def training(completions: list[float], **told: list[float]) -> LogView:
+def training(completions: list[float], **more: list[float]) -> LogView:
     """Prepare a training with one short episode an iteration; 1.0 completes the lap."""
     drives = [
         Drive(speed_mps=3.0, iteration=k, until=c)
@@ -38,56 +37,40 @@ def training(completions: list[float], **told: list[float]) -> LogView:
         else Drive(speed_mps=3.0, iteration=k, off_at=int(118 * c))
         for k, c in enumerate(completions)
     ]
-    return prepare(made_up_recording(drives, **told))
+    return prepare(made_up_recording(drives, **more))
 
 
 RISING = [0.1 + 0.06 * k for k in range(15)]
 LEARNED = [*RISING, *[1.0] * (LOG_RULE.patience + 4)]
 
 
-def test_a_training_that_stands_at_full_laps_has_converged_when_it_reached_them() -> None:
-    found = of(training(LEARNED), "converged")
-    # The moving average of three reaches the last laps two iterations after the first of them.
-    assert found.values["iteration"] in range(15, 18)
-    assert found.sentence.startswith(f"Converged at iteration {found.values['iteration']}: ")
-    assert found.figure == "training_progress"
-
-
-def test_a_training_that_still_grows_has_not_converged() -> None:
-    found = of(training([*RISING, 1.0]), "converged")
-    assert found.sentence.startswith("Not converged yet: completion grew")
-    assert "iteration" not in found.values
-
-
-def test_entropy_that_still_falls_keeps_a_training_from_being_converged() -> None:
-    falling = list(np.linspace(1.7, 0.2, len(LEARNED)))
-    flat = [1.0] * len(LEARNED)
-    assert "the entropy still changes" in of(training(LEARNED, entropy=falling), "converged").sentence
-    assert of(training(LEARNED, entropy=flat), "converged").sentence.startswith("Converged")
-
-
-def test_a_training_that_fell_back_has_not_converged() -> None:
-    found = of(training([*LEARNED, 0.4, 0.4, 0.4]), "converged")
-    assert found.sentence.startswith("Not converged: completion fell back from 100 to 4")
-
-
-def test_a_flat_training_that_never_drove_far_is_told_to_change_something() -> None:
-    sentence = of(training([0.2] * 30), "converged").sentence
-    assert sentence.startswith("Converged at iteration 0")
-    assert "do not train longer" in sentence
-
-
-def test_a_short_training_is_not_judged() -> None:
-    view = training([0.2] * LOG_RULE.patience)
-    assert convergence(view.iterations, 9) is None
-    assert of(view, "converged").sentence.startswith("Too short")
+@pytest.mark.parametrize(
+    ("completions", "entropy", "words"),
+    [
+        (LEARNED, [], "Converged at iteration 1"),
+        (LEARNED, [1.0] * len(LEARNED), "Converged at iteration 1"),
+        (LEARNED, list(np.linspace(1.7, 0.2, len(LEARNED))), "but the entropy still changes"),
+        ([*RISING, 1.0], [], "Not converged yet: completion grew"),
+        ([*LEARNED, 0.4, 0.4, 0.4], [], "Not converged: completion fell back from 100 to 4"),
+        ([0.2] * 30, [], "Converged at iteration 0"),
+        ([0.2] * 30, [], "do not train longer"),
+        ([0.2] * LOG_RULE.patience, [], "Too short"),
+    ],
+)
+def test_a_training_has_converged_where_nothing_grew_any_more(
+    completions: list[float], entropy: list[float], words: str
+) -> None:
+    found = of(training(completions, entropy=entropy), "converged")
+    assert words in found.sentence
+    assert ("iteration" in found.values) == found.sentence.startswith("Converged")
+    if completions is LEARNED and "iteration" in found.values:
+        # The moving average of three reaches the last laps two iterations after the first of them.
+        assert found.values["iteration"] in range(15, 18)
 
 
 def test_episodes_under_way_when_the_run_ended_do_not_count() -> None:
-    drives = [Drive(speed_mps=3.0, iteration=k) for k in range(15)] + [
-        Drive(speed_mps=3.0, iteration=14, until=0.05)
-    ]
-    view = prepare(made_up_recording(drives))
+    drives = [Drive(speed_mps=3.0, iteration=k) for k in range(15)]
+    view = prepare(made_up_recording([*drives, Drive(speed_mps=3.0, iteration=14, until=0.05)]))
     assert view.iterations["completion_mean"].tolist() == [100.0] * 15
     assert not view.episodes["ended"].iloc[-1]
 
@@ -115,66 +98,77 @@ def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
     assert found.values["p25_s"] == pytest.approx(COURSE.length_m / 2.5)
 
 
-def test_without_enough_laps_nothing_is_to_be_submitted() -> None:
-    found = of(laps_of((0, 5, 2.0), (2, 5, 2.0)), "submit")
-    assert found.sentence.startswith(
+def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_submitted() -> None:
+    view = laps_of((0, 5, 2.0), (2, 5, 2.0))
+    assert of(view, "submit").sentence.startswith(
         "Nothing to submit yet: no iteration has 3 complete laps (2 laps in all)"
     )
-
-
-def test_where_only_evaluations_have_laps_the_fastest_of_them_is_to_be_submitted() -> None:
-    recording = laps_of((0, 5, 2.0), (2, 5, 2.0)).recording
     rows = [  # of iteration 3 one lap of two is incomplete, of 4 and 5 all are complete
         *((3, 100.0, 8.0), (3, 90.0, 7.0)),
         *((4, 100.0, 9.5), (4, 100.0, 9.7)),
         *((5, 100.0, 9.8), (5, 100.0, 9.8)),
     ]
     evaluated = pd.DataFrame(rows, columns=["iteration", "completion", "time_s"])
-    evaluated = evaluated.assign(stream="training", phase="evaluation").reindex(
-        columns=recording.metrics.columns
-    )
-    found = of(prepare(replace(recording, metrics=evaluated)), "submit")
-    assert found.sentence.startswith(
+    evaluated = evaluated.assign(stream="training", phase="evaluation")
+    metrics = evaluated.reindex(columns=view.recording.metrics.columns)
+    assert of(prepare(replace(view.recording, metrics=metrics)), "submit").sentence.startswith(
         "Submit the checkpoint saved after iteration 4: its evaluation completed both laps, in 9.60 s on average."
     )
 
 
-def test_the_chance_of_a_lap_is_measured_and_fitted() -> None:
-    found = lap_chance(np.array([10.0, 11.0, 12.0, 13.0, math.nan]), 11.5)
-    assert found is not None
-    assert (found.laps, found.faster, found.share) == (4, 2, 0.5)
-    assert found.normal == pytest.approx(0.5)
-    assert (found.low, found.high) == pytest.approx((0.1500, 0.8500), abs=1e-3)
+def test_laps_that_are_in_metrics_files_only_can_be_submitted() -> None:
+    recording = laps_of((0, 5, 2.0)).recording
+    known = {
+        "stream": "training",
+        "worker": 0,
+        "iteration": 7,
+        "trial": 1,
+        "phase": "training",
+        "reward": 1.0,
+    }
+    known |= {"completion": 100.0, "time_s": 9.5, "episode_status": "lap_complete", "resets": 0.0}
+    metrics = pd.DataFrame({"episode": np.arange(100, 108)}).assign(**known)
+    view = prepare(replace(recording, metrics=metrics))
+    assert of(view, "submit").sentence.startswith("Submit the checkpoint that drove iteration 7:")
+    words = "8 more episodes known from metrics files only; 8 complete laps, the best in 9.50 s"
+    assert words in headline(view)
+    assert draw_sections(LogPage(view, []))
 
 
-def test_without_a_lap_there_is_no_chance() -> None:
-    view = laps_of((0, 5, 2.0))
-    assert [one.rule for one in findings(view)] == ["converged", "submit", "runs_off", "steering"]
-    assert lap_chance(np.array([math.nan]), 9.0) is None
-
-
-def test_the_target_is_compared_with_the_laps_of_the_last_third() -> None:
+def test_the_chance_of_a_lap_is_measured_and_fitted_on_the_laps_of_the_last_third() -> None:
     view = laps_of((6, 0, 1.0), (6, 0, 1.0), (4, 0, 2.0), (2, 0, 3.0))
     found = of(view, "chance", target_s=COURSE.length_m / 2.5)
     assert (found.values["laps"], found.values["faster"]) == (6, 2)
     assert "2 of 6 complete laps since iteration 2 took at most 7.08 s" in found.sentence
+    assert (found.values["low"], found.values["high"]) == pytest.approx((0.0968, 0.7), abs=1e-3)
+    assert found.values["normal"] == pytest.approx(0.303, abs=0.001)
+
+
+def test_without_a_lap_there_is_no_chance_and_few_say_little() -> None:
+    rules = [one.rule for one in findings(laps_of((0, 5, 2.0)))]
+    assert rules == ["converged", "submit", "runs_off", "steering"]
+    for laps in (1, 3):
+        view = laps_of((laps, 4, 2.0))
+        sentence = of(view, "chance").sentence
+        assert "too few to say how likely the next one is" in sentence
+        lost = [one.sentence for one in findings(view) if one.rule == "time_lost"]
+        assert [f"From {laps} laps this is a hint at most." in one for one in lost] == [True] * (laps > 1)
 
 
 def test_time_is_lost_in_the_sectors_that_were_driven_slowly() -> None:
-    slow = [SECTORS.parts[k] for k in (1, 5, 9)]
-    sections = tuple((part.begin, part.end, speed) for part, speed in zip(slow, (0.8, 1.0, 1.2), strict=True))
+    slow = dict(zip((SECTORS[k] for k in (1, 5, 9)), (0.8, 1.0, 1.2), strict=True))
+    sections = tuple((part.begin, part.end, speed) for part, speed in slow.items())
     drives = [Drive(speed_mps=2.0)] + [Drive(speed_mps=2.0, sections=sections)] * 6
     found = of(prepare(made_up_recording(drives)), "time_lost")
     lost = {
         f"lost_s, {part.name}": (part.end - part.begin) * COURSE.length_m * (1 / speed - 1 / 2.0)
-        for part, speed in zip(slow, (0.8, 1.0, 1.2), strict=True)
+        for part, speed in slow.items()
     }
     names = [name for name in found.values if name.startswith("lost_s")]
     assert names == sorted(lost, key=lambda name: -lost[name])
-    for name, seconds in lost.items():
-        assert found.values[name] == pytest.approx(seconds, abs=0.05)
+    assert {name: found.values[name] for name in lost} == pytest.approx(lost, abs=0.05)
     assert found.values["theoretical_best_s"] == pytest.approx(COURSE.length_m / 2.0, abs=0.05)
-    assert f"waypoints {slow[0].first_waypoint} to {slow[0].last_waypoint}" in found.sentence
+    assert f"waypoints {SECTORS[1].first_waypoint} to {SECTORS[1].last_waypoint}" in found.sentence
 
 
 def off_at(*places: tuple[int, int, bool]) -> LogView:
@@ -186,16 +180,17 @@ def off_at(*places: tuple[int, int, bool]) -> LogView:
 
 
 def test_the_car_runs_off_where_it_was_made_to() -> None:
-    found = of(off_at((35, 6, False), (85, 4, False)), "runs_off")
-    assert [name for name in found.values if name.startswith("times")] == [
-        "times, waypoint 35",
-        "times, waypoint 85",
-    ]
-    assert found.values["times, waypoint 35"] == 6
+    view = off_at((35, 6, False), (85, 4, False))
+    found = of(view, "runs_off")
+    times = {name: value for name, value in found.values.items() if name.startswith("times")}
+    assert times == {"times, waypoint 35": 6, "times, waypoint 85": 4}
     # All sixteen come to waypoint 35, and six do not come to 85.
     assert found.values["risk, waypoint 35"] == pytest.approx(6 / 16)
     assert found.values["risk, waypoint 85"] == pytest.approx(4 / 10)
     assert "waypoint 35 (left 2) to the right" in found.sentence
+    # What the car does at several places is said once.
+    assert "at waypoints 35 and 85 it understeers" in of(view, "steering").sentence
+    assert of(off_at(), "runs_off").sentence == "The car does not run off the road since iteration 0."
 
 
 def test_a_car_that_goes_straight_on_with_the_wheel_turned_understeers_and_a_spinning_one_oversteers() -> (
@@ -205,10 +200,9 @@ def test_a_car_that_goes_straight_on_with_the_wheel_turned_understeers_and_a_spi
     assert found.sentence.startswith("Before it runs off, at waypoint 35 it understeers")
     assert "at waypoint 85 it oversteers" in found.sentence
     assert (found.values["understeer, waypoint 35"], found.values["oversteer, waypoint 85"]) == (6, 4)
-    assert found.figure == "slide_map"
 
 
-def test_a_car_that_does_not_steer_back_is_told_so() -> None:
+def test_a_car_that_does_not_steer_back_is_named_so() -> None:
     view = off_at((35, 6, False))
     last = view.steps.groupby("episode").cumcount(ascending=False) < 12
     ends = view.episodes["status"].to_numpy()[view.steps["episode"]] == "off_track"
@@ -217,85 +211,11 @@ def test_a_car_that_does_not_steer_back_is_told_so() -> None:
     assert "it does not steer back" in of(prepare(replace(view.recording, steps=steps)), "steering").sentence
 
 
-def test_logs_without_episode_status_tell_where_the_car_runs_off() -> None:
+def test_logs_without_episode_status_show_where_the_car_runs_off() -> None:
     recording = off_at((35, 6, False)).recording
-    steps = recording.steps.assign(
-        episode_status=recording.steps["episode_status"].astype(str).where(lambda s: s == "", "")
-    )
-    view = prepare(replace(recording, steps=steps))
+    view = prepare(replace(recording, steps=recording.steps.assign(episode_status="")))
     assert view.episodes["status"].tolist() == ["lap_complete"] * 6 + ["off_track"] * 6
     assert of(view, "runs_off").values["times, waypoint 35"] == 6
-
-
-def test_a_car_that_stays_on_the_road_does_not_run_off() -> None:
-    found = of(off_at(), "runs_off")
-    assert found.sentence == "The car does not run off the road since iteration 0."
-
-
-def test_evaluations_that_fall_while_the_training_holds_are_overfitting() -> None:
-    falling = [10.0 * k for k in range(10)] + [90.0] * 9 + [40.0] * 10
-    found = of(training(LEARNED, evaluated=falling), "overfits")
-    assert found.sentence.startswith("It overfits: completion in the evaluation fell from 90 %")
-    assert found.values["best_iteration"] in range(10, 19)
-
-
-def test_evaluations_that_fall_with_the_training_or_hold_are_no_overfitting() -> None:
-    falling = [10.0 * k for k in range(10)] + [90.0] * 9 + [40.0] * 10
-    both = training([*RISING, *[1.0] * 4, *[0.3] * 10], evaluated=falling)
-    holding = training(LEARNED, evaluated=[min(90.0, 10.0 * k) for k in range(29)])
-    for view in (both, holding):
-        assert of(view, "overfits").sentence.startswith("No sign of overfitting")
-
-
-def test_a_race_without_training_is_judged_by_its_laps() -> None:
-    recording = made_up_recording(
-        [Drive()], evaluations={"race": [Drive(speed_mps=v) for v in (1.5, 2.0, 1.8)]}
-    )
-    race = recording.steps[recording.steps["stream"] == "race"].reset_index(drop=True)
-    view = prepare(replace(recording, steps=race))
-    assert [one.rule for one in findings(view)] == ["chance", "time_lost", "runs_off"]
-    assert of(view, "chance").sentence.startswith("3 of 3 episodes of the evaluations are complete laps")
-    assert headline(view).startswith("No training; ")
-    assert "3 complete laps, the best in 8.85 s" in headline(view)
-    drawn = {chart.name for section in draw_sections(view) for chart in section.charts}
-    assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn
-    assert [row[:2] for row in best_laps(view).rows] == [
-        ("race", "8.85"),
-        ("race", "9.84"),
-        ("race", "11.81"),
-    ]
-
-
-@pytest.mark.parametrize("laps", [1, 3])
-def test_a_few_laps_say_nothing_of_chances_and_only_hint_at_lost_time(laps: int) -> None:
-    view = laps_of((laps, 4, 2.0))
-    sentence = of(view, "chance").sentence
-    assert "too few to say how likely the next one is" in sentence
-    assert "normal fit" not in sentence
-    lost = [one.sentence for one in findings(view) if one.rule == "time_lost"]
-    assert [f"From {laps} laps this is a hint at most." in one for one in lost] == [True] * (laps > 1)
-
-
-def test_laps_that_only_metrics_tell_of_can_be_submitted() -> None:
-    recording = laps_of((0, 5, 2.0)).recording
-    episodes = np.arange(100, 108)
-    told = pd.DataFrame(
-        {
-            "stream": "training",
-            "worker": 0,
-            "iteration": 7,
-            "episode": episodes,
-            "trial": 1,
-            "phase": "training",
-        }
-        | {"reward": 1.0, "completion": 100.0, "time_s": 9.5, "episode_status": "lap_complete", "resets": 0.0}
-    )
-    view = prepare(replace(recording, metrics=told))
-    assert of(view, "submit").sentence.startswith("Submit the checkpoint that drove iteration 7:")
-    assert "8 more episodes known from metrics files only; 8 complete laps, the best in 9.50 s" in headline(
-        view
-    )
-    assert [section.title for section in draw_sections(view)]
 
 
 def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
@@ -307,11 +227,52 @@ def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
     assert "crashes" not in [one.rule for one in findings(off_at((35, 6, False)))]
 
 
-def test_what_the_car_does_at_several_places_is_said_once() -> None:
-    view = off_at((35, 6, False), (85, 4, False))
-    sentence = of(view, "steering").sentence
-    assert sentence.count("understeers") == 1
-    assert "at waypoints 35 and 85 it understeers" in sentence
+FALLING = [10.0 * k for k in range(10)] + [90.0] * 9 + [40.0] * 10
+
+
+@pytest.mark.parametrize(
+    ("completions", "evaluated", "overfits"),
+    [
+        (LEARNED, FALLING, True),
+        ([*RISING, *[1.0] * 4, *[0.3] * 10], FALLING, False),
+        (LEARNED, [min(90.0, 10.0 * k) for k in range(29)], False),
+    ],
+    ids=["they fall while the training holds", "both fall", "both hold"],
+)
+def test_evaluations_that_fall_while_the_training_holds_are_overfitting(
+    completions: list[float], evaluated: list[float], overfits: bool
+) -> None:
+    found = of(training(completions, evaluated=evaluated), "overfits")
+    words = (
+        "It overfits: completion in the evaluation fell from 90 %" if overfits else "No sign of overfitting"
+    )
+    assert found.sentence.startswith(words)
+    assert not overfits or found.values["best_iteration"] in range(10, 19)
+
+
+def test_a_run_of_ours_is_judged_by_its_own_rules_and_its_decision_is_what_the_report_shows() -> None:
+    view = training(LEARNED, evaluated=FALLING)
+    overrides = ["stopping.converged.patience=40", "stopping.overfitting.patience=20"]
+    stopping = compose_experiment(overrides)[1].mapping["stopping"]
+    own = replace(view, recording=replace(view.recording, stopping=stopping))
+    assert "at least 41 are needed" in of(own, "converged").sentence
+    assert of(own, "overfits").sentence.startswith("No sign of overfitting")  # not before iteration 41
+    decision = {"rule": "overfitting", "why": "held-out fell", "values": {"a": 1.0}, "thresholds": {}}
+    ended = replace(view, recording=replace(view.recording, decision=decision))
+    assert "ended it (overfitting): held-out fell." in of(ended, "converged").sentence
+    assert "overfits" not in [one.rule for one in findings(ended)]
+
+
+def test_a_race_without_training_is_judged_by_its_laps() -> None:
+    races = {"race": [Drive(speed_mps=v) for v in (1.5, 2.0, 1.8)]}
+    view = prepare(made_up_recording([], evaluations=races))
+    assert [one.rule for one in findings(view)] == ["chance", "time_lost", "runs_off"]
+    assert of(view, "chance").sentence.startswith("3 of 3 episodes in the evaluations are complete laps")
+    assert headline(view).startswith("No training; ")
+    assert "3 complete laps, the best in 8.85 s" in headline(view)
+    drawn = {chart.name for some in draw_sections(LogPage(view, [])).values() for chart in some}
+    assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn
+    assert [row[:2] for row in best_laps(view).rows] == [("race", s) for s in ("8.85", "9.84", "11.81")]
 
 
 def test_without_a_course_only_what_needs_its_shape_is_left_out() -> None:
@@ -335,19 +296,3 @@ def test_places_off_the_road_are_counted_the_shorter_way_round(at, others, withi
     assume(not (np.abs(away - within) < 1e-12).any())
     counted = neighbours(np.array(at), np.array(others), within)
     assert counted.tolist() == (away <= within).sum(axis=1).tolist()
-
-
-def test_a_run_of_ours_is_judged_by_its_own_rule_and_its_decision_is_what_the_report_says() -> None:
-    view = training(LEARNED)
-    stopping = compose_experiment(["stopping.converged.patience=40"])[1].mapping["stopping"]
-    own = replace(view, recording=replace(view.recording, stopping=stopping))
-    assert "at least 41 are needed" in of(own, "converged").sentence
-    decision = {
-        "rule": "overfitting",
-        "why": "held-out completion fell",
-        "values": {"a": 1.0},
-        "thresholds": {},
-    }
-    ended = replace(view, recording=replace(view.recording, decision=decision))
-    assert "ended it (overfitting): held-out completion fell." in of(ended, "converged").sentence
-    assert "overfits" not in [one.rule for one in findings(ended)]

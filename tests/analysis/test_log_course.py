@@ -96,7 +96,7 @@ def test_a_page_has_the_waypoint_numbers_of_its_log_wherever_it_has_any(every: i
     logged = steps["closest_waypoint"].to_numpy()
     near = (np.abs(logged - found.previous) <= 1) | (np.abs(logged - found.next) <= 1)
     assert near.mean() > 0.95
-    assert max(part.last_waypoint for part in sectors_of(view.course).parts) <= logged.max() + 1
+    assert max(part.last_waypoint for part in sectors_of(view.course)) <= logged.max() + 1
     assert view.course.length_m == pytest.approx(made_up_course().length_m, rel=0.03)
 
 

@@ -259,6 +259,7 @@ def test_another_reward_is_told_with_the_ranks_of_laps_and_places(view):
     )
     assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in told.sentences[1]
     assert "waypoint 0 gains most and waypoint 20 loses most" in told.sentences[2]
+    assert told.laps.rows[0][:3] == ("1", "3", "1")
     assert [chart.name for chart in told.charts] == ["replayed_laps", "replayed_places"]
     text = Html(page_html(LogPage(view, findings(view), replay=told))).text
     assert text.index(told.sentences[0]) < text.rindex("The best laps")

@@ -9,11 +9,10 @@ import pytest
 from deepracer_exp.analysis.log_course import catalogue_track
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.sectors import (
-    BEND_PM,
     SHORTEST_M,
     interval_times,
+    sector_at,
     sectors_of,
-    theoretical_best_s,
     time_lost,
     times_by_sector,
 )
@@ -21,70 +20,62 @@ from deepracer_exp.analysis.sectors import (
 from .made_up import Drive, made_up_course, made_up_recording
 
 COURSE = made_up_course()
+SECTORS = sectors_of(COURSE)
 
 
 @pytest.mark.parametrize(
-    "name", ["reinvent_base", "Oval_track", "Bowtie_track", "Straight_track", "Spain_track"]
+    ("name", "kinds"),
+    [
+        ("reinvent_base", {"left", "right", "straight"}),
+        ("Oval_track", {"left", "straight"}),
+        ("Bowtie_track", {"left", "right", "straight"}),
+        ("Straight_track", {"straight"}),
+        ("Spain_track", {"left", "right", "straight"}),
+    ],
 )
-def test_sectors_cover_the_course_once_and_are_not_too_short(name: str) -> None:
+def test_sectors_cover_the_course_once_and_are_not_too_short(name: str, kinds: set[str]) -> None:
     course = catalogue_track(name)
-    parts = sectors_of(course).parts
+    parts = sectors_of(course)
+    assert {part.kind for part in parts} == kinds
     assert parts[0].begin == 0.0
     assert parts[-1].end == 1.0
-    assert all(a.end == b.begin for a, b in pairwise(parts))
-    assert (
-        len(parts) == 1 or min(part.end - part.begin for part in parts) * course.length_m > 0.9 * SHORTEST_M
-    )
-    assert all((part.kind == "straight") == (1 / part.radius_m < BEND_PM) for part in parts)
+    assert all(a.end == b.begin and a.kind != b.kind for a, b in pairwise(parts))
+    assert all((part.end - part.begin) * course.length_m > 0.9 * SHORTEST_M for part in parts)
 
 
-def test_an_oval_driven_to_the_left_has_left_bends_and_straights_only() -> None:
-    parts = sectors_of(catalogue_track("Oval_track")).parts
-    assert {part.kind for part in parts} == {"left", "straight"}
-    backwards = sectors_of(catalogue_track("Oval_track", reversed=True)).parts
+def test_an_oval_driven_the_other_way_has_right_bends() -> None:
+    backwards = sectors_of(catalogue_track("Oval_track", reversed=True))
     assert {part.kind for part in backwards} == {"right", "straight"}
-
-
-def test_a_straight_road_is_one_sector() -> None:
-    assert [part.kind for part in sectors_of(catalogue_track("Straight_track")).parts] == ["straight"]
 
 
 def test_at_constant_speed_a_sector_takes_its_share_of_the_lap_wherever_the_lap_starts() -> None:
     drives = [Drive(speed_mps=1.0), Drive(speed_mps=1.0, start=0.37)]
-    sectors = sectors_of(COURSE)
-    times = times_by_sector(prepare(made_up_recording(drives)).steps, sectors)
-    share = np.array([part.end - part.begin for part in sectors.parts])
+    times = times_by_sector(prepare(made_up_recording(drives)).steps, SECTORS)
+    share = np.array([part.end - part.begin for part in SECTORS])
     np.testing.assert_allclose(times.to_numpy(), [share * COURSE.length_m] * 2, atol=1e-6)
 
 
 def test_sector_times_sum_up_to_the_lap_time() -> None:
     drives = [Drive(sections=((0.2, 0.4, 3.0),), start=s) for s in (0.0, 0.1, 0.3, 0.999)]
     view = prepare(made_up_recording(drives))
-    times = times_by_sector(view.steps, sectors_of(COURSE))
+    times = times_by_sector(view.steps, SECTORS)
     np.testing.assert_allclose(times.sum(axis=1), view.episodes["lap_time_s"], rtol=1e-9)
 
 
-def test_incomplete_laps_have_no_sector_times() -> None:
-    drives = [Drive(until=0.7), Drive(), Drive(off_at=30)]
-    assert times_by_sector(prepare(made_up_recording(drives)).steps, sectors_of(COURSE)).index.tolist() == [1]
+def test_incomplete_laps_have_no_sector_times_and_cannot_be_compared() -> None:
+    steps = prepare(made_up_recording([Drive(until=0.7), Drive(), Drive(off_at=30)])).steps
+    assert times_by_sector(steps, SECTORS).index.tolist() == [1]
+    with pytest.raises(KeyError):
+        time_lost(steps, 1, 0)
+    assert len(times_by_sector(steps[steps["episode"] == 2], SECTORS)) == 0
 
 
 def test_the_theoretical_best_lap_takes_the_fast_half_of_each_lap() -> None:
-    sectors = sectors_of(COURSE)
-    middle = sectors.parts[len(sectors.parts) // 2].begin
-    drives = [
-        Drive(speed_mps=1.0, sections=((0.0, middle, 2.0),)),
-        Drive(speed_mps=1.0, sections=((middle, 1.0, 2.0),)),
-    ]
-    times = times_by_sector(prepare(made_up_recording(drives)).steps, sectors)
-    assert theoretical_best_s(times) == pytest.approx(COURSE.length_m / 2.0, abs=0.02)
+    middle = SECTORS[len(SECTORS) // 2].begin
+    drives = [Drive(speed_mps=1.0, sections=((a, b, 2.0),)) for a, b in ((0.0, middle), (middle, 1.0))]
+    times = times_by_sector(prepare(made_up_recording(drives)).steps, SECTORS)
+    assert times.min().sum() == pytest.approx(COURSE.length_m / 2.0, abs=0.02)
     assert times.sum(axis=1).min() > COURSE.length_m / 2.0 + 1.0
-
-
-def test_without_a_lap_there_are_no_times() -> None:
-    times = times_by_sector(prepare(made_up_recording([Drive(off_at=30)])).steps, sectors_of(COURSE))
-    assert len(times) == 0
-    assert np.isnan(theoretical_best_s(times))
 
 
 def test_a_lap_loses_time_where_it_is_slower_and_nowhere_else() -> None:
@@ -97,12 +88,6 @@ def test_a_lap_loses_time_where_it_is_slower_and_nowhere_else() -> None:
     assert delta.iloc[-1] == pytest.approx(slow.lap_time_s() - COURSE.length_m / 2.0, abs=1e-6)
 
 
-def test_a_lap_that_was_not_completed_cannot_be_compared() -> None:
-    steps = prepare(made_up_recording([Drive(), Drive(until=0.5)])).steps
-    with pytest.raises(KeyError):
-        time_lost(steps, 0, 1)
-
-
 def test_times_of_many_laps_do_not_mix() -> None:
     speeds = [1.0 + 0.1 * k for k in range(12)]
     steps = prepare(made_up_recording([Drive(speed_mps=v) for v in speeds])).steps
@@ -111,10 +96,9 @@ def test_times_of_many_laps_do_not_mix() -> None:
 
 
 def test_a_place_lies_in_the_sector_between_whose_ends_it_is() -> None:
-    sectors = sectors_of(COURSE)
-    middles = np.array([(part.begin + part.end) / 2 for part in sectors.parts])
-    assert sectors.of(middles).tolist() == list(range(len(middles)))
-    assert sectors.of(np.array([0.0, 1.0, np.nan])).tolist() == [0, len(middles) - 1, -1]
+    middles = np.array([(part.begin + part.end) / 2 for part in SECTORS])
+    assert sector_at(SECTORS, middles).tolist() == list(range(len(middles)))
+    assert sector_at(SECTORS, np.array([0.0, 1.0, np.nan])).tolist() == [0, len(middles) - 1, -1]
 
 
 def test_places_before_the_first_row_of_a_lap_are_passed_at_its_start() -> None:

@@ -6,7 +6,7 @@ import pandas as pd
 from deepracer_exp.analysis.log_course import waypoint_positions
 from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_waypoints
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
-from deepracer_exp.analysis.sectors import sectors_of, theoretical_best_s, times_by_sector
+from deepracer_exp.analysis.sectors import sectors_of, times_by_sector
 from deepracer_exp.analysis.statistics import Values, means, quantiles, subsample
 
 from .figure import Chart, Layer, Panel, band, bars, colored_points, line, note, points
@@ -39,15 +39,16 @@ def lap_line(view: LogView) -> Chart | None:
     lap = view.fastest_lap(*columns, *motion)
     if lap is None or view.course is None:
         return None
-    row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()].to_dict()
+    row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()]
     known = lap[lap["track_speed_mps"].notna()]
     hover = [
         f"step {step.steps:.0f}, waypoint {step.closest_waypoint}, {step.progress:.1f} %\n"
         f"driven {step.track_speed_mps:.2f} m/s, commanded {step.throttle:.2f} m/s, steering {step.steer:.1f}°"
         for step in known.itertuples()
     ]
-    speed = known["track_speed_mps"]
-    dots = colored_points(known["X"], known["Y"], speed, "speed along the track, m/s", size=5.5, hover=hover)
+    dots = colored_points(
+        known["X"], known["Y"], known["track_speed_mps"], "speed along the track, m/s", size=7.5, hover=hover
+    )
     mean_mps = view.course.length_m / float(row["lap_time_s"])
     whose = f"iteration {row['iteration']}" if view.trained else str(row["stream"])
     return Chart(
@@ -56,8 +57,7 @@ def lap_line(view: LogView) -> Chart | None:
         caption="One dot for each control step of the fastest complete lap, coloured by the speed of the car; "
         f"at a constant {mean_mps:.2f} m/s the centre line would take as long. Dots close together are slow: find "
         "where the car slows down and ask whether the bend requires it.",
-        rows=[[map_panel(view.course, [line(lap["X"], lap["Y"], PALE, width=1.0), dots])]],
-        table=lap.reset_index(drop=True),
+        rows=[[map_panel(view.course, [line(lap["X"], lap["Y"], PALE, width=1.25), dots])]],
     )
 
 
@@ -67,48 +67,40 @@ def sector_times(view: LogView) -> Chart | None:
         return None
     sectors = sectors_of(view.course)
     times = times_by_sector(view.steps, sectors)
-    times = times[np.isfinite(times).all(axis=1)]
     if not len(times):
         return None
-    best = times.min()
-    median, fastest = times.median() - best, times.loc[times.sum(axis=1).idxmin()] - best
-    names = list(times.columns)
-    x = np.arange(len(names))
-    hover = [
-        f"{name}: {lost:.3f} s behind the best {own:.3f} s"
-        for name, lost, own in zip(names, fastest, best, strict=True)
-    ]
-    lost = Panel(
+    table = pd.DataFrame(
+        {
+            "best_s": times.min(),
+            "median_s": times.median(),
+            "fastest_lap_s": times.loc[times.sum(axis=1).idxmin()],
+        }
+    )
+    lost = table.sub(table["best_s"], axis=0)
+    x = np.arange(len(sectors))
+    panel = Panel(
         layers=[
-            bars(x, median, PALE, f"median of {len(times)} complete laps"),
-            points(x, fastest, VERMILION, "fastest lap", size=9.0, symbol="diamond", hover=hover),
+            bars(x, lost["median_s"], PALE, f"median of {len(times)} complete laps"),
+            points(x, lost["fastest_lap_s"], VERMILION, "fastest lap", size=12.0, symbol="diamond"),
         ],
-        x_names=names,
+        x_names=list(times),
         x_label="sector, in driving direction",
         y_label="s behind the best of the sector",
     )
     lines: list[Layer] = []
     notes: list[Layer] = []
-    for number, sector in enumerate(sectors.parts):
+    for number, sector in enumerate(sectors):
         places = view.course.points_at(np.linspace(sector.begin, sector.end, 60))
-        lines.append(line(places[:, 0], places[:, 1], CATEGORIES[number % 6], width=4.0))
-        notes.append(note(places[30].tolist(), f"{sector.name}\n{best[sector.name]:.2f} s"))
-    best_s, driven_s = theoretical_best_s(times), float(times.sum(axis=1).min())
+        lines.append(line(places[:, 0], places[:, 1], CATEGORIES[number % 6], width=5.0))
+        notes.append(note(places[30].tolist(), f"{sector.name}\n{table['best_s'][sector.name]:.2f} s"))
+    best_s, driven_s = table["best_s"].sum(), table["fastest_lap_s"].sum()
     return Chart(
         name="sector_times",
         title=f"Sectors: the best times of all add up to {best_s:.3f} s, the fastest lap took {driven_s:.3f} s",
         caption="Sectors begin and end where the curvature of the centre line changes; the map shows the best "
         "time driven in each of them, in any complete lap. The height of a bar is what the median lap loses there, "
         "the diamond what even the fastest lap lost.",
-        rows=[[map_panel(view.course, [*lines, *notes], numbers=False)], [lost]],
-        table=pd.DataFrame(
-            {
-                "sector": names,
-                "best_s": best.to_numpy(),
-                "median_s": times.median().to_numpy(),
-                "fastest_lap_s": (fastest + best).to_numpy(),
-            }
-        ),
+        rows=[[map_panel(view.course, [*lines, *notes], numbers=False)], [panel]],
     )
 
 
@@ -116,48 +108,37 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
     """Draw speed and steering at each waypoint, beside those of the racing line and of the centre line."""
     columns = ("closest_waypoint", "track_speed_mps", "yaw_rate_dps", "steer", "throttle", "steps")
     rows, which = _laps_or_recent(view, *columns)
-    rows = rows[rows["steps"].to_numpy() > STARTING_STEPS]
+    rows = rows[rows["steps"] > STARTING_STEPS]
     if not len(rows):
         return None
     n = view.waypoint_count
     at, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), _ROWS)
     lap = view.fastest_lap(*columns)
-    table = pd.DataFrame({"waypoint": at})
-    speed: list[Layer] = []
-    steering: list[Layer] = []
-    for column, layers in (("track_speed_mps", speed), ("steer", steering)):
+    panels: dict[str, list[Layer]] = {"track_speed_mps": [], "steer": []}
+    for column, layers in panels.items():
         values = rows[column].to_numpy(np.float64)
         low, high = quantiles(waypoint[part], values[part], n, (0.1, 0.9))
-        mean = means(waypoint, values, n)
-        table = table.assign(**{f"{column}_mean": mean, f"{column}_p10": low, f"{column}_p90": high})
         layers.append(band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"))
-        layers.append(line(at, mean, BLUE, "mean", width=2.0))
+        layers.append(line(at, means(waypoint, values, n), BLUE, "mean", width=2.5))
         if column == "track_speed_mps":
-            layers.append(
-                line(at, means(waypoint, rows["throttle"], n), PALE, "mean speed commanded", width=1.4)
-            )
+            layers.append(line(at, means(waypoint, rows["throttle"], n), PALE, "mean speed commanded"))
         if lap is not None:
             driven = lap[lap["steps"] > STARTING_STEPS]
             # Control steps of uneven length make the speed of a single one jump.
             smooth = driven[column].rolling(3, center=True, min_periods=1).mean()
             best = _without_gaps(means(closest_waypoints(driven), smooth, n))
-            layers.append(line(at, best, INK, "fastest lap, mean of three steps", width=1.2))
+            layers.append(line(at, best, INK, "fastest lap, mean of three steps", width=1.5))
     if view.course is not None:
         places = waypoint_positions(view.course)
-        known = np.minimum(at, len(places) - 1)
         grip_mps2, top_mps = _grip(rows.iloc[part]), float(rows["throttle"].max())
         for ideal, name, color in (
             (minimum_curvature_line(view.course), "racing line", VERMILION),
             (center_line(view.course), "centre line", ORANGE),
         ):
-            ideal_mps = ideal.at(places, ideal.speed_mps(grip_mps2, top_mps))
-            ideal_deg = ideal.at(places, ideal.steering_deg)
+            speed_mps = ideal.at(places, ideal.speed_mps(grip_mps2, top_mps))
             x, words = np.arange(len(places)), f"{name}, cornering at {grip_mps2:.1f} m/s²"
-            speed.append(line(x, ideal_mps, color, words, dashed=True))
-            steering.append(line(x, ideal_deg, color, name, dashed=True))
-            key = name.replace(" ", "_")
-            found = {f"{key}_speed_mps": ideal_mps[known], f"{key}_steering_deg": ideal_deg[known]}
-            table = table.assign(**found)
+            panels["track_speed_mps"].append(line(x, speed_mps, color, words, dashed=True))
+            panels["steer"].append(line(x, ideal.at(places, ideal.steering_deg), color, name, dashed=True))
     return Chart(
         name="speed_steering_by_waypoint",
         title="Speed and steering by waypoint",
@@ -166,64 +147,59 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
         "room for braking. Where the driven speed stays far below the dashed lines, time can be gained; steering "
         "that swings where they are flat is weaving.",
         rows=[
-            [waypoint_panel(speed, "speed along the track, m/s", n)],
-            [waypoint_panel(steering, "steering, ° (left is positive)", n)],
+            [waypoint_panel(panels["track_speed_mps"], "speed along the track, m/s", n)],
+            [waypoint_panel(panels["steer"], "steering, ° (left is positive)", n)],
         ],
         share_x=True,
-        table=table,
     )
 
 
 def racing_line(view: LogView) -> Chart | None:
     """Draw how far from the racing line the car drives."""
-    if view.course is None:
+    course = view.course
+    if course is None:
         return None
     columns = ("closest_waypoint", "lap_position", "offset_m", "X", "Y")
     rows, which = _laps_or_recent(view, *columns)
-    rows = rows[np.isfinite(rows["offset_m"].to_numpy(np.float64))]
+    rows = rows[np.isfinite(rows["offset_m"])]
     if not len(rows):
         return None
-    ideal, course = minimum_curvature_line(view.course), view.course
-    n = view.waypoint_count
+    ideal, n = minimum_curvature_line(course), view.waypoint_count
     at = np.arange(n)
     rows = rows.iloc[subsample(len(rows), _ROWS)]
-    offset_m, waypoint = rows["offset_m"].to_numpy(np.float64), closest_waypoints(rows)
-    away_m = offset_m - ideal.at(rows["lap_position"], ideal.offset_m)
+    waypoint = closest_waypoints(rows)
+    away_m = rows["offset_m"] - ideal.at(rows["lap_position"], ideal.offset_m)
     low, middle, high = quantiles(waypoint, away_m, n, (0.1, 0.5, 0.9))
-    median_xy = _beside(
-        course.waypoints, quantiles(waypoint, offset_m, n, (0.5,))[0][: len(course.waypoints)]
-    )
+    median = _beside(course.waypoints, quantiles(waypoint, rows["offset_m"], n, (0.5,))[0])
     layers: list[Layer] = [
         line(at, np.zeros(n), VERMILION, "racing line", dashed=True),
         band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"),
-        line(at, middle, BLUE, "median", width=2.0),
+        line(at, middle, BLUE, "median", width=2.5),
     ]
     paths: list[Layer] = [
-        line(ideal.xy[:, 0], ideal.xy[:, 1], VERMILION, "racing line", width=1.8, dashed=True),
-        line(median_xy[:, 0], median_xy[:, 1], BLUE, f"{which}, median", width=2.0),
+        line(ideal.xy[:, 0], ideal.xy[:, 1], VERMILION, "racing line", dashed=True),
+        line(median[:, 0], median[:, 1], BLUE, f"{which}, median", width=2.5),
     ]
     lap = view.fastest_lap(*columns)
     if lap is not None:
         own_m = lap["offset_m"] - ideal.at(lap["lap_position"], ideal.offset_m)
         own = _without_gaps(means(closest_waypoints(lap), own_m, n))
-        paths.append(line(lap["X"], lap["Y"], INK, "fastest lap", width=1.2))
-        layers.append(line(at, own, INK, "fastest lap", width=1.2))
-    mean_m = float(np.nanmean(np.abs(away_m)))
+        paths.append(line(lap["X"], lap["Y"], INK, "fastest lap", width=1.5))
+        layers.append(line(at, own, INK, "fastest lap", width=1.5))
     return Chart(
         name="racing_line",
-        title=f"The racing line: the car drives {100 * mean_m:.0f} cm from it on average",
+        title=f"The racing line: the car drives {100 * away_m.abs().mean():.0f} cm from it on average",
         caption="The racing line is the one of minimum curvature that keeps all wheels on the road; the lower panel "
         "shows how far to the left (positive) or to the right of it the car is. A line that cuts in before the bend "
         "and runs wide behind it crosses zero twice: the car turns in too early.",
         rows=[[map_panel(course, paths)], [waypoint_panel(layers, "m left of the racing line", n)]],
-        table=pd.DataFrame({"waypoint": at, "median_m": middle, "p10_m": low, "p90_m": high}),
     )
 
 
 def acceleration_map(view: LogView) -> Chart | None:
     """Draw where the car accelerates and where it brakes."""
     rows = view.recent("X", "Y", "acceleration_mps2", "braking_mps2", "steps")
-    rows = rows[rows["steps"].to_numpy() > STARTING_STEPS]
+    rows = rows[rows["steps"] > STARTING_STEPS]
     if view.course is None or not len(rows):
         return None
     grid = Grid.over(view.course, 8_000)
@@ -236,7 +212,6 @@ def acceleration_map(view: LogView) -> Chart | None:
         "standing starts: positive where the car gets faster. A car should brake before a bend and accelerate in its "
         "second half; braking on a straight is time lost.",
         rows=[[map_panel(view.course, [grid.cells(mean, "change of speed, m/s²", diverging=True)])]],
-        table=grid.table({"change_mps2": mean}),
     )
 
 
@@ -257,7 +232,6 @@ def slide_map(view: LogView) -> Chart | None:
         "last third of the iterations; 0 is rolling without slip. Bright cells are bends taken at the limit of grip: "
         "only another line can be faster there.",
         rows=[[map_panel(view.course, [grid.cells(mean, "slide, degrees")])]],
-        table=grid.table({"slide_deg": mean}),
     )
 
 
@@ -271,8 +245,8 @@ def waypoint_map(view: LogView) -> Chart | None:
     tenth = np.arange(0, len(x) - course.closed, 10)
     ahead = course.start_pose(np.array([0.5 * course.width_m / course.length_m]))
     layers: list[Layer] = [
-        points(x, y, BLUE, size=3.0, hover=hover),
-        points(x[tenth], y[tenth], VERMILION, size=6.0),
+        points(x, y, BLUE, size=4.0, hover=hover),
+        points(x[tenth], y[tenth], VERMILION, size=8.0),
         note((float(ahead.x[0]), float(ahead.y[0])), "start"),
     ]
     return Chart(
@@ -282,7 +256,6 @@ def waypoint_map(view: LogView) -> Chart | None:
         "other figures; every tenth waypoint is marked. The car drives from low to high numbers and starts at "
         "waypoint 0.",
         rows=[[map_panel(course, layers)]],
-        table=pd.DataFrame({"waypoint": np.arange(len(x)), "x_m": x, "y_m": y}),
     )
 
 
@@ -302,13 +275,12 @@ def _grip(rows: pd.DataFrame) -> float:
 
 def _without_gaps(values: Values) -> Values:
     """Return values with the gaps filled in, which are waypoints that one lap jumped over."""
-    known = np.flatnonzero(np.isfinite(values))
-    return np.interp(np.arange(len(values)), known, values[known]) if len(known) else values
+    return pd.Series(values).interpolate(limit_direction="both").to_numpy()
 
 
 def _beside(waypoints: Values, offset_m: Values) -> Values:
-    """Return the points (n, 2) so many m to the left of the waypoints."""
+    """Return the points (n, 2) so many m to the left of the first waypoints."""
     ahead = np.gradient(waypoints, axis=0)
-    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
-    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])[: len(offset_m)]
-    return waypoints[: len(offset_m)] + offset_m[:, None] * left
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    n = min(len(waypoints), len(offset_m))
+    return waypoints[:n] + offset_m[:n, None] * np.column_stack([-ahead[:n, 1], ahead[:n, 0]])

@@ -1,7 +1,7 @@
 """Charts made of panels, and the traces and shapes in these, as Plotly objects in one style."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -48,8 +48,18 @@ class Chart:
     """Panels row by row."""
     share_x: bool = False
     """Whether the panels of a column zoom together along x."""
-    table: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """The data that is drawn."""
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """Return the data that is drawn, a row a point: `panel`, `name` in the legend, `x`, `y`, `value` by colour."""
+        panels = [panel for row in self.rows for panel in row]
+        tables = [
+            _data(layer).assign(panel=panel.title or panel.y_label, name=layer.name)
+            for panel in panels
+            for layer in panel.layers
+            if isinstance(layer, go.Scatter | go.Bar | go.Heatmap)
+        ]
+        return pd.concat(tables, ignore_index=True)[["panel", "name", "x", "y", "value"]]
 
 
 def in_rows(panels: Sequence[Panel], columns: int = 2) -> list[Sequence[Panel]]:
@@ -63,12 +73,12 @@ def line(
     color: str,
     name: str | None = None,
     *,
-    width: float = 1.6,
+    width: float = 2.0,
     dashed: bool = False,
 ) -> go.Scatter:
     """Return a line through points; NaN interrupts it. Without a name it is not in the legend."""
     x, y = _light(x), _light(y)
-    style = {"color": color, "width": 1.25 * width, "dash": "dash" if dashed else "solid"}
+    style = {"color": color, "width": width, "dash": "dash" if dashed else "solid"}
     # One or two points would be hard to see as a line.
     return go.Scatter(x=x, y=y, mode="lines" if len(x) > 2 else "lines+markers", line=style, **_named(name))
 
@@ -79,14 +89,14 @@ def points(
     color: str,
     name: str | None = None,
     *,
-    size: float = 5.0,
+    size: float = 7.0,
     symbol: str = "circle",
     hover: Sequence[str] | None = None,
 ) -> go.Scatter:
-    """Return points of one colour; `size` is their diameter in points of 1/72 inch."""
+    """Return points of one colour; `size` is their diameter in pixels."""
     x = _light(x)
     marker = {
-        "size": 1.35 * size,
+        "size": size,
         "symbol": symbol,
         "color": color,
         "opacity": 0.45 if len(x) > _MANY else 0.9,
@@ -100,23 +110,17 @@ def colored_points(
     values: ArrayLike,
     scale: str,
     *,
-    size: float = 5.0,
+    size: float = 8.5,
     value_range: tuple[float, float] | None = None,
     hover: Sequence[str] | None = None,
 ) -> go.Scatter:
     """Return points coloured by values.
 
-    Args:
-        x: places.
-        y: places.
-        values: one a point.
-        scale: what the values are, with unit: the label of the colour bar.
-        size: diameter in points of 1/72 inch.
-        value_range: values of the first and the last colour; None: the percentiles 1 and 99.
-        hover: text of each point.
+    `scale` is what the values are, with unit; `value_range` are those of the first and the last colour, without it
+    the percentiles 1 and 99.
     """
     low, high = value_range or _color_range(values)
-    marker = {"size": 1.35 * size, "color": _light(values), "cmin": low, "cmax": high, "colorscale": SCALE}
+    marker = {"size": size, "color": _light(values), "cmin": low, "cmax": high, "colorscale": SCALE}
     marker["colorbar"] = {"title": {"text": escaped(scale)}}
     text = {"hovertemplate": f"%{{marker.color:.6~g}}<extra>{escaped(scale)}</extra>"}
     if hover is not None:
@@ -128,18 +132,16 @@ def band(x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str | 
     """Return the area between two lines; NaN interrupts it."""
     x, low, high = (np.asarray(values, np.float64) for values in (x, low, high))
     known = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    pieces = [slice(first, last) for first, last in zip(edges[::2], edges[1::2], strict=True)]
-    around_x, around_y = (
-        np.concatenate(
-            [part for piece in pieces for part in (there[piece], back[piece][::-1], [np.nan])] or [[]]
-        )
-        for there, back in ((x, x), (low, high))
-    )
+    around: list[NDArray[np.float64]] = []
+    for piece in np.ma.clump_unmasked(np.ma.array(x, mask=~known)):
+        there = np.column_stack([x[piece], low[piece]])
+        back = np.column_stack([x[piece], high[piece]])[::-1]
+        around += [there, back, np.full((1, 2), np.nan)]
+    outline = np.concatenate([*around, np.zeros((0, 2))])
     red, green, blue = (int(color[at : at + 2], 16) for at in (1, 3, 5))
     return go.Scatter(
-        x=_light(around_x[:-1]),
-        y=_light(around_y[:-1]),
+        x=_light(outline[:-1, 0]),
+        y=_light(outline[:-1, 1]),
         mode="lines",
         fill="toself",
         line={"width": 0, "color": color},
@@ -157,7 +159,6 @@ def bars(
     *,
     base: ArrayLike | None = None,
     width: float | None = None,
-    hover: Sequence[str] | None = None,
 ) -> go.Bar:
     """Return bars from `base` upwards, so wide in units of x; without a width they almost touch."""
     x = _light(x)
@@ -165,9 +166,7 @@ def bars(
     width = width or (0.82 * float(apart.min()) if len(apart) else 0.82)
     marker = {"color": color, "line": {"width": 0.5, "color": PAPER}}
     base = None if base is None else _light(base)
-    return go.Bar(
-        x=x, y=_light(height), base=base, width=width, marker=marker, **_named(name), **_hover(hover)
-    )
+    return go.Bar(x=x, y=_light(height), base=base, width=width, marker=marker, **_named(name))
 
 
 def heatmap(
@@ -180,16 +179,10 @@ def heatmap(
     diverging: bool = False,
     value_range: tuple[float, float] | None = None,
 ) -> go.Heatmap:
-    """Return cells coloured by values; NaN leaves a cell empty.
+    """Return cells (m, n) coloured by values, with centres x (n,) and y (m,); NaN leaves a cell empty.
 
-    Args:
-        x: centres (n,).
-        y: centres (m,).
-        values: (m, n).
-        scale: what the values are, with unit: the label of the colour bar.
-        written: whether each value is written into its cell.
-        diverging: whether zero is in the middle of the colours.
-        value_range: values of the first and the last colour; None: the percentiles 1 and 99.
+    `written` writes each value into its cell, `diverging` puts zero in the middle of the colours; `scale` and
+    `value_range` are those of `colored_points`.
     """
     low, high = value_range or _color_range(values)
     if diverging:
@@ -213,10 +206,9 @@ def mark(
 ) -> go.layout.Shape:
     """Return a dashed line across the panel, labelled at its end or in the legend; an empty label: the line alone."""
     ends = {"xref": "x domain", "x0": 0, "x1": 1, "yref": "y", "y0": at, "y1": at}
-    if not horizontal:
-        ends = {"xref": "x", "x0": at, "x1": at, "yref": "y domain", "y0": 0, "y1": 1}
     text = {"text": escaped(label), "textposition": "end", "font": {"size": 12, "color": INK}}
     if not horizontal:
+        ends = {"xref": "x", "x0": at, "x1": at, "yref": "y domain", "y0": 0, "y1": 1}
         text |= {"xanchor": "right", "yanchor": "top"}  # below the upper end, to the right of the line
     return go.layout.Shape(
         type="line",
@@ -230,21 +222,21 @@ def mark(
 
 def note(place: Sequence[float], text: str) -> go.layout.Annotation:
     """Return a text at a place (2,)."""
+    where = {"x": place[0], "y": place[1], "xref": "x", "yref": "y"}
     font = {"size": 12, "color": INK}
-    return go.layout.Annotation(
-        x=place[0],
-        y=place[1],
-        xref="x",
-        yref="y",
-        text=escaped(text),
-        showarrow=False,
-        bgcolor=VEIL,
-        font=font,
-    )
+    return go.layout.Annotation(text=escaped(text), showarrow=False, bgcolor=VEIL, font=font, **where)
+
+
+def _data(layer: go.Scatter | go.Bar | go.Heatmap) -> pd.DataFrame:
+    if isinstance(layer, go.Heatmap):
+        x, y = np.meshgrid(layer.x, layer.y)
+        return pd.DataFrame({"x": x.ravel(), "y": y.ravel(), "value": layer.z.ravel()}).dropna()
+    values = layer.marker.color if isinstance(layer.marker.color, np.ndarray) else np.nan
+    return pd.DataFrame({"x": layer.x, "y": layer.y, "value": values})
 
 
 def _light(values: ArrayLike) -> NDArray[np.float32]:
-    """Return values in half the size: nobody sees more digits."""
+    """Return values in half the size; more digits cannot be seen."""
     return np.asarray(values, dtype=np.float32)
 
 
@@ -261,7 +253,5 @@ def _hover(hover: Sequence[str] | None) -> dict[str, Any]:
 def _color_range(values: ArrayLike) -> tuple[float, float]:
     known = np.asarray(values, np.float64)
     known = known[np.isfinite(known)]
-    if not len(known):
-        return 0.0, 1.0
-    low, high = (float(end) for end in np.percentile(known, [1, 99]))
+    low, high = np.percentile(known, [1, 99]).tolist() if len(known) else (0.0, 1.0)
     return (low, high) if low < high else (low - 0.5, high + 0.5)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 from shapely import get_coordinates, get_parts, get_rings
@@ -13,7 +12,7 @@ from shapely import get_coordinates, get_parts, get_rings
 from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.tracks.track import Track
 
-from .figure import Layer, Panel, heatmap, line, note
+from .figure import Layer, Panel, colored_points, heatmap, line, note
 from .style import FAINT, ROAD_CENTER, ROAD_EDGE, ROAD_FILL
 
 LEAST_STEPS = 4
@@ -71,36 +70,35 @@ class Grid:
         """Number of cells."""
         return self.columns * self.rows
 
-    def cells(
-        self,
-        values: Values,
-        scale: str,
-        *,
-        diverging: bool = False,
-        value_range: tuple[float, float] | None = None,
-    ) -> go.Heatmap:
+    def cells(self, values: Values, scale: str, **more: Any) -> go.Heatmap:
         """Return values (count,) as the layer of a map; see `heatmap`."""
-        grid = values.reshape(self.rows, self.columns)
-        return heatmap(self.x, self.y, grid, scale, diverging=diverging, value_range=value_range)
-
-    def table(self, values: dict[str, Values]) -> pd.DataFrame:
-        """Return the cells of which anything is known: centre `x_m`, `y_m` and `values`, each (count,)."""
-        row, column = np.divmod(np.arange(self.count), self.columns)
-        table = pd.DataFrame({"x_m": self.x[column], "y_m": self.y[row], **values})
-        return table[table[list(values)].notna().any(axis=1)].reset_index(drop=True)
+        return heatmap(self.x, self.y, values.reshape(self.rows, self.columns), scale, **more)
 
 
 def map_panel(course: Track, layers: Sequence[Layer], title: str = "", numbers: bool = True) -> Panel:
     """Return a map: the road, `layers` on it, its borders above them, and numbers of waypoints beside it."""
     polygons = [part for part in get_parts(course.road) if part.geom_type == "Polygon"]
     rings = [get_coordinates(ring) for polygon in polygons for ring in get_rings(polygon)]
-    borders = [line(ring[:, 0], ring[:, 1], FAINT, width=0.8) for ring in rings]
+    borders = [line(ring[:, 0], ring[:, 1], FAINT, width=1.0) for ring in rings]
     ends = np.stack([course.inner[0], course.outer[0]])
-    start = line(ends[:, 0], ends[:, 1], FAINT, width=2.4)
+    start = line(ends[:, 0], ends[:, 1], FAINT, width=3.0)
     notes = _waypoint_numbers(course) if numbers else []
     shown = [*_road(rings, course.waypoints), *layers, *borders, start, *notes]
     x_range, y_range = _extent(shown)
     return Panel(layers=shown, title=title, map=True, x_range=x_range, y_range=y_range)
+
+
+def waypoint_map_panel(
+    course: Track,
+    values: Values,
+    scale: str,
+    hover: Sequence[str],
+    value_range: tuple[float, float] | None = None,
+) -> Panel:
+    """Return a map with the waypoints coloured by values, at least one each."""
+    n = min(len(course.waypoints), len(values))
+    x, y = course.waypoints[:n].T
+    return map_panel(course, [colored_points(x, y, values[:n], scale, hover=hover, value_range=value_range)])
 
 
 def waypoint_panel(layers: Sequence[Layer], label: str, n: int, **more: Any) -> Panel:
@@ -142,22 +140,16 @@ def _waypoint_numbers(course: Track) -> list[go.layout.Annotation]:
     last = len(course.waypoints) - course.closed
     # Long courses have more waypoints than room for their numbers.
     every = _NUMBERED * max(1, round(last / 160))
-    index = np.arange(0, last, every)
-    if len(index) > 1 and course.closed and last - index[-1] < every // 2:
-        index = index[:-1]
     far_m = _LABEL * float(np.ptp(course.outer, axis=0).max())
     notes: list[go.layout.Annotation] = []
-    for k in index.tolist():
+    for k in range(0, last - every // 2 if course.closed else last, every):
+        sides = []
+        for border in (course.outer, course.inner):
+            aside = border[k] - course.waypoints[k]
+            sides.append(border[k] + far_m * aside / max(float(np.linalg.norm(aside)), 1e-9))
         # On the side with more room to other parts of the road.
-        sides = [_beyond(course, border, k, far_m) for border in (course.outer, course.inner)]
         rooms = [float(np.linalg.norm(course.waypoints - side, axis=1).min()) for side in sides]
         x, y = sides[int(rooms[1] > 1.05 * rooms[0])].tolist()
         if all(np.hypot(other.x - x, other.y - y) > far_m for other in notes):
             notes.append(note((x, y), str(k)))
     return notes
-
-
-def _beyond(course: Track, border: Values, k: int, far_m: float) -> Values:
-    """Return the place beyond a border at waypoint k."""
-    aside = border[k] - course.waypoints[k]
-    return border[k] + far_m * aside / max(float(np.linalg.norm(aside)), 1e-9)

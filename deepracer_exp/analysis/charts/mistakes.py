@@ -2,14 +2,14 @@
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_view import LogView, thirds
-from deepracer_exp.analysis.statistics import Values, subsample, totals, wilson
+from deepracer_exp.analysis.off_track import risk_counts
+from deepracer_exp.analysis.statistics import subsample, totals, wilson
 from deepracer_exp.tracks.track import Track
 
-from .figure import Chart, Layer, band, bars, colored_points, line, note, points
-from .maps import Grid, map_panel, waypoint_panel
+from .figure import Chart, Layer, band, bars, line, note, points
+from .maps import Grid, map_panel, waypoint_map_panel, waypoint_panel
 from .style import BLACK, BLUE, ORANGE, PALE, PURPLE, VERMILION
 
 OUTCOMES = {
@@ -32,16 +32,18 @@ def visits_map(view: LogView) -> Chart | None:
     grid = Grid.over(view.course, 10_000)
     cell = grid.of(view.steps["X"], view.steps["Y"])
     late = thirds(view.steps["iteration"].to_numpy()) == 2
-    visits, late_visits = totals(cell, None, grid.count), totals(np.where(late, cell, -1), None, grid.count)
     panels = []
-    for title, count in (("all iterations", visits), ("last third of the iterations", late_visits)):
+    for title, place in (
+        ("all iterations", cell),
+        ("last third of the iterations", np.where(late, cell, -1)),
+    ):
+        count = totals(place, None, grid.count)
         seen = np.where(count > 0, count, np.nan)
         # The start positions would take all colours.
         top = float(np.nanpercentile(seen, 98)) if np.isfinite(seen).any() else 1.0
         scale = f"control steps per cell of {100 * grid.side_m:.0f} cm"
-        panels.append(
-            map_panel(view.course, [grid.cells(seen, scale, value_range=(1.0, max(top, 2.0)))], title)
-        )
+        cells = grid.cells(seen, scale, value_range=(1.0, max(top, 2.0)))
+        panels.append(map_panel(view.course, [cells], title))
     return Chart(
         name="visits_map",
         title="Where the car drove",
@@ -49,7 +51,6 @@ def visits_map(view: LogView) -> Chart | None:
         "a line driven again and again. Compare the two maps: where the last third is still as wide as the whole "
         "training, the policy still explores.",
         rows=[panels],
-        table=grid.table({"visits": np.where(visits > 0, visits, np.nan), "visits_last_third": late_visits}),
     )
 
 
@@ -67,8 +68,7 @@ def episode_ends_map(view: LogView) -> Chart | None:
         if not len(here):
             continue
         count = totals(here["waypoint"].to_numpy(np.intp), None, n)
-        name = f"{words} ({len(here)})"
-        counted.append(bars(np.arange(n), count, color, name, base=base, width=1.0))
+        counted.append(bars(np.arange(n), count, color, f"{words} ({len(here)})", base=base, width=1.0))
         base = base + count
         shown = here.iloc[subsample(len(here), 1500)]
         hover = [
@@ -76,30 +76,26 @@ def episode_ends_map(view: LogView) -> Chart | None:
             f"waypoint {row.waypoint}, {row.progress:.1f} % of the lap"
             for row in shown.itertuples()
         ]
-        placed.append(points(shown["X"], shown["Y"], color, symbol=symbol, size=4.5, hover=hover))
+        placed.append(points(shown["X"], shown["Y"], color, symbol=symbol, size=6.0, hover=hover))
     rows = [[waypoint_panel(counted, "episodes that ended here", n)]]
     if view.course is not None:
         rows.insert(0, [map_panel(view.course, [*placed, *_worst_notes(ends, view.course)])])
-    ended = int(view.episodes["ended"].sum())
     return Chart(
         name="episode_ends_map",
-        title=f"Where {len(ends)} of {ended} episodes ended before the lap was complete",
+        title=f"Where {len(ends)} of {view.episodes['ended'].sum()} episodes ended before the lap was complete",
         caption=f"Each symbol is the last recorded position of an episode; the {_WORST} waypoints with most ends "
         "carry their number and count. Many ends behind a corner mean that the car enters it too fast or turns in "
         "too late.",
         rows=rows,
-        table=ends,
     )
 
 
 def _ends(view: LogView) -> pd.DataFrame:
     """Return the last rows of the episodes that ended without a lap: place, waypoint, outcome, iteration."""
-    episode = view.steps["episode"].to_numpy()
-    last = np.flatnonzero(np.diff(episode, append=-1) != 0) if len(episode) else np.zeros(0, np.intp)
+    last = np.flatnonzero(np.diff(view.episode_index, append=-1) != 0)
     table = view.steps.iloc[last][["X", "Y", "closest_waypoint"]].reset_index(drop=True)
-    table = table.rename(columns={"closest_waypoint": "waypoint"})
-    for name in ("episode", "iteration", "progress", "status"):
-        table[name] = view.episodes[name].to_numpy()
+    columns = view.episodes[["episode", "iteration", "progress", "status"]].reset_index(drop=True)
+    table = table.rename(columns={"closest_waypoint": "waypoint"}).join(columns)
     return table[table["status"].isin(list(OUTCOMES))].reset_index(drop=True)
 
 
@@ -122,19 +118,20 @@ def off_track_risk(view: LogView) -> Chart | None:
     n = view.waypoint_count
     late = thirds(view.episodes["iteration"].to_numpy()) == 2
     every = np.ones(len(late), bool)
-    passes, off = risk_counts(view, every, n)
+    _, off = risk_counts(view.episodes, n)
     if not off.any():
         return None
-    late_passes, late_off = risk_counts(view, late, n)
-    near_passes, near_off = risk_counts(view, every, n, REACH)
-    late_near_passes, late_near_off = risk_counts(view, late, n, REACH)
-    low, high = wilson(late_near_off, late_near_passes)
+    _, late_off = risk_counts(view.episodes[late], n)
+    (near_passes, near_off), (late_passes, late_near_off) = (
+        risk_counts(view.episodes[wanted], n, REACH) for wanted in (every, late)
+    )
+    low, high = (100.0 * end for end in wilson(late_near_off, late_passes))
     share = 100.0 * near_off / np.where(near_passes > 0, near_passes, np.nan)
-    late_share = 100.0 * late_near_off / np.where(late_near_passes > 0, late_near_passes, np.nan)
+    late_share = 100.0 * late_near_off / np.where(late_passes > 0, late_passes, np.nan)
     at, before = np.arange(n), off - late_off
     risk: list[Layer] = [
-        band(at, 100.0 * low, 100.0 * high, VERMILION, "95 % interval (Wilson)"),
-        line(at, share, PALE, "all iterations", width=1.4),
+        band(at, low, high, VERMILION, "95 % interval (Wilson)"),
+        line(at, share, PALE, "all iterations"),
         line(at, late_share, VERMILION, "last third of the iterations"),
     ]
     counts: list[Layer] = [
@@ -144,22 +141,14 @@ def off_track_risk(view: LogView) -> Chart | None:
     label = f"risk within {REACH} waypoints, %"
     rows = [[waypoint_panel(risk, label, n)], [waypoint_panel(counts, "episodes", n)]]
     if view.course is not None:
-        places = view.course.waypoints[:n]
         hover = [
-            f"waypoint {k}: {late_near_off[k]:.0f} of {late_near_passes[k]:.0f} passes left the road near it\n"
-            f"{late_share[k]:.2f} %, 95 % interval {100 * low[k]:.2f} to {100 * high[k]:.2f} %"
-            for k in range(len(places))
+            f"waypoint {k}: {late_near_off[k]:.0f} of {late_passes[k]:.0f} passes left the road near it\n"
+            f"{late_share[k]:.2f} %, 95 % interval {low[k]:.2f} to {high[k]:.2f} %"
+            for k in range(n)
         ]
-        spots = colored_points(
-            places[:, 0],
-            places[:, 1],
-            late_share[: len(places)],
-            f"{label}, last third",
-            size=6.5,
-            hover=hover,
-            value_range=(0.0, max(float(np.nanmax(late_share, initial=0.0)), 0.1)),
-        )
-        rows.insert(0, [map_panel(view.course, [spots])])
+        colors = (0.0, max(float(np.nanmax(late_share, initial=0.0)), 0.1))
+        scale = f"{label}, last third"
+        rows.insert(0, [waypoint_map_panel(view.course, late_share, scale, hover, colors)])
     return Chart(
         name="off_track_risk",
         title="The risk of leaving the road",
@@ -167,49 +156,4 @@ def off_track_risk(view: LogView) -> Chart | None:
         "is the range that contains the true share with 95 per cent confidence. A high risk with a narrow shade is a "
         "place to work on; a wide shade only means that few passes came this far.",
         rows=rows,
-        table=pd.DataFrame(
-            {
-                "waypoint": at,
-                "passes": passes,
-                "off_track": off,
-                "passes_last_third": late_passes,
-                "off_track_last_third": late_off,
-                "near_passes_last_third": late_near_passes,
-                "near_off_track_last_third": late_near_off,
-                "near_risk_last_third": late_share / 100.0,
-                "low": low,
-                "high": high,
-            }
-        ),
     )
-
-
-def risk_counts(view: LogView, wanted: NDArray[np.bool_], n: int, reach: int = 0) -> tuple[Values, Values]:
-    """Return for each of n waypoints how many of the wanted episodes passed it, and how many left the road there.
-
-    An episode passes every waypoint from that of its first row to that of its last row, also those that a control
-    step jumped over; a complete lap passes all of them.
-
-    Args:
-        view: the recording.
-        wanted: episodes that count, (n,) in the order of `view.episodes`.
-        n: number of waypoints.
-        reach: waypoints to either side that count as well.
-    """
-    episodes = view.episodes[wanted]
-    first, last = (episodes[name].to_numpy(np.int64) for name in ("first_waypoint", "last_waypoint"))
-    progress = episodes["progress"].to_numpy(np.float64)
-    ahead = (last - first) % n
-    # A car that ends a little before or behind its start drove hardly anything or nearly the whole lap.
-    back = (ahead > 0.75 * n) & (progress < 50.0)
-    first, ahead = np.where(back, last, first), np.where(back, 0, ahead)
-    whole = episodes["complete"].to_numpy(bool) | ((ahead < 0.25 * n) & (progress > 50.0))
-    ahead = np.minimum(np.where(whole, n, ahead) + 2 * reach, n - 1)
-    first = (first - reach) % n
-    change = np.zeros(2 * n + 1)
-    np.add.at(change, first, 1.0)
-    np.add.at(change, first + ahead + 1, -1.0)
-    passed = np.cumsum(change)[: 2 * n]
-    left = np.bincount(last[(episodes["status"] == "off_track").to_numpy()], minlength=n)
-    near = np.sum([np.roll(left, by) for by in range(-reach, reach + 1)], axis=0)
-    return passed[:n] + passed[n:], near.astype(np.float64)

@@ -5,7 +5,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
-from deepracer_exp.analysis.statistics import Values, correlation, histogram, means, quantiles, subsample
+from deepracer_exp.analysis.statistics import histogram, means, quantiles, subsample
 
 from .actions import action_classes
 from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
@@ -21,8 +21,6 @@ _ACTIONS = 3
 _ROWS = 200_000
 """Rows beyond which quantiles are those of an evenly spaced part of them."""
 _COMMON = 20
-_FAR = 10
-"""Steps from which on the share of the last step's reward sets the range of the axis."""
 _MOST_EPISODES = 1500
 
 
@@ -33,18 +31,15 @@ def reward_map(view: LogView) -> Chart | None:
         return None
     course, coarse, fine = view.course, Grid.over(view.course, 3_500), Grid.over(view.course, 8_000)
     reward = rows["reward"].to_numpy(np.float64)
-    third = thirds(rows["iteration"].to_numpy())
-    complete = view.episodes["complete"].to_numpy(bool)
-    in_lap = complete[view.episode_index][view.is_driven]
     cells = {grid: grid.of(rows["X"], rows["Y"]) for grid in (fine, coarse)}
-    mean = means(cells[fine], reward, fine.count)
     inside = cells[fine][cells[fine] >= 0]
+    mean = means(cells[fine], reward, fine.count)
     of_steps = mean[inside[subsample(len(inside), _ROWS)]]
     of_steps = of_steps[np.isfinite(of_steps)]
     if not len(of_steps):
         return None
     # Weighted by how often cells are driven: few steps off the road would take all colours.
-    low, high = (float(end) for end in np.percentile(of_steps, [1, 99]))
+    low, high = np.percentile(of_steps, [1, 99]).tolist()
     colors = (low, high) if low < high else (low - 0.5, high + 0.5)
 
     def panel(wanted: NDArray[np.bool_], title: str, grid: Grid) -> Panel:
@@ -52,17 +47,23 @@ def reward_map(view: LogView) -> Chart | None:
         layer = grid.cells(values, "reward of a step", value_range=colors)
         return map_panel(course, [layer], title, numbers=grid is fine)
 
-    top = [panel(np.ones(len(rows), bool), "all steps", fine)]
-    if in_lap.any():
-        top.append(panel(in_lap, f"complete laps only ({complete.sum()})", fine))
-    charts = [top, [panel(third == k, title, coarse) for k, title in enumerate(_THIRDS)]]
+    complete = view.episodes["complete"].to_numpy(bool)
+    third = thirds(rows["iteration"].to_numpy())
+    charts = [
+        [panel(np.ones(len(rows), bool), "all steps", fine)],
+        [panel(third == k, title, coarse) for k, title in enumerate(_THIRDS)],
+    ]
+    if complete.any():
+        in_lap = complete[view.episode_index][view.is_driven]
+        charts[0].append(panel(in_lap, f"complete laps only ({complete.sum()})", fine))
     actions = action_classes(view)
     if actions is not None:
         used = np.bincount(actions.number[actions.number >= 0], minlength=len(actions.names))
-        most = [int(k) for k in np.argsort(-used, kind="stable")[:_ACTIONS] if used[k]]
-        names = {k: f"{actions.names[k]} ({100 * used[k] / used.sum():.0f} % of steps)" for k in most}
-        charts.append([panel(actions.number == k, name, coarse) for k, name in names.items()])
-    visits = np.bincount(inside, minlength=fine.count)
+        titles = {
+            int(k): f"{actions.names[k]} ({100 * used[k] / used.sum():.0f} % of steps)"
+            for k in np.argsort(-used, kind="stable")[:_ACTIONS]
+        }
+        charts.append([panel(actions.number == k, title, coarse) for k, title in titles.items()])
     return Chart(
         name="reward_map",
         title="What the reward function paid, by place",
@@ -70,7 +71,6 @@ def reward_map(view: LogView) -> Chart | None:
         "actions taken most often. A fast line should be the bright one: where complete laps run through dark cells, "
         "the reward asks for something other than the lap.",
         rows=charts,
-        table=fine.table({"reward_mean": mean, "visits": np.where(visits > 0, visits, np.nan)}),
     )
 
 
@@ -84,9 +84,9 @@ def value_map(view: LogView) -> Chart | None:
     value = means(grid.of(rows["X"], rows["Y"]), future, grid.count)
     n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), _ROWS)
     low, high = quantiles(waypoint[part], future[part], n, (0.1, 0.9))
-    layers: list[Layer] = [
+    layers = [
         band(np.arange(n), low, high, BLUE, "10th to 90th percentile"),
-        line(np.arange(n), means(waypoint, future, n), BLUE, "mean", width=2.0),
+        line(np.arange(n), means(waypoint, future, n), BLUE, "mean", width=2.5),
     ]
     return Chart(
         name="value_map",
@@ -99,7 +99,6 @@ def value_map(view: LogView) -> Chart | None:
             [map_panel(view.course, [grid.cells(value, "future reward, discounted")])],
             [waypoint_panel(layers, "future reward", n)],
         ],
-        table=grid.table({"discounted_future_reward": value}),
     )
 
 
@@ -110,31 +109,20 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
         return None
     n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), _ROWS)
     at = np.arange(n)
-    table = pd.DataFrame({"waypoint": at, "steps": np.bincount(waypoint[waypoint >= 0], minlength=n)})
     panels = []
     for column, label in (
         ("reward", "reward of a step"),
         ("discounted_future_reward", "future reward, discounted"),
     ):
         values = rows[column].to_numpy(np.float64)
-        quarter, middle, three_quarters = quantiles(waypoint[part], values[part], n, (0.25, 0.5, 0.75))
+        quarter, median, three_quarters = quantiles(waypoint[part], values[part], n, (0.25, 0.5, 0.75))
         ends = pd.Series(values).groupby(waypoint).agg(["max", "min"]).reindex(range(n))
-        found = {
-            "mean": means(waypoint, values, n),
-            "median": middle,
-            "best": ends["max"],
-            "worst": ends["min"],
-        }
-        table = table.assign(**{f"{column}_{name}": found[name] for name in found})
         usual: list[Layer] = [
             band(at, quarter, three_quarters, BLUE, "middle half"),
-            line(at, found["mean"], INK, "mean", width=2.0),
-            line(at, middle, ORANGE, "median", dashed=True, width=2.0),
+            line(at, means(waypoint, values, n), INK, "mean", width=2.5),
+            line(at, median, ORANGE, "median", dashed=True, width=2.5),
         ]
-        extremes: list[Layer] = [
-            line(at, ends["max"], GREEN, "best"),
-            line(at, ends["min"], VERMILION, "worst"),
-        ]
+        extremes = [line(at, ends["max"], GREEN, "best"), line(at, ends["min"], VERMILION, "worst")]
         panels += [waypoint_panel(usual, label, n), waypoint_panel(extremes, label, n)]
     return Chart(
         name="reward_by_waypoint",
@@ -144,7 +132,6 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
         "place that the reward function punishes whatever the car does.",
         rows=in_rows(panels, 1),
         share_x=True,
-        table=table,
     )
 
 
@@ -160,18 +147,16 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
     rows = view.steps.loc[terms.index]
     n, waypoint, iteration = view.waypoint_count, closest_waypoints(rows), rows["iteration"].to_numpy(np.intp)
     last = int(iteration.max()) + 1
-    known = np.flatnonzero(np.bincount(iteration, minlength=last))
+    known = np.unique(iteration)
     at = np.arange(n)
-    table = pd.DataFrame({"waypoint": at})
     by_waypoint: list[Layer] = []
     by_iteration: list[Layer] = []
-    curves = [("sum", "sum of all", terms.sum(axis=1), PALE, 3.5)]
+    curves = [("sum of all", terms.sum(axis=1), PALE, 4.5)]
     for number, name in enumerate(terms.columns):
         words = f"{str(name).replace('_', ' ')} ({terms[name].mean():.3g})"
-        curves.append((str(name), words, terms[name], CATEGORIES[number % len(CATEGORIES)], 1.6))
-    for name, words, values, color, width in curves:
-        table[name] = means(waypoint, values, n)
-        by_waypoint.append(line(at, table[name], color, words, width=width))
+        curves.append((words, terms[name], CATEGORIES[number % len(CATEGORIES)], 2.0))
+    for words, values, color, width in curves:
+        by_waypoint.append(line(at, means(waypoint, values, n), color, words, width=width))
         by_iteration.append(line(known, means(iteration, values, last)[known], color, width=width))
     unit = "reward of a step"
     return Chart(
@@ -184,14 +169,12 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
             [waypoint_panel(by_waypoint, unit, n)],
             [Panel(layers=by_iteration, x_label="iteration", y_label=unit)],
         ],
-        table=table,
     )
 
 
 def reward_distribution(view: LogView) -> Chart | None:
     """Draw how rewards are distributed over steps and over episodes."""
-    rewards = view.steps["reward"].to_numpy(np.float64)
-    rewards = rewards[np.isfinite(rewards)]
+    rewards = view.steps["reward"].dropna().to_numpy(np.float64)
     episodes = view.episodes[view.episodes["ended"]]
     if not len(rewards) or not len(episodes):
         return None
@@ -221,7 +204,6 @@ def reward_distribution(view: LogView) -> Chart | None:
                 Panel(title="Reward of an episode", x_label="reward", y_label="episodes", layers=of_episodes),
             ]
         ],
-        table=episodes[["iteration", "episode", "reward", "complete"]],
     )
 
 
@@ -232,12 +214,11 @@ def common_rewards(view: LogView) -> Chart | None:
         return None
     common = counts.head(_COMMON).sort_index()
     share = 100 * common / counts.sum()
-    hover = [f"reward {value:.4g}: {count} steps" for value, count in common.items()]
     panel = Panel(
         x_label="reward of a step",
         y_label="per cent of the control steps",
         x_names=[f"{value:.4f}".rstrip("0").rstrip(".") for value in common.index],
-        layers=[bars(np.arange(len(share)), share, GREEN, hover=hover)],
+        layers=[bars(np.arange(len(share)), share, GREEN)],
     )
     return Chart(
         name="common_rewards",
@@ -246,7 +227,6 @@ def common_rewards(view: LogView) -> Chart | None:
         f"for {share.sum():.0f} per cent of all steps. A reward given in many different situations cannot teach the "
         "policy which of them is better.",
         rows=[[panel]],
-        table=counts.rename("steps").reset_index(),
     )
 
 
@@ -265,14 +245,13 @@ def scatter_time_reward(view: LogView) -> Chart | None:
     ):
         known = shown[shown[x].notna()]
         layers: list[Layer] = [
-            points(some[x], some[y], color, name, size=3.5)
+            points(some[x], some[y], color, name, size=5.0)
             for complete, name, color in ((False, "not complete", ORANGE), (True, "complete lap", BLUE))
             if len(some := known[known["complete"] == complete])
         ]
         if layers:
             panels.append(Panel(x_label=x_label, y_label=y_label, layers=layers))
-    laps = episodes[episodes["lap_time_s"].notna()]
-    r = correlation(laps["lap_time_s"].to_numpy(np.float64), laps["reward"].to_numpy(np.float64))
+    r = episodes["lap_time_s"].corr(episodes["reward"], min_periods=3)
     words = (
         f"Lap time and reward of complete laps correlate with r = {r:+.2f}: below zero, the reward asks for speed."
         if np.isfinite(r)
@@ -285,7 +264,6 @@ def scatter_time_reward(view: LogView) -> Chart | None:
         caption="Each point is an episode; a reward that grows steadily with progress is easy to learn from. "
         f"{words}{part}",
         rows=in_rows(panels),
-        table=episodes[["iteration", "episode", "progress", "reward", "time_s", "steps", "lap_time_s"]],
     )
 
 
@@ -294,74 +272,26 @@ def discount_factors(view: LogView) -> Chart | None:
     episodes = view.episodes
     if not len(episodes):
         return None
-    complete = episodes["lap_time_s"].notna().any()
-    lap = int(episodes["lap_time_s"].idxmin() if complete else episodes["progress"].idxmax())
-    rows = view.steps[view.steps["episode"] == episodes.loc[lap, "episode"]]
-    rewards = np.nan_to_num(rows["reward"].to_numpy(np.float64))
-    count = len(rewards)
+    complete = bool(episodes["lap_time_s"].notna().any())
+    longest = episodes["lap_time_s"].idxmin() if complete else episodes["progress"].idxmax()
+    count = int(episodes.loc[longest, "steps"])
     ahead = np.arange(0, max(int(1.5 * count), 60), max(1, count // 150))
-    remaining = np.arange(count - 1, -1, -1).astype(np.float64)
-    table = pd.DataFrame({"steps_to_go": remaining})
-    gammas = sorted({*GAMMAS, view.discount})
-    weights: list[Layer] = []
-    values: list[Layer] = []
-    bonus: list[Layer] = []
-    highest = 5.0
-    for gamma, color in zip(gammas, (color for color in CATEGORIES if color != BLACK), strict=False):
-        own, width = gamma == view.discount, 1.4
-        if own:
-            color, width = BLACK, 2.6
-        future = discounted(rewards, gamma)
-        last = rewards[-1] * gamma**remaining
-        # A sum near zero has no shares.
-        share = np.where(np.abs(future) > 1e-9, 100 * last / np.where(future == 0, 1, future), np.nan)
-        far = share[(remaining >= _FAR) & np.isfinite(share)]
-        highest = max(highest, float(far.max(initial=0.0)))
+    layers: list[Layer] = []
+    colors = (color for color in CATEGORIES if color != BLACK)
+    for gamma, color in zip(sorted({*GAMMAS, view.discount}), colors, strict=False):
+        own = gamma == view.discount
         name = f"{gamma:g}{' (this training)' if own else ''}"
-        weights.append(line(ahead, 100 * gamma**ahead, color, name, width=width))
-        values.append(line(remaining, future, color, width=width))
-        bonus.append(line(remaining, np.clip(share, -100, 200), color, width=width))
-        table[f"future_reward_{gamma:g}"] = future
-    weights.append(mark(count, f"this lap: {count} steps", FAINT))
+        layers.append(
+            line(ahead, 100 * gamma**ahead, BLACK if own else color, name, width=3.2 if own else 1.75)
+        )
+    what = "the fastest lap" if complete else "the longest drive"
+    layers.append(mark(count, f"{what}: {count} steps", FAINT, in_legend=True))
     half = np.log(0.5) / np.log(view.discount) if 0 < view.discount < 1 else np.inf
-    to_go = "steps to go in the episode"
-    what = "fastest lap" if complete else "episode that drove farthest"
     return Chart(
         name="discount_factors",
         title="The weight of later rewards",
         caption=f"With the discount factor of this training, {view.discount:g}, a reward counts half if it comes "
-        f"{half:.0f} steps ({half / STEP_HZ:.1f} s) later. The two panels below are of the {what}: the future reward, "
-        "and how much of it is the reward of the last step.",
-        rows=[
-            [
-                Panel(
-                    title="Weight of a reward",
-                    x_label="steps until it comes",
-                    y_label="per cent",
-                    layers=weights,
-                )
-            ],
-            [
-                Panel(title="Discounted future reward", x_label=to_go, y_label="reward", layers=values),
-                Panel(
-                    title="Share of the last step's reward",
-                    x_label=to_go,
-                    y_label="per cent of the future reward",
-                    layers=bonus,
-                    # In the last steps it is always nearly all.
-                    y_range=(0.0, min(1.1 * highest, 105.0)),
-                ),
-            ],
-        ],
-        table=table,
+        f"{half:.0f} steps ({half / STEP_HZ:.1f} s) later. Rewards far beyond that, such as a bonus at the end of the "
+        "lap, hardly reach the decisions of its beginning.",
+        rows=[[Panel(x_label="steps until a reward comes", y_label="weight, per cent", layers=layers)]],
     )
-
-
-def discounted(rewards: Values, gamma: float) -> Values:
-    """Return each step's reward plus all later ones, discounted."""
-    future = np.empty(len(rewards))
-    total = 0.0
-    for step in range(len(rewards) - 1, -1, -1):
-        total = rewards[step] + gamma * total
-        future[step] = total
-    return future

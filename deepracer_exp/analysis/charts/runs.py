@@ -1,15 +1,21 @@
 """Several runs or checkpoints in one figure: learning curves, generations, generalisation, speed and stability."""
 
+import json
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from deepracer_exp.analysis.comparison import last_value
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.analysis.statistics import Values, median_band, moving_average
-from deepracer_exp.runs.files import RunRecord
+from deepracer_exp.analysis.statistics import Values, median_band
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.convergence import moving_average
+from deepracer_exp.runs.files import EVALUATIONS, METRICS, RunRecord
+from deepracer_exp.runs.lineage import read_lineage
 
 from .figure import Chart, Layer, Panel, band, bars, heatmap, in_rows, line, mark, note, points
 from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE
@@ -29,18 +35,28 @@ _TIME = re.compile(r"^\d{8}-\d{6}-")
 _SEED = re.compile(r"[-_]?seed[-_=]?\d+$")
 
 
+def run_folder(view: LogView) -> Path | None:
+    """Return the folder of a run of ours, None of other recordings."""
+    return next((file.parent for file in view.recording.files if file.name == METRICS), None)
+
+
+def group_name(name: str) -> str:
+    """Return what the names of runs that differ only in time and seed have in common."""
+    return _SEED.sub("", _TIME.sub("", name)) or name
+
+
 def runs_compared(views: Sequence[LogView]) -> Chart | None:
     """Draw runs beside each other; those that differ only in their seed as a median with its bootstrap interval."""
     if len(views) < 2:
         return None
+    several = len({view.track_name for view in views}) > 1
     groups: dict[str, list[LogView]] = {}
     for view in views:
-        groups.setdefault(group_name(view.name), []).append(view)
-    groups = _split_by_course(groups)
+        course = f" on {view.track_name or 'an unknown track'}" if several else ""
+        groups.setdefault(group_name(view.name) + course, []).append(view)
     longest = max(float(view.iterations["steps"].sum()) for view in views)
     grid = np.linspace(0.0, longest, _PLACES)
     factor, unit = (1e-6, "million control steps") if longest >= 2e6 else (1e-3, "thousand control steps")
-    tables = []
     panels: list[Panel] = []
     for column, (title, label) in _CURVES.items():
         layers: list[Layer] = []
@@ -52,17 +68,13 @@ def runs_compared(views: Sequence[LogView]) -> Chart | None:
             median, low, high = median_band(curves)
             if len(some) > 1:
                 layers.append(band(factor * grid, low, high, color))
-            layers.append(line(factor * grid, median, color, None if panels else name, width=2.0))
-            found = {"group": name, "runs": len(some), "column": column, "steps": grid, "median": median}
-            tables.append(pd.DataFrame(found | {"low": low, "high": high}))
+            layers.append(line(factor * grid, median, color, None if panels else name, width=2.5))
         if layers:
             x_range = (0.0, factor * longest)
             panels.append(Panel(title=title, x_label=unit, y_label=label, layers=layers, x_range=x_range))
     if not panels:
         return None
-    laps = _best_laps(groups)
-    if laps is not None:
-        panels.append(laps)
+    panels += _best_laps(groups)
     counts = sorted({len(some) for some in groups.values()})
     words = (
         f"Lines are medians over {' or '.join(map(str, counts))} runs whose names differ only in their seed, bands "
@@ -75,25 +87,7 @@ def runs_compared(views: Sequence[LogView]) -> Chart | None:
         title="Runs compared",
         caption=f"{words}. Where bands of two colours overlap, more seeds are needed to tell them apart.",
         rows=in_rows(panels),
-        table=pd.concat(tables, ignore_index=True),
     )
-
-
-def group_name(name: str) -> str:
-    """Return what the names of runs that differ only in time and seed have in common."""
-    return _SEED.sub("", _TIME.sub("", name)) or name
-
-
-def _split_by_course(groups: Mapping[str, list[LogView]]) -> dict[str, list[LogView]]:
-    """Split and name groups by their course as well, if there are several courses."""
-    courses = {view.track_name for some in groups.values() for view in some}
-    if len(courses) < 2:
-        return dict(groups)
-    named: dict[str, list[LogView]] = {}
-    for name, some in groups.items():
-        for view in some:
-            named.setdefault(f"{name} on {view.track_name or 'an unknown track'}", []).append(view)
-    return named
 
 
 def _on_grid(iterations: pd.DataFrame, column: str, grid: Values) -> Values:
@@ -106,123 +100,100 @@ def _on_grid(iterations: pd.DataFrame, column: str, grid: Values) -> Values:
     return np.interp(grid, driven[known], values[known], left=np.nan, right=np.nan)
 
 
-def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> Panel | None:
-    names = list(groups)
-    best = [[float(view.episodes["lap_time_s"].min()) for view in some] for some in groups.values()]
-    y = np.concatenate(best)
-    if not np.isfinite(y).any():
-        return None
-    x = [
-        number + 0.5 * ((at + 0.5) / len(some) - 0.5)
-        for number, some in enumerate(best)
-        for at in range(len(some))
+def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> list[Panel]:
+    names, places, best_s, medians_s = list(groups), [], [], []
+    for number, some in enumerate(groups.values()):
+        own_s = [float(view.episodes["lap_time_s"].min()) for view in some]
+        places += list(number + 0.5 * ((np.arange(len(some)) + 0.5) / len(some) - 0.5))
+        best_s += own_s
+        medians_s.append(float(np.median(own_s)))
+    if not np.isfinite(best_s).any():
+        return []
+    layers = [
+        # Below the points, which it may coincide with.
+        points(np.arange(len(names)), medians_s, ORANGE, "median", symbol="diamond", size=16),
+        points(places, best_s, BLUE, "a run", size=8),
     ]
-    medians = [float(np.median(some)) for some in best]
-    return Panel(
-        title="Best lap of each run",
-        y_label="lap time, s",
-        x_names=names,
-        x_range=(-0.5, len(names) - 0.5),
-        layers=[
-            # Below the points, which it may coincide with.
-            points(np.arange(len(names)), medians, ORANGE, "median", symbol="diamond", size=12),
-            points(x, y, BLUE, "a run", size=6),
-        ],
-    )
+    x_range = (-0.5, len(names) - 0.5)
+    title = "Best lap of each run"
+    return [Panel(title=title, y_label="lap time, s", x_names=names, x_range=x_range, layers=layers)]
 
 
 def generations(views: Sequence[LogView]) -> Chart | None:
     """Draw a run and the clones of it on one axis of iterations.
 
     Args:
-        views: the oldest first; a recording of several rounds contains all of these.
+        views: of all runs; those that are not related are left out, unless the first is a recording of several rounds.
     """
-    begins: list[tuple[float, str]] = []
-    tables = []
+    parts: list[tuple[str, pd.DataFrame]] = []
     offset = 0
-    for view in views:
+    for view in _clone_chain(views) or views[:1]:
         table = view.iterations
         if not len(table):
             continue
-        rounds = view.recording.rounds
         first = int(table["iteration"].min())
-        starts = [(one.first_iteration, one.name) for one in rounds] or [(first, group_name(view.name))]
-        begins += [(float(offset + start - first), name) for start, name in starts]
-        generation = (
-            len(begins)
-            - len(starts)
-            + np.searchsorted([s for s, _ in starts[1:]], table["iteration"], "right")
-        )
-        moved = table["iteration"] + (offset - first)
-        tables.append(table.assign(iteration=moved, generation=generation))
-        offset = int(moved.max()) + 1
-    if len(begins) < 2:
+        starts = [(one.first_iteration, one.name) for one in view.recording.rounds]
+        starts = starts or [(first, group_name(view.name))]
+        number = np.searchsorted([start for start, _ in starts[1:]], table["iteration"], "right")
+        moved = table.assign(iteration=table["iteration"] + offset - first)
+        parts += [(name, moved[number == at]) for at, (_, name) in enumerate(starts)]
+        offset = int(moved["iteration"].max()) + 1
+    if len(parts) < 2:
         return None
-    whole = pd.concat(tables, ignore_index=True)
     panels: list[Panel] = []
     for column, (title, label) in _CURVES.items():
-        if not whole[column].notna().any():
+        if not any(table[column].notna().any() for _, table in parts):
             continue
         layers: list[Layer] = []
-        for number, (_, name) in enumerate(begins):
-            here = whole[whole["generation"] == number]
-            x, y = here["iteration"], here[column].to_numpy(np.float64)
+        for number, (name, table) in enumerate(parts):
+            x, y = table["iteration"], table[column].to_numpy(np.float64)
             color = CATEGORIES[number % len(CATEGORIES)]
             text = None if panels else f"{number + 1}: {name}"
-            layers.append(points(x, y, color, size=3.5))
-            layers.append(line(x, moving_average(y), color, text, width=2.0))
-        layers += [mark(begin - 0.5, "", FAINT) for begin, _ in begins[1:]]
+            layers += [points(x, y, color, size=5), line(x, moving_average(y), color, text, width=2.5)]
+        layers += [mark(table["iteration"].min() - 0.5, "", FAINT) for _, table in parts[1:]]
         panels.append(Panel(title=title, x_label=ITERATION, y_label=label, layers=layers))
-    gained = whole.groupby("generation")["completion_mean"].max()
+    best = ", ".join(f"{table['completion_mean'].max():.0f}" for _, table in parts)
     return Chart(
         name="generations",
         title="Generations of clones",
         caption="Each colour is a training that continues the one before it; points are iterations, lines their "
-        "moving average of three. Best mean progress by generation: "
-        + ", ".join(f"{value:.0f}" for value in gained)
-        + " per cent.",
+        f"moving average of three. Best mean progress by generation: {best} per cent.",
         rows=in_rows(panels),
         share_x=True,
-        table=whole,
     )
 
 
-def generalisation_matrix(views: Sequence[LogView], results: Sequence[pd.DataFrame]) -> Chart | None:
-    """Draw how far each policy drives on each track.
+def _clone_chain(views: Sequence[LogView]) -> list[LogView]:
+    """Return the views that are a run and its clones, the oldest first; none where that is not known."""
+    parents, number = {}, {}
+    for view in views:
+        folder = run_folder(view)
+        try:
+            lineage = read_lineage(folder) if folder is not None else None
+        except BadInput:  # an unreadable file counts as none
+            lineage = None
+        parents[view.name] = lineage.parent if lineage else None
+        number[view.name] = lineage.generation if lineage else 0
+    related = [v for v in views if parents[v.name] in parents or v.name in parents.values()]
+    return sorted(related, key=lambda view: number[view.name])
 
-    Args:
-        views: of the policies' trainings.
-        results: of their evaluations, `run_folders.evaluation_results`.
-    """
-    tracks = list(dict.fromkeys(str(track) for table in results for track in table["track"]))
-    driven = [(view, table) for view, table in zip(views, results, strict=True) if len(table)]
-    if len(tracks) < 2 or not driven:
+
+def generalisation_matrix(views: Sequence[LogView]) -> Chart | None:
+    """Draw how far each policy drives on each track, as it was evaluated or raced."""
+    driven = [(view, results) for view in views if (results := evaluation_results(view))]
+    tracks = list(dict.fromkeys(track for _, results in driven for track in results))
+    if len(tracks) < 2:
         return None
-    labels = [
-        f"{group_name(view.name)}, trained on {view.track_name or 'an unknown track'}" for view, _ in driven
-    ]
+    labels = [f"{group_name(v.name)}, trained on {v.track_name or 'an unknown track'}" for v, _ in driven]
     names = [label if labels.count(label) == 1 else f"{label} ({at + 1})" for at, label in enumerate(labels)]
-    matrix = np.full((len(driven), len(tracks)), np.nan)
-    for row, (_, table) in enumerate(driven):
-        for track, completion in zip(table["track"], table["completion"], strict=True):
-            matrix[row, tracks.index(str(track))] = float(completion)
-    cells = heatmap(
-        np.arange(len(tracks)),
-        np.arange(len(names)),
-        matrix,
-        "completion, per cent",
-        written=True,
-        value_range=(0.0, 100.0),
-    )
-    away = [
-        value
-        for row, (view, _) in zip(matrix, driven, strict=True)
-        for track, value in zip(tracks, row, strict=True)
-        if track != view.track_name and np.isfinite(value)
-    ]
+    matrix = np.array([[results.get(track, np.nan) for track in tracks] for _, results in driven])
+    scale, at = "completion, per cent", (np.arange(len(tracks)), np.arange(len(names)))
+    cells = heatmap(*at, matrix, scale, written=True, value_range=(0.0, 100.0))
+    foreign = np.array([[track != view.track_name for track in tracks] for view, _ in driven])
+    away = matrix[foreign & np.isfinite(matrix)]
     words = (
-        f"On tracks that a policy was not trained on, the mean is {np.mean(away):.0f} per cent."
-        if away
+        f"On tracks that a policy was not trained on, the mean is {away.mean():.0f} per cent."
+        if len(away)
         else "No policy was tried on a track that it was not trained on."
     )
     return Chart(
@@ -230,8 +201,28 @@ def generalisation_matrix(views: Sequence[LogView], results: Sequence[pd.DataFra
         title="How far each policy drives on each track",
         caption=f"A row is a policy, a column a track it was tried on; empty cells were not tried. {words}",
         rows=[[Panel(x_label="driven on", layers=[cells], x_names=tracks, y_names=names)]],
-        table=pd.DataFrame(matrix, index=names, columns=tracks).reset_index(names="policy"),
     )
+
+
+def evaluation_results(view: LogView) -> dict[str, float]:
+    """Return the mean completion of a policy in per cent by track.
+
+    Of the recorded evaluations and races; of a run of ours the newest stored evaluation of each track on usual
+    conditions. Files that are no evaluation are left out.
+    """
+    steps = view.recording.steps
+    raced = steps[steps["stream"].astype(str) != "training"].astype({"track": str, "stream": str})
+    episodes = raced.groupby(["track", "stream", "episode"])["progress"].max()
+    found: dict[str, float] = episodes.groupby("track").mean().to_dict()
+    folder = run_folder(view)
+    for file in sorted((folder / EVALUATIONS).glob("*.json")) if folder is not None else ():
+        try:
+            groups: list[dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["groups"]
+            usual = [group for group in groups if group["condition"] == "usual"]
+            found |= {str(group["track"]): float(group["completion"]["mean"]) for group in usual}
+        except (OSError, ValueError, TypeError, KeyError):
+            continue
+    return found
 
 
 def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
@@ -240,7 +231,6 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     Args:
         records: the runs by a short label, each with at least one iteration.
     """
-    named = [f"{label}  {record.name}" for label, record in records.items()]
     panels: list[Panel] = []
     for column, title, unit in (
         ("completion", "Completion, mean", "per cent of the lap"),
@@ -248,15 +238,15 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
         ("mean_lap_time_s", "Lap time, mean", "s"),
     ):
         layers: list[Layer] = []
-        for number, (name, record) in enumerate(zip(named, records.values(), strict=True)):
+        for number, (label, record) in enumerate(records.items()):
             rows = pd.DataFrame(record.rows)
             columns = [one for one in rows if one.startswith(f"{column}/")] or [column]
             # Not every iteration ends an episode on every track.
             values = rows[columns].astype(float).ffill().mean(axis=1, skipna=False)
             curve = values.rolling(_SMOOTHED, min_periods=1).mean()
-            steps, color = rows["env_steps"] / 1000, CATEGORIES[number % len(CATEGORIES)]
-            dashed = number >= len(CATEGORIES)
-            layers.append(line(steps, curve, color, None if panels else name, dashed=dashed))
+            color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
+            name = None if panels else f"{label}  {record.name}"
+            layers.append(line(rows["env_steps"] / 1000, curve, color, name, dashed=dashed))
         panels.append(Panel(title=title, x_label="thousand control steps", y_label=unit, layers=layers))
     best_s, mean_s = (
         np.array([last_value(record, name) for record in records.values()], np.float64)
@@ -265,7 +255,7 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     at = np.arange(len(records))
     laps: list[Layer] = [
         bars(at, best_s, BLUE, "best"),
-        points(at, mean_s, ORANGE, "mean of the last iteration", size=8, symbol="diamond"),
+        points(at, mean_s, ORANGE, "mean of the last iteration", size=11, symbol="diamond"),
         *(note((float(k), 0.0), "no lap") for k in at[np.isnan(best_s)]),
     ]
     panels.append(Panel(title="Laps in training", y_label="lap time, s", layers=laps, x_names=list(records)))
@@ -274,7 +264,6 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
         title="Learning curves and lap times",
         caption=f"Lines are moving averages of {_SMOOTHED} iterations.",
         rows=in_rows(panels),
-        table=pd.DataFrame({"run": named, "best_lap_time_s": best_s, "mean_lap_time_s": mean_s}),
     )
 
 
@@ -293,19 +282,18 @@ def speed_and_stability(run: str, checkpoints: pd.DataFrame, recommended: str) -
         color, x = CATEGORIES[number % len(CATEGORIES)], one.lap_time_s
         if np.isfinite(one.held_out_lap_time_s):
             away, share = one.held_out_lap_time_s, one.held_out_complete
-            layers.append(
-                line(np.linspace(x, away, 3), np.linspace(one.complete, share, 3), color, width=0.8)
-            )
-            layers.append(points([away], [share], color, size=7, symbol="circle-open"))
+            between = np.linspace(x, away, 3), np.linspace(one.complete, share, 3)
+            layers.append(line(*between, color, width=1.0))
+            layers.append(points([away], [share], color, size=9, symbol="circle-open"))
         layers.append(line([x, x, x], [one.low, one.complete, one.high], color))
         if one.name == recommended:
             ring = f"recommended: {recommended}"
-            layers.append(points([x], [one.complete], INK, ring, size=15, symbol="circle-open"))
+            layers.append(points([x], [one.complete], INK, ring, size=20, symbol="circle-open"))
         # Lap times are multiples of the control period, so that points coincide: the older ones are larger.
         later = checkpoints.iloc[number + 1 :]
         above = ((later["lap_time_s"] == x) & (later["complete"] == one.complete)).sum()
         words = "  ".join(filter(None, [one.name, one.labels, "" if np.isfinite(x) else "no lap"]))
-        layers.append(points([x], [one.complete], color, words, size=6 + 4 * above))
+        layers.append(points([x], [one.complete], color, words, size=8 + 5 * above))
     times_s = checkpoints[["lap_time_s", "held_out_lap_time_s"]].to_numpy(np.float64)
     times_s = times_s[np.isfinite(times_s)]
     x_range = (0.0, 1.0)
@@ -327,5 +315,4 @@ def speed_and_stability(run: str, checkpoints: pd.DataFrame, recommended: str) -
         caption="Filled points are the usual conditions, with the 95 per cent interval of the share of complete laps; "
         "open points are held-out conditions.",
         rows=[[panel]],
-        table=checkpoints,
     )
