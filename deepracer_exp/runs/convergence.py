@@ -495,10 +495,10 @@ def overfitting(iterations: pd.DataFrame, stopping: Mapping[str, Any] | None = N
         only = EntropyStopping(
             kind="entropy", window=3, converged=None, overfitting=rule, collapsed=None, not_learning=None
         )
-        stopper, decision = Stopping(only, None), None
+        judge, decision = TrendRule(only, None), None
         for returned, completion in zip(iterations["reward_mean"], iterations[column], strict=True):
             row = {"mean_return": returned, "held_out_completion": completion, "laps": 0, "env_steps": 0}
-            decision = stopper.observe(row)
+            decision = judge.observe(row)
         averages = moving_average(known[column].to_numpy(np.float64))
         best = 2 + int(averages[2:].argmax())  # the first two are of fewer than three
         return Overfitting(

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import EngFormatter, MaxNLocator
@@ -28,6 +29,7 @@ SPEED = LinearSegmentedColormap.from_list("speed", ["#e0457b", "#f58f3c", "#ffe1
 BLUE, ORANGE, GREEN, PURPLE = "#2f6fb5", "#d9822b", "#2e8b57", "#7a5195"
 MANY = [*matplotlib.color_sequences["tab20"][::2], *matplotlib.color_sequences["tab20"][1::2]]
 """Colours of the tracks of a run."""
+_LAYOUT = ConstrainedLayoutEngine(w_pad=0.15, h_pad=0.12)
 
 
 def episodes(trace: pd.DataFrame) -> pd.DataFrame:
@@ -68,7 +70,7 @@ def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
         ((left, right), (bottom, top)) = _bounds(next(iter(tracks.values())))
         shape = float(np.clip((top - bottom) / (right - left), 0.25, 0.9))
     cell = (10.0 if one else 13.0) / columns  # inches
-    figure = Figure((columns * cell, rows * (shape * cell + 0.9)), dpi=150, layout="constrained")
+    figure = Figure((columns * cell, rows * (0.9 * shape * cell + 0.9)), dpi=150, layout=_LAYOUT)
     cells = figure.subplots(rows, columns, squeeze=False)
     lines = []
     for axes, (name, track) in zip(cells.flat, tracks.items(), strict=False):
@@ -101,7 +103,7 @@ def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
         for line in lines:
             # The few rows after the standing start would take half of the colours.
             line.set_clim(float(np.percentile(speeds, 5)), float(speeds.max()))
-        bar = figure.colorbar(lines[0], ax=cells, extend="min", shrink=0.6, aspect=30, pad=0.02)
+        bar = figure.colorbar(lines[0], ax=cells, extend="min", shrink=0.6, aspect=30, panchor=False)
         bar.outline.set_visible(False)
         bar.ax.tick_params(length=0, labelcolor=FAINT, labelsize=10)
         bar.ax.set_title("m/s", fontsize=10, color=FAINT, loc="left", pad=8)
@@ -118,7 +120,7 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
             `mean_lap_time_s/TRACK` of each of several tracks.
     """
     tracks = [name.removeprefix("completion/") for name in metrics if name.startswith("completion/")]
-    figure = Figure((10.0, 6.0 + 0.3 * math.ceil(len(tracks) / 5)), dpi=150, layout="constrained")
+    figure = Figure((10.0, 6.0 + 0.3 * math.ceil(len(tracks) / 5)), dpi=150, layout=_LAYOUT)
     driving, returns, laps, entropy = figure.subplots(2, 2, sharex=True).flat
     # A column that only other runs have, or only nulls, is of no number.
     numbers = metrics.apply(pd.to_numeric).assign(lap_share=100 * metrics["lap_share"].astype(float))
