@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.recording import LogProblem, Recording
+from deepracer_exp.deepracer.routes import recognise, world_rows
 from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.files import CONFIG, read_config
-from deepracer_exp.tracks.catalogue import recognise, world_rows, world_track
-from deepracer_exp.tracks.track import Track
+from deepracer_exp.tracks.track import Track, world_track
 
 _SAMPLE = 2000
 """Rows of a course that are used to recognise it."""

@@ -4,7 +4,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, TypeAdapter
@@ -21,6 +21,8 @@ FARTHEST_M = 10_000.0
 ROUTE_ROWS = "rows of 6 numbers: centre x, y, inner x, y, outer x, y in metres"
 
 
+NEAR_M = 1.0
+"""Largest mean distance of a recording's poses from their closest waypoints: roads are up to 2 m wide."""
 _Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 _Width = Annotated[float, Field(gt=0, le=FARTHEST_M)]
 
@@ -121,6 +123,37 @@ def _bends() -> dict[str, np.ndarray]:
         bends = np.lib.format.read_array(member, allow_pickle=False)
     ends = np.cumsum([world.rows for world in worlds().values()])
     return dict(zip(worlds(), np.split(bends, ends[:-1]), strict=True))
+
+
+class Recognised(NamedTuple):
+    """A world that matches a recording."""
+
+    name: str
+    reversed: bool
+    distance_m: float
+    """Mean distance between the recorded points and the waypoints recorded as closest."""
+
+
+def recognise(points: np.ndarray, closest_waypoint: np.ndarray) -> list[Recognised]:
+    """Return the worlds that match a recording, the best first; equal ones in the catalogue's order.
+
+    Every world has its own numbering of waypoints: in the right one, each recorded waypoint is near the point where it
+    was recorded.
+
+    Args:
+        points: recorded points (n, 2) in metres; a few hundred from all around the lap are enough.
+        closest_waypoint: the waypoint recorded with each (n,).
+    """
+    found = []
+    last = int(closest_waypoint.max())
+    for world in worlds().values():
+        if last < world.rows:
+            waypoints = world_rows(world.name)[:, :2]
+            for reversed, line in ((False, waypoints), (True, waypoints[::-1])):
+                away_m = np.linalg.norm(points - line[closest_waypoint], axis=1)
+                found.append(Recognised(world.name, reversed, float(away_m.mean())))
+    near = [one for one in found if one.distance_m < NEAR_M]
+    return sorted(near, key=lambda one: round(one.distance_m, 6))
 
 
 def read_knots(path: str | Path) -> Knots:

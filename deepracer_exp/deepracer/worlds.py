@@ -2,7 +2,7 @@
 
 `worlds.zip` holds their names and their routes: the coordinates of deepracer-simapp (Apache-2.0), rounded to 0.1 mm.
 Every world has the rows of its own file in their order, so that waypoints have the numbers they have in the service.
-`python -m benchmarks.build_catalogue` writes it; `tracks.catalogue` builds courses from it.
+`python -m benchmarks.build_catalogue` writes it; `tracks.track.world_track` builds a course from it.
 """
 
 import json

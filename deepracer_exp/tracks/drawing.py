@@ -1,6 +1,5 @@
 """Pictures of a course: braille for the terminal, or an image file."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,6 @@ DOT_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 """Bits of a braille character's dots, 4 rows of 2."""
 BLANK = "\N{BRAILLE PATTERN BLANK}"
 ARROWS = "→↗↑↖←↙↓↘"
-NUMBER_ROOM = 4
-"""Characters between two waypoint numbers at least, on average."""
 LONG_IN = 12.0
 """Inches of the longer side of the course in a picture."""
 NARROW_IN = 7.0
@@ -34,7 +31,7 @@ CENTER_COLOR = "#f5a623"
 
 
 def draw_terminal(track: Track, columns: int, rows: int) -> str:
-    """Draw the course in braille: borders, start line, an arrow in driving direction and waypoint numbers.
+    """Draw the course in braille: borders, start line and an arrow in driving direction.
 
     Args:
         track: The course.
@@ -70,29 +67,7 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
     pose = track.start_pose(np.array([ahead_m / track.length_m]))
     column, row = dot(np.array([[pose.x[0], pose.y[0]]]))[0] // (2, 4)
     text[row][column] = ARROWS[round(float(pose.yaw_rad[0]) / (np.pi / 4)) % 8]
-    _write_numbers(track, text, lambda points: dot(points) // (2, 4))
     return "\n".join("".join(line).replace(BLANK, " ").rstrip() for line in text)
-
-
-def _write_numbers(track: Track, text: list[list[str]], cell: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Write numbers of waypoints into the empty cells beside the road, as many as have room around them."""
-    border = _roomier_border(track)
-    aside = border - track.waypoints
-    aside /= np.linalg.norm(aside, axis=1, keepdims=True).clip(1e-9)
-    border_cells, columns = cell(border), len(text[0])
-    apart = np.abs(np.diff(border_cells, axis=0)).max(axis=1).mean()
-    every = next((every for every in (10, 20, 50) if every * apart >= NUMBER_ROOM), 100)
-    for index in range(0, len(track.waypoints) - track.closed, every):
-        number = str(index)
-        # Beside the border, a character or two away from it; a number to the left ends there.
-        x, y = border_cells[index] + np.rint(aside[index] * (2, -1)).astype(int)
-        first = x - (
-            len(number) - 1 if aside[index, 0] < -0.3 else len(number) // 2 if aside[index, 0] < 0.3 else 0
-        )
-        around = range(first - 1, first + len(number) + 1)
-        inside = 0 <= y < len(text) and first >= 0 and first + len(number) <= columns
-        if inside and all(text[y][k] == BLANK for k in around if 0 <= k < columns):
-            text[y][first : first + len(number)] = number
 
 
 def draw_picture(track: Track, path: str | Path) -> None:

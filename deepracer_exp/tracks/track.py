@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.config.track import FloorConfig, TrackConfig
 from deepracer_exp.deepracer.routes import checked_rows, read_knots, read_route, world_rows
+from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.errors import BadInput
 
 from . import segments
@@ -231,6 +232,21 @@ class Track:
     def start_pose(self, ndist: np.ndarray) -> Pose:
         """Return poses on the centre line that face the next waypoint; arrays shaped as `ndist`."""
         return self._alone.start_pose(ndist, _FIRST)
+
+
+@cache
+def world_track(name: str, reversed: bool = False) -> Track:
+    """Return a world's course on a plain floor.
+
+    Args:
+        name: its name in the service in any case of letters, or its official name.
+        reversed: Drive against the order of its waypoints.
+
+    Raises:
+        BadInput: there is no such world.
+    """
+    found = find_world(name) or name
+    return Track.from_route(world_rows(found), found, title=worlds()[found].title, reversed=reversed)
 
 
 class Tracks:

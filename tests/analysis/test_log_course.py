@@ -12,8 +12,8 @@ from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracks.catalogue import world_rows
 
 from .made_up import Drive, made_up_course, made_up_recording
 

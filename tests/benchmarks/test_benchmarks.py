@@ -12,7 +12,7 @@ from benchmarks.driving import PASS_STEPS, SameDriving, scalar_setup
 from benchmarks.report import median, table
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.tracks.catalogue import world_track
+from deepracer_exp.tracks.track import world_track
 
 # One process and one iteration; any 3 episodes count as reliable.
 SHORTEST = (

@@ -4,7 +4,6 @@ import io
 import pickle
 import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable
 from fractions import Fraction
@@ -70,13 +69,8 @@ def test_the_params_are_the_27_keys_of_the_service_as_plain_python(dtype: type) 
     assert all(type(index) is int for index in params["closest_waypoints"])
     assert all(type(point) is tuple and type(point[0]) is float for point in params["waypoints"])
     assert set(COLUMNS) | set(TrackParams._fields) < set(KEYS)
-
-
-def test_keys_about_other_objects_hold_the_defaults_of_an_empty_road() -> None:
-    params = scalar_params(next(iter(rows(select(columns(1), None)))), WAYPOINTS, 3.4, True)
     assert params["closest_objects"] == [0, 0]
     assert not params["is_crashed"]
-    assert not params["object_in_camera"]
     assert [v for k, v in params.items() if k.startswith("objects_")] == [[]] * 6
 
 
@@ -88,10 +82,6 @@ def test_batch_params_hold_the_same_keys_and_values() -> None:
             shared = key in TrackParams._fields or key.startswith("objects_")
             np.testing.assert_array_equal(batch[key] if shared else batch[key][car], value)
     assert set(batch) == set(KEYS)
-
-
-def test_each_car_is_paid_for_its_own_params() -> None:
-    np.testing.assert_array_equal(function("return params['x'] * 2")(columns(3), ROAD), [0.0, 2.0, 4.0])
 
 
 def test_cars_that_are_not_active_get_nothing_and_are_not_called() -> None:
@@ -117,18 +107,13 @@ def test_whatever_float_makes_a_bounded_number_of_is_a_reward(value: str) -> Non
         ("return '1.0'", "returned '1.0'; accepted: a finite"),
         ("return b'1'", "returned b'1'"),
         ("return float('nan')", "returned nan"),
-        ("return float('-inf')", "returned -inf"),
-        ("return 1e9", "returned 1000000000.0"),
         ("return -100000.1", "returned -100000.1"),
         ("return 10 ** 400", "returned 1000"),
-        ("return 1j", "returned 1j"),
         ("return [1.0]", "returned [1.0]"),
         ("return 1 / 0", "raised ZeroDivisionError: division by zero in line 2 of /somewhere/mine.py"),
-        ("return params['nonsense']", "raised KeyError: 'nonsense' in line 2"),
         ("raise ValueError('two\\nlines')", "raised ValueError: two lines in line 2"),
         ("raise ValueError('x' * 1000000)", "raised ValueError: xxx"),
         ("import sys; sys.exit(0)", "raised SystemExit: 0 in line 2"),
-        ("raise GeneratorExit", "raised GeneratorExit in line 2"),
         ("return reward_function(params)", "raised RecursionError"),
     ],
 )
@@ -262,14 +247,6 @@ def test_timer_and_handler_found_are_put_back() -> None:
         signal.setitimer(signal.ITIMER_REAL, *timer)
 
 
-def test_outside_the_main_thread_rewards_are_paid_without_a_limit() -> None:
-    results: list[np.ndarray] = []
-    thread = threading.Thread(target=lambda: results.append(function("return 1.0")(columns(3), ROAD)))
-    thread.start()
-    thread.join()
-    np.testing.assert_array_equal(results, np.ones((1, 3)))
-
-
 def test_what_a_reward_does_to_its_params_reaches_neither_the_next_call_nor_the_caller() -> None:
     body = (
         "seen = (len(params), len(params['waypoints']), *params['closest_waypoints'],"
@@ -317,14 +294,11 @@ def test_a_module_that_cannot_be_run_is_bad_input(text: str, message: str) -> No
     assert str(caught.value).startswith(f"/somewhere/mine.py: cannot be run: {message}")
 
 
-def test_a_name_that_is_no_function_is_bad_input() -> None:
-    with pytest.raises(BadInput, match="reward_function is 5; accepted: a function"):
-        function("def other(): pass\nreward_function = 5\n")
-
-
-def test_a_callable_object_is_accepted() -> None:
+def test_a_callable_object_is_accepted_and_a_number_is_bad_input() -> None:
     text = "class R:\n    def __call__(self, params):\n        return 2.0\nreward_function = R()\n"
     np.testing.assert_array_equal(function(text)(columns(3), ROAD), [2.0] * 3)
+    with pytest.raises(BadInput, match="reward_function is 5; accepted: a function"):
+        function("def other(): pass\nreward_function = 5\n")
 
 
 def test_prints_go_to_the_log_and_nowhere_else(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -336,15 +310,6 @@ def test_prints_go_to_the_log_and_nowhere_else(tmp_path: Path, capfd: pytest.Cap
     log = prints.path.read_text().splitlines()
     assert log == [f"car {i}: made" for i in range(3)] + [f"car {i}: x is {i}.0" for i in range(3)]
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_million_prints_do_not_stop_a_reward(tmp_path: Path) -> None:
-    prints = RewardPrints(tmp_path / "reward_prints.log")
-    body = "\n    for i in range(100000):\n        print('line', i)\n    return 1.0"
-    np.testing.assert_array_equal(function(body, prints=prints)(columns(3), ROAD), np.ones(3))
-    prints.close()
-    assert prints.written + prints.dropped == 300_000
-    assert prints.path.stat().st_size < 100_000
 
 
 def batch(body: str, **options: Any) -> RewardFunction:
@@ -366,10 +331,8 @@ def test_a_batch_function_is_called_once_for_all_active_cars() -> None:
             None,
             "returned object of shape (); accepted: one number a car, shape (3,) (3 cars)",
         ),
-        ("return 1.0", None, "returned float64 of shape ()"),
         ("return params['x'][:2]", None, "returned float64 of shape (2,)"),
         ("return params['x'] * 1j", None, "returned complex128 of shape (3,)"),
-        ("return ['a', 'b', 'c']", None, "of shape (3,)"),
         ("return [[1], [2, 3], 4]", None, "returned [[1], [2, 3], 4]"),
         ("return 1 / 0", None, "raised ZeroDivisionError: division by zero in line 5"),
         ("while True: pass", None, "took longer than the time limit of 0.05 s"),

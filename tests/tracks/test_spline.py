@@ -29,13 +29,9 @@ def test_a_width_for_each_knot_is_the_width_at_that_knot():
     np.testing.assert_allclose(found, widths_m, atol=0.02)
 
 
-def test_a_closed_course_ends_in_its_first_row_to_the_last_bit():
-    rows = rows_from_knots(SQUARE, np.array([1.0]), closed=True)
+def test_rows_are_evenly_spaced_at_about_15_cm_and_end_in_the_first():
+    rows = rows_from_knots(SQUARE, 1.0, closed=True)
     np.testing.assert_array_equal(rows[0], rows[-1])
-
-
-def test_rows_are_evenly_spaced_at_about_15_cm():
-    rows = rows_from_knots(SQUARE, np.array([1.0]), closed=True)
     step_m = np.linalg.norm(np.diff(rows[:, :2], axis=0), axis=1)
     assert step_m.min() > 0.145
     assert step_m.max() < 0.155

@@ -59,9 +59,3 @@ def test_points_of_a_car_may_follow_one_another(several, points):
     np.testing.assert_array_equal(
         together.on_road(at, track_index[::4]), together.on_road(at, np.repeat(track_index[::4], 4))
     )
-
-
-def test_no_points_are_no_answers(several):
-    nothing = np.zeros((0, 2))
-    assert len(Tracks(several).project(nothing, np.zeros(0, np.intp)).ndist) == 0
-    assert len(several[0].on_road(nothing)) == 0
