@@ -14,9 +14,9 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
-from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.files import read_config, read_object
+from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.training.callbacks import BUDGET_REACHED

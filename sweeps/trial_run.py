@@ -15,7 +15,6 @@ from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import key_of
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
@@ -31,6 +30,7 @@ from deepracer_exp.runs.files import (
 )
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
+from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.metadata import PARENT
 from deepracer_exp.tracking.metrics import trial_metrics

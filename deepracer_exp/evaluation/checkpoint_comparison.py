@@ -20,10 +20,10 @@ from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
+from deepracer_exp.runs.read_checkpoint import check, read_policy
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.runs.result import CRITERIA
 
-from .checkpoint import check, read_policy
 from .evaluate import NOTHING
 from .evaluator import Evaluator
 from .result import CONFIDENCE, HELD_OUT, USUAL, Evaluation, Group, Metric, Rank

@@ -16,11 +16,11 @@ from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import EVALUATIONS
+from deepracer_exp.runs.read_checkpoint import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
-from .checkpoint import StoredPolicy, read_checkpoint
 from .evaluator import Evaluator
 from .result import CONFIDENCE, USUAL, Evaluation
 

@@ -28,10 +28,10 @@ def verify(folder: Path) -> None:
         wanted = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
         found = {path: _sha256(folder / path) for path in _files(folder)}
     except (OSError, ValueError, TypeError) as error:
-        raise BadInput(f"{folder}: torn: {HASHES} cannot be used: {error}") from error
+        raise BadInput(f"{folder}: corrupt: {HASHES} cannot be used: {error}") from error
     if found != wanted:
         changed = sorted(set(found.items()) ^ set(wanted.items()))
-        raise BadInput(f"{folder}: torn: {changed[0][0]} is not as it was written")
+        raise BadInput(f"{folder}: corrupt: {changed[0][0]} is not as it was written")
 
 
 def find_checkpoint(folder: Path, name: str) -> Path:

@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
+from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
 from deepracer_exp.agents.ppo import Algorithm
-from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.checkpoint_files import pinned, write_hashes
+from deepracer_exp.errors import RunFailed
 
+from .checkpoint_files import pinned, write_hashes
 from .files import CHECKPOINTS
-
-AGENT, TRAINING = "agent", "training"
-"""Components: the networks with what improves them, and what a resumed training needs besides."""
+from .read_checkpoint import AGENT, TRAINING, State
 
 
 class CheckpointStore:
@@ -103,7 +101,7 @@ class CheckpointStore:
         archive = StateDictCheckpointAdapter("archive")
         checkpoint = Checkpoint().register(AGENT, agent, adapter=archive)
         if training is not None:
-            checkpoint.register(TRAINING, _State(training), adapter=archive)
+            checkpoint.register(TRAINING, State(training), adapter=archive)
         aside = self.folder / f".{name}"
         try:
             checkpoint.save(aside, metadata=dict(counters))
@@ -140,52 +138,6 @@ class CheckpointStore:
 def checkpoint_name(iteration: int) -> str:
     """Return the name of the folder of an iteration's checkpoint."""
     return f"{iteration:06d}"
-
-
-def read_training(folder: Path) -> dict[str, Any]:
-    """Return what `CheckpointStore.save` was given as `training`.
-
-    Args:
-        folder: of one checkpoint, whose hashes have been looked at.
-
-    Raises:
-        BadInput: there is none, or it cannot be read.
-    """
-    state = _State({})
-    target = Checkpoint().register(TRAINING, state, adapter=StateDictCheckpointAdapter("archive"))
-    try:
-        target.load(folder)
-    except (CheckpointError, OSError) as error:
-        raise BadInput(
-            f"{folder}: no training can go on from here: {' '.join(str(error).split())[:200]}"
-        ) from error
-    return dict(state.values)
-
-
-def read_agent(folder: Path, agent: Algorithm) -> None:
-    """Give an agent the networks, optimizer and schedule of a checkpoint.
-
-    Raises:
-        BadInput: it does not fit, or cannot be read.
-    """
-    target = Checkpoint().register(AGENT, agent, adapter=StateDictCheckpointAdapter("archive"))
-    try:
-        target.load(folder)
-    except (CheckpointError, OSError) as error:
-        raise BadInput(f"{folder}: cannot be used: {' '.join(str(error).split())[:200]}") from error
-
-
-class _State:
-    """What torchrl's adapter asks for."""
-
-    def __init__(self, values: Mapping[str, Any]):
-        self.values = values
-
-    def state_dict(self) -> dict[str, Any]:
-        return dict(self.values)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.values = state
 
 
 def _remove(path: Path) -> None:

@@ -22,11 +22,12 @@ from deepracer_exp.deepracer.trace import TraceWriter, to_table
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed, reading
-from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
+from deepracer_exp.runs.checkpoints import CheckpointStore
 from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.read_checkpoint import read_agent
 
 from .budget import Budget
 from .metrics import NOT_EVALUATED, EvalResult, Finished, RunMetrics, track_names

@@ -19,7 +19,8 @@ from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
-from deepracer_exp.runs.checkpoints import CheckpointStore, read_training
+from deepracer_exp.runs.checkpoints import CheckpointStore
+from deepracer_exp.runs.read_checkpoint import read_training
 
 TRAINING = {"iteration": 0}
 
@@ -94,7 +95,7 @@ def test_best_is_what_was_said_to_be_and_last_what_a_training_can_go_on_from(sto
     store.save(agents[3], {"iteration": 3}, None)
     assert same(load(store.folder / "best"), agents[1])
     assert same(load(store.folder / "last"), agents[2])
-    with pytest.raises(BadInput, match="no training can go on"):
+    with pytest.raises(BadInput, match="a training cannot resume from it"):
         read_training(store.folder / "best")
 
 
@@ -153,7 +154,7 @@ def test_the_hashes_tell_a_changed_checkpoint(store):
     before = checkpoint_sha256(folder)
     manifest = folder / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"iteration": 0', '"iteration": 1'))
-    with pytest.raises(BadInput, match=r"torn: manifest\.json is not as it was written"):
+    with pytest.raises(BadInput, match=r"corrupt: manifest\.json is not as it was written"):
         verify(folder)
     assert checkpoint_sha256(folder) == before  # that of what was written
 

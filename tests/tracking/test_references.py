@@ -129,10 +129,10 @@ def test_a_checkpoint_that_is_not_the_registered_one_is_refused(season, client):
     checkpoint = run / "checkpoints" / "000020"
     file = checkpoint / "agent" / "state.tdz"
     file.write_text("other weights")
-    assert "torn" in refusal("champion", season)
+    assert "corrupt" in refusal("champion", season)
     hashes = json.loads((checkpoint / "hashes.json").read_text())
     (checkpoint / "hashes.json").unlink()
-    assert "torn" in refusal("champion", season)
+    assert "corrupt" in refusal("champion", season)
     shutil.rmtree(checkpoint)
     assert "which is gone" in refusal("champion", season)
     made_anew = season.checkpoint(run, 20)

@@ -86,7 +86,7 @@ def spoil(checkpoint: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "arguments", "words"),
     [
-        (lambda run, client, run_id: spoil(run / "checkpoints/000020"), (), "torn"),
+        (lambda run, client, run_id: spoil(run / "checkpoints/000020"), (), "corrupt"),
         (lambda run, client, run_id: (run / "tracking.json").unlink(), (), "is not recorded in MLflow"),
         (
             lambda run, client, run_id: (run / "tracking.json").write_text('{"run_id": null}'),

@@ -9,11 +9,10 @@ import yaml
 from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
-from deepracer_exp.evaluation.checkpoint import read_checkpoint
 from deepracer_exp.runs.checkpoint_files import verify
-from deepracer_exp.runs.checkpoints import read_training
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.read_checkpoint import read_checkpoint, read_training
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.metrics import TIMES
 from deepracer_exp.training.trainer import Trainer
@@ -102,7 +101,7 @@ def test_a_torn_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trai
     archive.write_bytes(archive.read_bytes()[:-20])
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 0, ended.stderr
-    assert "000003: torn" in ended.stderr
+    assert "000003: corrupt" in ended.stderr
     assert "using 000002, the newest intact one" in ended.stderr
     assert_same_run(run, whole(trained))
 

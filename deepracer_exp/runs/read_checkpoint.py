@@ -3,6 +3,7 @@
 import logging
 import re
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,18 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
+from deepracer_exp.agents.ppo import Algorithm
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, verify
+
+from .checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, verify
 
 logger = logging.getLogger("deepracer_exp")
 
-_AGENT, _TRAINING = "agent", "training"
+AGENT, TRAINING = "agent", "training"
+"""Components: the networks with what improves them, and what a resumed training needs besides."""
 _MANIFEST = "manifest.json"
 _STATE = {"state.json", "state.tdz"}
 _MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
@@ -64,27 +68,21 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
         BadInput: there is no such checkpoint, it lies elsewhere, or it is corrupt and so are all others. Files that
             could contain a pickle are rejected unread.
     """
-    path, kept = find_checkpoint(folder, name), kept_checkpoints(folder)
-    try:
-        return check(path, resumable=resumable)
-    except BadInput as error:
-        if name.isdecimal():
-            raise
-        reasons = [str(error)]
-    for other in kept:
-        if path.exists() and other.samefile(path):
+    path, reasons = find_checkpoint(folder, name), list[str]()
+    others = [] if name.isdecimal() else kept_checkpoints(folder)
+    for candidate in (path, *others):
+        if candidate is not path and path.exists() and candidate.samefile(path):
             continue
         try:
-            found = check(other, resumable=resumable)
+            found = check(candidate, resumable=resumable)
         except BadInput as error:
+            if not others:
+                raise
             reasons.append(str(error))
             continue
-        logger.warning(
-            "checkpoint=%s: %s; using %s, the newest intact one",
-            name,
-            "; ".join(reasons),
-            other.name,
-        )
+        if reasons:
+            why = "; ".join(reasons)
+            logger.warning("checkpoint=%s: %s; using %s, the newest intact one", name, why, found.name)
         return found
     raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
 
@@ -96,52 +94,39 @@ def check(path: Path, *, resumable: bool = False) -> Path:
         BadInput: any other.
     """
     if not path.is_dir():
-        what = (
-            "is a broken link"
-            if path.is_symlink()
-            else "is not a folder"
-            if path.exists()
-            else "does not exist"
-        )
-        raise BadInput(f"{path}: {what}; a pickle is never loaded")
+        kind = "a broken link" if path.is_symlink() else "no folder"
+        raise BadInput(f"{path}: is {kind}; a pickle is never loaded")
     path = path.resolve()
     entries = list(path.rglob("*"))
     links = [entry for entry in entries if entry.is_symlink()]
     if links:
         raise BadInput(f"{links[0]}: is a link; the files of a checkpoint must be in its own folder")
-    files = {file.name: file for file in entries if not file.is_dir()}
-    foreign = sorted(files.keys() - _STATE - {_MANIFEST, HASHES})
+    files = {file.name for file in entries if not file.is_dir()}
+    foreign = sorted(files - _STATE - {_MANIFEST, HASHES})
     if foreign:
         raise BadInput(
             f"{path}: contains {foreign[0]}; accepted: the tensors and JSON files of a checkpoint; a pickle is "
             "never loaded"
         )
-    if _MANIFEST not in files:
-        raise BadInput(f"{path}: incomplete: has no {_MANIFEST}")
-    if HASHES not in files:
-        raise BadInput(
-            f"{path}: has no {HASHES}: incomplete, or written by an older version, whose checkpoints cannot be used"
-        )
+    for name in (_MANIFEST, HASHES):
+        if name not in files:
+            raise BadInput(f"{path}: incomplete: has no {name}")
     verify(path)
     try:
         components = Checkpoint.manifest(path)["components"]
     except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
-        raise BadInput(
-            f"{path}: not a checkpoint of deepracer-exp: {' '.join(str(error).split())}"
-        ) from error
-    if _AGENT not in components or not components.keys() <= {_AGENT, _TRAINING}:
-        raise BadInput(
-            f"{path}: not a checkpoint of deepracer-exp: holds {', '.join(components) or 'nothing'}"
-        )
+        raise BadInput(f"{path}: not a checkpoint of deepracer-exp: {_one_line(error)}") from error
+    if AGENT not in components or not components.keys() <= {AGENT, TRAINING}:
+        held = ", ".join(components) or "nothing"
+        raise BadInput(f"{path}: not a checkpoint of deepracer-exp: holds {held}")
     for name, record in components.items():
         folder = path / record["path"]  # torchrl lets no absolute path and no `..` pass
         there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
         if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
-            raise BadInput(
-                f"{path}: not a checkpoint of deepracer-exp: {name} is not {' and '.join(sorted(_STATE))}"
-            )
+            parts = " and ".join(sorted(_STATE))
+            raise BadInput(f"{path}: not a checkpoint of deepracer-exp: {name} is not {parts}")
         _check_archive(folder / "state.tdz")
-    if resumable and _TRAINING not in components:
+    if resumable and TRAINING not in components:
         raise BadInput(f"{path}: contains only the policy, so a training cannot resume from it")
     return path
 
@@ -158,18 +143,49 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
         build_action_space(experiment.action_space).n,
         torch.Generator(),
     )
-    target = Checkpoint().register(
-        _AGENT, _NetworksOf(networks), adapter=StateDictCheckpointAdapter("archive")
-    )
-    try:
-        found = target.load(path)
-    except (CheckpointError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise BadInput(f"{path}: does not fit the run's config.yaml: {reason[:300]}") from error
+    counters = _load(path, AGENT, _NetworksOf(networks), "does not fit the run's config.yaml")
     for key, value in networks.state_dict().items():
         if not torch.isfinite(value).all():
             raise BadInput(f"{path}: {key} is not finite; choose another checkpoint")
-    return StoredPolicy(networks, path, found.manifest["metadata"])
+    return StoredPolicy(networks, path, counters)
+
+
+def read_agent(path: Path, agent: Algorithm) -> None:
+    """Give an agent the networks, optimizer and schedule of a checkpoint that `check` has accepted.
+
+    Raises:
+        BadInput: it does not fit.
+    """
+    _load(path, AGENT, agent, "cannot be used")
+
+
+def read_training(path: Path) -> dict[str, Any]:
+    """Return what `CheckpointStore.save` was given as `training`.
+
+    Args:
+        path: a checkpoint that `check` has accepted.
+
+    Raises:
+        BadInput: there is none, or it cannot be read.
+    """
+    state = State({})
+    _load(path, TRAINING, state, "a training cannot resume from it")
+    return dict(state.values)
+
+
+class State:
+    """Plain values as a component of a checkpoint."""
+
+    def __init__(self, values: Mapping[str, Any]):
+        self.values = values
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the values."""
+        return dict(self.values)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Replace the values."""
+        self.values = state
 
 
 class _NetworksOf:
@@ -185,6 +201,15 @@ class _NetworksOf:
         self._networks.load_state_dict(state["networks"])
 
 
+def _load(path: Path, component: str, target: Any, problem: str) -> dict[str, Any]:
+    """Load a component into `target` and return the checkpoint's counters."""
+    archive = Checkpoint().register(component, target, adapter=StateDictCheckpointAdapter("archive"))
+    try:
+        return dict(archive.load(path).manifest["metadata"])
+    except (CheckpointError, OSError) as error:
+        raise BadInput(f"{path}: {problem}: {_one_line(error)}") from error
+
+
 def _check_archive(file: Path) -> None:
     """Refuse an archive with anything but tensors."""
     try:
@@ -194,3 +219,7 @@ def _check_archive(file: Path) -> None:
         raise BadInput(f"{file}: corrupt: {error}") from error
     if foreign:
         raise BadInput(f"{file}: contains {foreign[0]}, which is not a tensor; a pickle is never loaded")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]

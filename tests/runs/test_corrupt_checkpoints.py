@@ -19,9 +19,9 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.checkpoint import intact_checkpoint, read_checkpoint
 from deepracer_exp.runs.checkpoint_files import pin, write_hashes
 from deepracer_exp.runs.checkpoints import CheckpointStore
+from deepracer_exp.runs.read_checkpoint import intact_checkpoint, read_checkpoint
 
 STATE = {"cars": torch.arange(6.0), "streams": {"seed": 3}}
 
