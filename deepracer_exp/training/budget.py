@@ -9,9 +9,9 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from deepracer_exp.config.running import BudgetConfig
@@ -31,6 +31,8 @@ _UNITS = {
     "minutes": "{:,.4g} min",
     "max_cost": "{:,.2f} in cost",
 }
+_EXPERIMENT = "experiment_"
+"""Beginning of the keys of limits that all runs of an experiment share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +55,9 @@ class Budget:
             config: the budget group.
             folder: the run's own; the folders beside it are the other runs of the experiment. None: there are none.
         """
-        self._config = config
-        self._folder = folder
-        self._others = _OtherRuns(config.price_per_hour or 0.0)
+        self._config, self._folder = config, folder
+        self._others: dict[str, float] = {}
+        self._look_again_at = 0.0
         self._alerted: dict[str, int] = {}
 
     def used(self, env_steps: int, iterations: int, wall_clock_s: float) -> tuple[str, float]:
@@ -75,7 +77,7 @@ class Budget:
             spent = own + others
             percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
             if not first and percent > self._alerted[limit]:
-                number = _UNITS[limit.removeprefix("experiment_")]
+                number = _UNITS[limit.removeprefix(_EXPERIMENT)]
                 message = (
                     f"{percent} % of budget.{limit} used: {number.format(spent)} of {number.format(most)}"
                 )
@@ -90,10 +92,10 @@ class Budget:
 
     def __str__(self) -> str:
         """Return the limits in words, e.g. ``3,000,000 steps``."""
-        words = [_UNITS[limit].format(most) for limit, most in _limits(self._config).items()]
+        words = [_UNITS[name].format(most) for name, most in _limits(self._config).items()]
         words += [
-            f"{_UNITS[limit.removeprefix('experiment_')].format(most)} of all runs"
-            for limit, most in _limits(self._config, "experiment_").items()
+            f"{_UNITS[name].format(most)} of all runs"
+            for name, most in _limits(self._config, _EXPERIMENT).items()
         ]
         return " or ".join(words)
 
@@ -102,16 +104,21 @@ class Budget:
     ) -> list[tuple[str, float, float, float]]:
         """Return of each limit its key, what this run has used of it, what the others have, and the limit."""
         own = {
-            **_by_name(_Spent(env_steps, wall_clock_s, self.cost(wall_clock_s) or 0.0)),
+            "env_steps": env_steps,
             "iterations": iterations,
+            "minutes": wall_clock_s / 60,
+            "max_cost": self.cost(wall_clock_s) or 0.0,
         }
-        found = [(limit, own[limit], 0.0, most) for limit, most in _limits(self._config).items()]
-        shared = _limits(self._config, "experiment_")
+        found = [(name, own[name], 0.0, most) for name, most in _limits(self._config).items()]
+        shared = _limits(self._config, _EXPERIMENT)
         if shared and self._folder is not None:
-            others = _by_name(self._others.spent(self._folder.parent, self._folder.name))
-            for limit, most in shared.items():
-                name = limit.removeprefix("experiment_")
-                found.append((limit, own[name], others[name], most))
+            # They may run at the same time.
+            if time.monotonic() >= self._look_again_at:
+                self._others = _spent_in(self._folder.parent, self._config, besides=self._folder.name)
+                self._look_again_at = time.monotonic() + _REFRESH_S
+            found += [
+                (f"{_EXPERIMENT}{name}", own[name], self._others[name], most) for name, most in shared.items()
+            ]
         return found
 
 
@@ -125,16 +132,13 @@ def refuse_spent(config: BudgetConfig, experiment_dir: Path) -> None:
     Raises:
         BadInput: a limit is reached; it is named with what was used.
     """
-    limits = _limits(config, "experiment_")
-    if not limits:
-        return
-    spent = _by_name(_OtherRuns(config.price_per_hour or 0.0).spent(experiment_dir, None))
-    for limit, most in limits.items():
-        used = spent[limit.removeprefix("experiment_")]
-        if used >= most:
+    limits = _limits(config, _EXPERIMENT)
+    spent = _spent_in(experiment_dir, config) if limits else {}
+    for name, most in limits.items():
+        if spent[name] >= most:
             raise BadInput(
-                f"budget.{limit}={most:g}: the runs in {experiment_dir} have used {used:,.6g} already; accepted: "
-                "more than that, or another name="
+                f"budget.{_EXPERIMENT}{name}={most:g}: the runs in {experiment_dir} have used {spent[name]:,.6g} "
+                "already; accepted: more than that, or another name="
             )
 
 
@@ -155,11 +159,9 @@ class Alerts:
         """Send a message of a run; what goes wrong is logged."""
         for wanted, how in ((self._command, self._run), (self._address, self._post)):
             if wanted is not None:
-                thread = threading.Thread(
-                    target=how, args=(wanted, message, run_dir), name="alert", daemon=True
-                )
-                thread.start()
-                self._threads.append(thread)
+                arguments = (wanted, message, run_dir)
+                self._threads.append(threading.Thread(target=how, args=arguments, name="alert", daemon=True))
+                self._threads[-1].start()
 
     def close(self) -> None:
         """Wait up to 20 s for alerts still on their way."""
@@ -224,70 +226,34 @@ def _webhook_address(config: BudgetConfig) -> str | None:
     return address
 
 
-@dataclass(frozen=True)
-class _Spent:
-    env_steps: int = 0
-    wall_clock_s: float = 0.0
-    cost: float = 0.0
-
-    def __add__(self, other: "_Spent") -> "_Spent":
-        return _Spent(
-            self.env_steps + other.env_steps,
-            self.wall_clock_s + other.wall_clock_s,
-            self.cost + other.cost,
-        )
+def _limits(config: BudgetConfig, prefix: str = "") -> dict[str, float]:
+    """Return the limits that are set, by their keys without the prefix."""
+    return {name: limit for name in _UNITS if (limit := getattr(config, f"{prefix}{name}", None)) is not None}
 
 
-class _OtherRuns:
-    """What the other runs in a folder have used, looked up every few seconds: they may run at the same time."""
+def _spent_in(folder: Path, config: BudgetConfig, besides: str | None = None) -> dict[str, float]:
+    """Return what all run folders in `folder` but the one called `besides` have used, by the limits' keys."""
+    spent = dict.fromkeys(_UNITS, 0.0)
+    runs = [run for run in folder.iterdir() if run.name != besides] if folder.is_dir() else []
+    for row in map(_last_row, runs):
+        if row:
+            price = (config.price_per_hour or 0.0) * row["wall_clock_s"] / 3600
+            spent["env_steps"] += row["env_steps"]
+            spent["minutes"] += row["wall_clock_s"] / 60
+            spent["max_cost"] += price if row["cost"] is None else row["cost"]
+    return spent
 
-    def __init__(self, price_per_hour: float):
-        self._price = price_per_hour
-        self._ended: dict[str, _Spent] = {}
-        self._sum = _Spent()
-        self._look_again_at = 0.0
 
-    def spent(self, folder: Path, besides: str | None) -> _Spent:
-        """Return the sum over all run folders in `folder` but the one called `besides`."""
-        if time.monotonic() >= self._look_again_at:
-            runs = folder.iterdir() if folder.is_dir() else ()
-            self._sum = sum((self._of(path) for path in runs if path.name != besides), _Spent())
-            self._look_again_at = time.monotonic() + _REFRESH_S
-        return self._sum
-
-    def _of(self, run: Path) -> _Spent:
-        if run.name in self._ended:
-            return self._ended[run.name]
-        try:
-            spent = self._from(json.loads((run / SUMMARY).read_text(encoding="utf-8")))
-            self._ended[run.name] = spent
-        except (OSError, ValueError, KeyError, TypeError):
-            # It is running, was killed, or is no run at all: a sum of what is known must not end a training.
-            return self._so_far(run)
-        return spent
-
-    def _so_far(self, run: Path) -> _Spent:
-        try:
+def _last_row(run: Path) -> dict[str, Any]:
+    """Return the summary of a run, or its last whole row if it has none; empty where nothing can be read."""
+    try:
+        if (run / SUMMARY).exists():
+            text = (run / SUMMARY).read_bytes()
+        else:  # it is running, or was killed
             with (run / METRICS).open("rb") as file:
                 file.seek(max(0, file.seek(0, 2) - _TAIL_BYTES))
-                lines = file.read().split(b"\n")
-            return self._from(json.loads(lines[-2]))
-        except (OSError, ValueError, KeyError, TypeError, IndexError):
-            return _Spent()
-
-    def _from(self, row: Mapping[str, float]) -> _Spent:
-        seconds = float(row["wall_clock_s"])
-        cost = row.get("cost")
-        return _Spent(
-            int(row["env_steps"]), seconds, self._price * seconds / 3600 if cost is None else float(cost)
-        )
-
-
-def _limits(config: BudgetConfig, prefix: str = "") -> dict[str, float]:
-    """Return the limits that are set, by their keys."""
-    keys = [f"{prefix}{name}" for name in _UNITS]
-    return {key: limit for key in keys if (limit := getattr(config, key, None)) is not None}
-
-
-def _by_name(spent: _Spent) -> dict[str, float]:
-    return {"env_steps": spent.env_steps, "minutes": spent.wall_clock_s / 60, "max_cost": spent.cost}
+                text = file.read().split(b"\n")[-2]
+        row = dict(json.loads(text))
+        return {"env_steps": row["env_steps"], "wall_clock_s": row["wall_clock_s"], "cost": row.get("cost")}
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        return {}  # a sum of what is known must not end a training

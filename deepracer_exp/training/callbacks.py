@@ -2,12 +2,14 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
 from deepracer_exp.runs.convergence import Decision, StoppingRule, build_rule
@@ -24,15 +26,15 @@ from deepracer_exp.runs.files import (
     REPORT,
     REWARD,
     SUMMARY,
+    TRACE,
 )
 from deepracer_exp.tracking.delivery import ENDS
-from deepracer_exp.tracking.metadata import END_TAG
+from deepracer_exp.tracking.metadata import END_TAG, joined
 from deepracer_exp.tracking.tracker import Tracker
 
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
 from .metrics import NOT_EVALUATED, EvalResult, Finished, Ranking
-from .report import write_pictures, write_run_page
 from .trainer import FINISHED, STOPPED_EARLY, Callback, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
@@ -225,7 +227,7 @@ class ReportCallback(Callback):
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Write report.html, unless the run may be resumed."""
         if trainer.experiment.report and result.status in (FINISHED, STOPPED_EARLY):
-            result.note = write_run_page(trainer.folder.path)
+            result.note = _write_page(trainer.folder.path)
 
 
 class TrackingCallback(Callback):
@@ -289,7 +291,18 @@ class DisplayCallback(Callback):
     def on_fit_start(self, trainer: Trainer) -> None:
         """Show the view before the cars: workers take a second or two to start."""
         if trainer.stop_reason is None:
-            header = RunHeader.of(trainer.folder, trainer.setup, self._names, trainer.metrics, trainer.budget)
+            names, metrics = self._names, trainer.metrics
+            header = RunHeader(
+                name=trainer.folder.name,
+                track=joined([course.tracks[0].title for course in trainer.setup.courses], " + "),
+                track_labels=tuple(metrics.labels),
+                remembered=metrics.remembered,
+                reward=names["reward"],
+                network=names["network"],
+                actions=names["action_space"],
+                budget=str(trainer.budget),
+                folder=str(trainer.folder.path),
+            )
             self._display = ProgressDisplay(self._console, header).__enter__()
 
     def on_iteration_end(self, trainer: Trainer) -> None:
@@ -358,3 +371,40 @@ class BestCallback(Callback):
         moment = {"iteration": trainer.iteration, "env_steps": trainer.env_steps}
         self._best = {**moment, "metric": metric, "rank": list(rank), **columns}
         return True
+
+
+def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
+    """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration."""
+    # Half a second of import that no training waits for.
+    import pandas as pd
+
+    from deepracer_exp.analysis.charts.run_pictures import LINE_COLUMNS, driven_lines, learning_curves
+
+    metrics_file = run_dir / METRICS
+    if not metrics_file.is_file() or not metrics_file.stat().st_size:
+        return
+    trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
+    figure = driven_lines(trace, {course.name: course.tracks[0] for course in courses})
+    figure.savefig(run_dir / BEST_LAP, dpi=120)
+    learning_curves(pd.read_json(metrics_file, lines=True)).savefig(run_dir / LEARNING, dpi=120)
+
+
+def _write_page(run_dir: Path) -> str | None:
+    """Write `report.html`; return a line where there is none: nothing that happens here spoils a training."""
+    try:
+        from deepracer_exp.analysis.findings import findings
+        from deepracer_exp.analysis.log_report import LogPage, write_page
+        from deepracer_exp.analysis.log_view import prepare
+        from deepracer_exp.evaluation.reward_terms import run_terms
+        from deepracer_exp.runs.own_recording import read_own_recording
+
+        view, terms = run_terms(prepare(read_own_recording(run_dir)), just_trained=True)
+        write_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms))
+    except KeyboardInterrupt:
+        return f"{REPORT} was left off; `deepracer-exp analyze {run_dir.name}` writes it"
+    except Exception as error:
+        note = f"{REPORT} could not be written: {' '.join(f'{type(error).__name__}: {error}'.split())}"
+        # Commands print the line; warnings would be shown twice.
+        logger.info(note, exc_info=True)
+        return f"{note}; log.txt has the traceback"
+    return None

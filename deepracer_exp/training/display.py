@@ -8,20 +8,14 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console, ConsoleOptions, Group, RenderResult
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.tracking.metadata import joined
 from deepracer_exp.tracking.metrics import track_metric
-
-from .budget import Budget
-from .metrics import RunMetrics
 
 Row = Mapping[str, float | int | None]
 """One line of metrics.jsonl."""
@@ -33,17 +27,51 @@ LINE_S = 5.0
 """Shortest time between two plain lines; from two minutes on it grows with the run, up to `_LINE_AT_MOST_S`."""
 _LINE_AT_MOST_S = 60.0
 _LINE_SHARE = 1 / 24
-HALVES = 60
-"""Columns from which the figures stand in two halves side by side."""
-WIDE = 76
-"""Columns from which the limit of the budget stands beside the bar."""
-LABEL, VALUE, GAP, RIGHT = 12, 10, 3, 24
-"""Columns of a figure's name, of its value, between the halves, and of the right half."""
 NOTHING = "\N{EN DASH}"
-_TABLE_GAP = 2
-_CELL = 22  # columns of a track's figures, at least: 18 tracks in three columns of a terminal of 80
-_FIGURES = (4, 7)  # columns of per cent and lap time in it
+
+_HALVES = 60  # columns from which the figures stand in two halves side by side
+_WIDE = 76  # columns from which the limit of the budget stands beside the bar
+_LABEL, _VALUE, _GAP, _RIGHT = (
+    12,
+    10,
+    3,
+    24,
+)  # columns of a name, a value, between the halves, of the right half
 _FRAME_LINES = 10  # of the panel beside figures and table, and the terminal's last
+_TABLE_GAP, _CELL = (
+    2,
+    22,
+)  # columns between tracks, and of a track: 18 tracks in three columns of a terminal of 80
+_PERCENT, _LAP = 4, 7  # columns of per cent and lap time in it
+
+# What is shown of a row by its label: key, format and unit.
+_FIGURES = {
+    "completion": ("completion", ".1f", " %"),
+    "return": ("mean_return", ",.2f", ""),
+    "entropy": ("entropy", ".3f", ""),
+    "learn rate": ("lr", ".2g", ""),
+    "laps": ("laps", ",.0f", ""),
+    "best lap": ("best_lap_time_s", ".2f", " s"),
+    "mean lap": ("mean_lap_time_s", ".2f", " s"),
+    "env steps": ("env_steps", ",.0f", ""),
+    "speed": ("env_steps_per_s", ",.0f", " steps/s"),
+    "iteration": ("iteration", ",.0f", ""),
+    "episodes": ("episodes", ",.0f", ""),
+}
+_SHARE = "of last"
+_CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
+    "completion": ("green", (0.0, 100.0)),
+    "return": ("cyan", None),
+    "entropy": ("magenta", None),
+}
+"""Colour, and the values of the lowest and highest bar, of the figures that are drawn as curves."""
+_PAIRS = (("completion", "laps"), ("return", _SHARE), ("entropy", "best lap"), ("learn rate", "mean lap"))
+_PAIRS_OF_TRACKS = (("completion", "laps"), ("return", _SHARE), ("entropy", "learn rate"))
+_PAIRS_OF_STEPS = (("env steps", "iteration"), ("speed", "episodes"))
+_BY_IMPORTANCE = (
+    *("iteration", "completion", "laps", _SHARE, "best lap", "entropy", "return", "mean lap", "env steps"),
+    *("speed", "episodes", "learn rate"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,27 +92,9 @@ class RunHeader:
     folder: str
     """Where the results go."""
 
-    @classmethod
-    def of(
-        cls,
-        folder: RunFolder,
-        setup: RaceSetup,
-        names: Mapping[str, str],
-        metrics: RunMetrics,
-        budget: Budget,
-    ) -> "RunHeader":
-        """Return the header of a run; `names` are what a racer calls its choices."""
-        return cls(
-            name=folder.name,
-            track=joined([course.tracks[0].title for course in setup.courses], " + "),
-            track_labels=tuple(metrics.labels),
-            remembered=metrics.remembered,
-            reward=names["reward"],
-            network=names["network"],
-            actions=names["action_space"],
-            budget=str(budget),
-            folder=str(folder.path),
-        )
+    def __str__(self) -> str:
+        """Return the choices in one line."""
+        return " · ".join((self.track, self.reward, self.network, self.actions))
 
 
 class ProgressDisplay:
@@ -98,24 +108,25 @@ class ProgressDisplay:
     def __init__(
         self, console: Console, header: RunHeader, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._console = console
-        self._clock = clock
-        self._view = _View(header)
+        self._console, self._header, self._clock = console, header, clock
         # A terminal that is called dumb cannot draw in place.
         self._live = Live(console=console, auto_refresh=False) if console.is_interactive else None
-        self._started_s = 0.0
-        self._shown_s = -math.inf
+        self._started_s, self._shown_s = 0.0, -math.inf
         self._pending = False
+        self._row: Row = {}
+        self._fraction = self._elapsed_s = 0.0
+        self._eta_s: float | None = None
+        self._history: dict[str, list[float]] = {label: [] for label in _CURVES}
+        self._tracks = TrackTable(header.track_labels)
 
     def __enter__(self) -> Self:
         self._started_s = self._clock()
         if self._live is not None:
             self._live.start()
-            self._live.update(self._view, refresh=True)
+            self._live.update(self._panel(), refresh=True)
         else:
-            header = self._view.header
-            self._line(f"{header.name}: {_join(header)} · {header.budget}")
-            self._line(f"results in {header.folder}")
+            self._print(f"{self._header.name}: {self._header} · {self._header.budget}")
+            self._print(f"results in {self._header.folder}")
         return self
 
     def __exit__(
@@ -136,169 +147,131 @@ class ProgressDisplay:
             eta_s: seconds left, or None if unknown.
         """
         now_s = self._clock()
-        elapsed_s = now_s - self._started_s
-        self._view.add(row, fraction, eta_s, elapsed_s)
+        self._row, self._eta_s, self._elapsed_s = row, eta_s, now_s - self._started_s
+        self._fraction = min(max(fraction, 0.0), 1.0)
+        for label, values in self._history.items():
+            value = _value(row, _FIGURES[label][0])
+            if value is not None:
+                values.append(value)
+        self._tracks.add(row)
         self._pending = True
-        line_s = min(max(LINE_S, _LINE_SHARE * elapsed_s), _LINE_AT_MOST_S)
+        line_s = min(max(LINE_S, _LINE_SHARE * self._elapsed_s), _LINE_AT_MOST_S)
         if now_s - self._shown_s >= (line_s if self._live is None else REFRESH_S):
             self._shown_s = now_s
             self._show()
 
-    def message(self, text: str) -> None:
-        """Print a line above the view."""
-        self._line(text)
-
     def _show(self) -> None:
         self._pending = False
         if self._live is not None:
-            self._live.update(self._view, refresh=True)
+            self._live.update(self._panel(), refresh=True)
         else:
-            self._line(self._view.line())
+            self._print(self._line())
 
-    def _line(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         # Names and paths may hold square brackets, and a log line is not folded at 80 columns.
         self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
-
-class _View:
-    """The panel: state on one side, rich's protocol to draw it at any width on the other."""
-
-    def __init__(self, header: RunHeader) -> None:
-        self.header = header
-        self._row: Row = {}
-        self._fraction = 0.0
-        self._eta_s: float | None = None
-        self._elapsed_s = 0.0
-        self._history: dict[str, list[float]] = {"completion": [], "mean_return": [], "entropy": []}
-        self._tracks = TrackTable(header.track_labels)
-
-    def add(self, row: Row, fraction: float, eta_s: float | None, elapsed_s: float) -> None:
-        self._row, self._eta_s, self._elapsed_s = row, eta_s, elapsed_s
-        self._fraction = min(max(fraction, 0.0), 1.0)
-        for key, values in self._history.items():
-            value = _value(row, key)
-            if value is not None:
-                values.append(value)
-        self._tracks.add(row)
-
-    def line(self) -> str:
-        row = self._row
+    def _line(self) -> str:
+        share = self._figure(_SHARE)
         parts = [
             f"{100 * self._fraction:3.0f} %",
-            f"iteration {_format(row, 'iteration', ',.0f')}",
-            _format(row, "env_steps", ",.0f", " steps"),
-            _format(row, "env_steps_per_s", ",.0f", "/s"),
-            f"return {_format(row, 'mean_return', ',.2f')}",
-            f"completion {_format(row, 'completion', '.1f', ' %')}",
-            f"laps {_format(row, 'laps', ',.0f')} ({_share(row)} of last {self.header.remembered})",
-            self._tracks.least()
-            if self._tracks
-            else f"best lap {_format(row, 'best_lap_time_s', '.2f', ' s')}",
-            f"entropy {_format(row, 'entropy', '.3f')}",
-            f"lr {_format(row, 'lr', '.2g')}",
+            f"iteration {self._figure('iteration')}",
+            f"{self._figure('env steps')} steps",
+            self._figure("speed").replace(" steps/s", "/s"),
+            f"return {self._figure('return')}",
+            f"completion {self._figure('completion')}",
+            f"laps {self._figure('laps')} ({share} of last {self._header.remembered})",
+            self._tracks.least() if self._tracks else f"best lap {self._figure('best lap')}",
+            f"entropy {self._figure('entropy')}",
+            f"lr {self._figure('learn rate')}",
             _left(self._eta_s),
         ]
         return " · ".join(parts)
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def _panel(self) -> Panel:
         # On a very wide terminal the eye would have to travel between the halves.
-        width = min(options.max_width, 100)
-        # Less the border and two columns of padding on each side.
-        inner = width - 6
-        figures = self._figures(inner, width >= HALVES)
-        if width < HALVES:  # the first ones matter most
-            figures = figures[: max(1, console.height - _FRAME_LINES + 1)]
-        elif self._tracks:
-            room = console.height - len(figures) - _FRAME_LINES
-            figures += [Text(""), *self._tracks.lines(inner, room)]
-        yield Panel(
-            Group(
-                Text(_join(self.header), style="dim", overflow="ellipsis", no_wrap=True),
-                Text(""),
-                self._bar(inner, width >= WIDE),
-                Text(""),
-                *figures,
-            ),
-            title=Text(self.header.name, style="bold"),
+        width, height = min(self._console.width, 100), self._console.height
+        inner = width - 6  # less the border and two columns of padding on each side
+        if width < _HALVES:
+            figures = self._column(inner)[: max(1, height - _FRAME_LINES + 1)]
+        else:
+            figures = self._halves(inner)
+            if self._tracks:
+                room = height - len(figures) - _FRAME_LINES
+                figures += [Text(""), *self._tracks.lines(inner, room)]
+        content: list[RenderableType] = [
+            Text(str(self._header), style="dim", overflow="ellipsis", no_wrap=True),
+            Text(""),
+            self._bar(inner),
+            Text(""),
+            *figures,
+        ]
+        folder = self._header.folder
+        return Panel(
+            Group(*content),
+            title=Text(self._header.name, style="bold"),
             title_align="left",
-            subtitle=Text(_tail(self.header.folder, inner - 2), style="dim"),
+            # The end of a path distinguishes runs.
+            subtitle=Text(folder if len(folder) <= inner - 2 else f"…{folder[3 - inner :]}", style="dim"),
             subtitle_align="left",
             border_style="bright_black",
             padding=(1, 2),
             width=width,
         )
 
-    def _bar(self, width: int, wide: bool) -> Table:
+    def _bar(self, width: int) -> Table:
         spent = Text.assemble((f"{100 * self._fraction:.0f} %", "bold"))
         left = _left(self._eta_s)
-        if width >= HALVES - 6:
-            spent.append(f" of {self.header.budget if wide else 'budget'}", style="dim")
+        if width >= _HALVES - 6:
+            limit = self._header.budget if width >= _WIDE - 6 else "budget"
+            spent.append(f" of {limit}", style="dim")
             left = f"{_clock(self._elapsed_s)} · {left}"
         row = Table.grid(padding=(0, 2), expand=True)
         row.width = width
         row.add_column(ratio=1, min_width=4)
         row.add_column(justify="right", no_wrap=True)
         row.add_column(justify="right", no_wrap=True)
-        row.add_row(
-            ProgressBar(
-                total=1.0,
-                completed=self._fraction,
-                style="grey23",
-                complete_style="cyan",
-                finished_style="cyan",
-            ),
-            spent,
-            left,
-        )
+        bar = ProgressBar(total=1.0, completed=self._fraction, style="grey23", complete_style="cyan")
+        bar.finished_style = "cyan"
+        row.add_row(bar, spent, left)
         return row
 
-    def _figures(self, width: int, halves: bool) -> list[Text]:
-        row = self._row
-        left = width - GAP - RIGHT if halves else width
-        right = RIGHT if halves else width
+    def _halves(self, width: int) -> list[Text]:
+        pairs = _PAIRS_OF_TRACKS if self._tracks else _PAIRS  # lap times stand at each track
+        left = width - _GAP - _RIGHT
+        both = [
+            Text(" " * _GAP).join((self._cell(one, left), self._cell(other, _RIGHT)))
+            for one, other in (*pairs, *_PAIRS_OF_STEPS)
+        ]
+        return [*both[: len(pairs)], Text(""), *both[len(pairs) :]]
 
-        def curve(key: str, style: str, bounds: tuple[float, float] | None = None) -> Text:
-            return Text(sparkline(self._history[key], left - LABEL - VALUE, bounds), style=style)
+    def _column(self, width: int) -> list[Text]:
+        hidden = ("best lap", "mean lap") if self._tracks else ()
+        return [self._cell(label, width) for label in _BY_IMPORTANCE if label not in hidden]
 
-        def cell(label: str, value: str, note: Text | str = "", room: int = left) -> Text:
-            text = Text.assemble((label.ljust(LABEL), "dim"), (value.ljust(VALUE), "bold"), note)
-            text.truncate(room, overflow="ellipsis", pad=True)
-            return text
+    def _cell(self, label: str, width: int) -> Text:
+        name = f"{label} {self._header.remembered}" if label == _SHARE else label
+        cell = Text.assemble((name.ljust(_LABEL), "dim"), (self._figure(label).ljust(_VALUE), "bold"))
+        if label in _CURVES:
+            style, bounds = _CURVES[label]
+            cell.append(sparkline(self._history[label], width - _LABEL - _VALUE, bounds), style=style)
+        cell.truncate(width, overflow="ellipsis", pad=True)
+        return cell
 
-        completion = cell(
-            "completion", _format(row, "completion", ".1f", " %"), curve("completion", "green", (0, 100))
-        )
-        returns = cell("return", _format(row, "mean_return", ",.2f"), curve("mean_return", "cyan"))
-        entropy = cell("entropy", _format(row, "entropy", ".3f"), curve("entropy", "magenta"))
-        rate = _format(row, "lr", ".2g")
-        laps = cell("laps", _format(row, "laps", ",.0f"), room=right)
-        share = cell(f"of last {self.header.remembered}", _share(row), room=right)
-        best = cell("best lap", _format(row, "best_lap_time_s", ".2f", " s"), room=right)
-        mean = cell("mean lap", _format(row, "mean_lap_time_s", ".2f", " s"), room=right)
-        steps = cell("env steps", _format(row, "env_steps", ",.0f"))
-        speed = cell("speed", _format(row, "env_steps_per_s", ",.0f", " steps/s"))
-        iteration = cell("iteration", _format(row, "iteration", ",.0f"), room=right)
-        episodes = cell("episodes", _format(row, "episodes", ",.0f"), room=right)
-        if not halves:
-            lap_times = () if self._tracks else (best, mean)
-            learn_rate = cell("learn rate", rate)
-            return [
-                *(iteration, completion, laps, share, *lap_times[:1], entropy, returns),
-                *(*lap_times[1:], steps, speed, episodes, learn_rate),
-            ]
-        if self._tracks:  # lap times stand at each track
-            rows = [(completion, laps), (returns, share), (entropy, cell("learn rate", rate, room=right))]
-        else:
-            rows = [(completion, laps), (returns, share), (entropy, best), (cell("learn rate", rate), mean)]
-        rows += [(Text(""), Text("")), (steps, iteration), (speed, episodes)]
-        return [one + " " * GAP + other for one, other in rows]
+    def _figure(self, label: str) -> str:
+        if label == _SHARE:
+            share = _value(self._row, "lap_share")
+            return NOTHING if share is None else f"{100 * share:.0f} %"
+        key, spec, unit = _FIGURES[label]
+        value = _value(self._row, key)
+        return NOTHING if value is None else format(value, spec) + unit
 
 
 class TrackTable:
     """Completion and best lap of each track."""
 
     def __init__(self, labels: Sequence[str]):
-        """Begin empty.
+        """Start empty.
 
         Args:
             labels: of the tracks, as in the rows of metrics.jsonl; empty for a run on one track.
@@ -311,12 +284,12 @@ class TrackTable:
     def __bool__(self) -> bool:
         return bool(self._labels)
 
-    def add(self, row: Mapping[str, float | int | None]) -> None:
+    def add(self, row: Row) -> None:
         """Add the figures of an iteration."""
         for metric, known in (("completion", self._completion), ("best_lap_time_s", self._best_s)):
             for label in self._labels:
-                value = row.get(track_metric(metric, label))
-                if value is not None and math.isfinite(value):
+                value = _value(row, track_metric(metric, label))
+                if value is not None:
                     known[label] = value
 
     def least(self) -> str:
@@ -355,11 +328,10 @@ class TrackTable:
 
 def _columns(name: str, done: str, best: str, cell: int) -> str:
     """Set a name to the left and figures to the right; a long name loses its middle, since both ends distinguish it."""
-    done_room, best_room = _FIGURES
-    room = cell - done_room - best_room
+    room = cell - _PERCENT - _LAP
     if len(name) > room:
         name = f"{name[: room // 2]}…{name[len(name) - (room - 1) // 2 :]}"
-    return f"{name:<{room}}{done:>{done_room}}{best:>{best_room}}"
+    return f"{name:<{room}}{done:>{_PERCENT}}{best:>{_LAP}}"
 
 
 def sparkline(values: list[float], width: int, bounds: tuple[float, float] | None = None) -> str:
@@ -386,16 +358,6 @@ def _value(row: Row, key: str) -> float | None:
     return float(value) if value is not None and math.isfinite(value) else None
 
 
-def _format(row: Row, key: str, spec: str, unit: str = "") -> str:
-    value = _value(row, key)
-    return NOTHING if value is None else format(value, spec) + unit
-
-
-def _share(row: Row) -> str:
-    share = _value(row, "lap_share")
-    return NOTHING if share is None else f"{100 * share:.0f} %"
-
-
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
@@ -406,12 +368,3 @@ def _left(eta_s: float | None) -> str:
     if eta_s is None or not math.isfinite(eta_s):
         return f"{NOTHING} left"
     return f"at most {_clock(max(eta_s, 0.0))} left"  # the last iteration may end past the budget
-
-
-def _join(header: RunHeader) -> str:
-    return " · ".join((header.track, header.reward, header.network, header.actions))
-
-
-def _tail(text: str, width: int) -> str:
-    """Keep the end of a path: it distinguishes runs."""
-    return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
