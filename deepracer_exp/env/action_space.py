@@ -14,7 +14,7 @@ from deepracer_exp.config.driving import (
     SpeedRange,
     SteeringRange,
 )
-from deepracer_exp.deepracer.model_metadata import read_model_metadata
+from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
 
 Commands = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -139,3 +139,17 @@ def _check_levels(name: str, bounds: SteeringRange | SpeedRange, levels: int) ->
             f"action_space.{name}_levels: {levels} from low {bounds.low:g} to high {bounds.high:g};"
             " accepted: 1 level with low = high, or at least 2 with low < high"
         )
+
+
+def metadata_of(actions: ActionSpace) -> ModelMetadata:
+    """Return an action space as model metadata, with the service's default camera, which our policies lack."""
+    discrete = isinstance(actions, DiscreteActions)
+    listed: tuple[Action, ...] = ()
+    if isinstance(actions, DiscreteActions):
+        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
+        listed = tuple(Action(steering_deg, speed_mps) for steering_deg, speed_mps in pairs)
+    return ModelMetadata(
+        actions=listed,
+        low=None if discrete else Action(*actions.low.tolist()),
+        high=None if discrete else Action(*actions.high.tolist()),
+    )

@@ -7,11 +7,10 @@ from deepracer_exp.config.custom_files import TAKEN
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import (
-    Action,
     ModelMetadata,
     model_metadata_text,
 )
-from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
+from deepracer_exp.env.action_space import ActionSpace, metadata_of
 from deepracer_exp.errors import BadInput
 
 CONSOLE_ACTIONS = (2, 30)
@@ -64,20 +63,6 @@ def write_aws_files(files: AwsFiles, folder: Path) -> None:
         raise BadInput(
             f"{error.filename}: cannot be written: {error.strerror}; give another folder by -o"
         ) from error
-
-
-def metadata_of(actions: ActionSpace) -> ModelMetadata:
-    """Return an action space as model metadata, with the service's default camera, which our policies lack."""
-    discrete = isinstance(actions, DiscreteActions)
-    listed: tuple[Action, ...] = ()
-    if isinstance(actions, DiscreteActions):
-        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
-        listed = tuple(Action(steering_deg, speed_mps) for steering_deg, speed_mps in pairs)
-    return ModelMetadata(
-        actions=listed,
-        low=None if discrete else Action(*actions.low.tolist()),
-        high=None if discrete else Action(*actions.high.tolist()),
-    )
 
 
 def _action_notes(metadata: ModelMetadata) -> list[str]:

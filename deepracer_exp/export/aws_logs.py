@@ -16,10 +16,10 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import model_metadata_text
 from deepracer_exp.deepracer.recording import Recording
-from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput
 
-from .aws_files import hyperparameters_of, metadata_of
+from .aws_files import hyperparameters_of
 
 TRACE_HEADER = (
     "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"

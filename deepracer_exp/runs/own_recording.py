@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import TypeAdapter, ValidationError
 
+from deepracer_exp.config.custom_files import TAKEN
+from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.deepracer import sim_trace
-from deepracer_exp.deepracer.model_metadata import (
-    Action,
-    ModelMetadata,
-    read_model_metadata,
-)
+from deepracer_exp.deepracer.model_metadata import ModelMetadata
 from deepracer_exp.deepracer.recording import (
     EVALUATION_COLUMNS,
     METRICS_COLUMNS,
@@ -28,25 +27,17 @@ from deepracer_exp.deepracer.recording import (
     typed_table,
 )
 from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.trace import EPISODE_STATUS
+from deepracer_exp.deepracer.trace import EPISODE_STATUS, SCHEMA
+from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
 
-LEARNING = {
-    "batch_size": "batch_size",
-    "num_epochs": "epochs",
-    "lr": "lr",
-    "beta_entropy": "entropy_coeff",
-    "discount_factor": "discount",
-    "loss_type": "loss_type",
-    "num_episodes_between_training": "episodes_per_iteration",
-}
-"""The service's words for values of the group `algorithm`."""
 _CONSTANT = {"stream": TRAINING, "worker": 0, "wall_clock": np.nan}
-_WORDS = ("episode_status", "track")
 _READ = [name for name in STEP_COLUMNS if name not in _CONSTANT]
+_SCHEMA = pa.schema([SCHEMA.field(name) for name in _READ])
+_ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
 
 def is_own_run(folder: Path) -> bool:
@@ -100,89 +91,44 @@ def read_own_recording(folder: Path) -> Recording:
 
 
 def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
-    """Read the trace into arrays made once, so that there is never a second copy of the whole."""
+    """Read the newest files of the trace that together have no more than `MOST_STEPS` rows."""
     found = sorted(path for path in (folder / TRACE).glob("*-iteration.parquet") if path.name[0] != ".")
     if not found:
         raise BadInput(
             f"{folder / TRACE}: no *-iteration.parquet; accepted: the folder of a run with its trace"
         )
-    counts = _last(found, [_count(path, problems) for path in found], problems)
-    total = sum(counts)
-    columns = {name: np.empty(total, STEP_COLUMNS[name][0]) for name in _READ if name not in _WORDS}
-    codes = {name: np.zeros(total, np.int16) for name in _WORDS}
-    words = {"episode_status": dict.fromkeys(EPISODE_STATUS), "track": dict[str, None]()}
-    place = {name: {word: code for code, word in enumerate(known)} for name, known in words.items()}
-    at = 0
-    for path, count in zip(found, counts, strict=True):
-        if not count:
-            continue
-        rows = slice(at, at + count)
+    tables: dict[Path, pa.Table] = {}
+    rows = left_out = 0
+    for path in reversed(found):
         try:
-            table = pq.ParquetFile(path).read(columns=_READ, use_threads=False)
-            for name, column in columns.items():
-                column[rows] = _numbers(table[name])
-            for name in _WORDS:
-                codes[name][rows] = _codes(table[name], place[name])
+            count = pq.read_metadata(path).num_rows
+            rows += count
+            if rows > sim_trace.MOST_STEPS:
+                left_out += count
+            else:
+                tables[path] = pq.ParquetFile(path).read(columns=_READ, use_threads=False).cast(_SCHEMA)
         except (OSError, pa.ArrowException, KeyError, ValueError) as error:
             problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
-            continue
-        at += count
-        files.append(path)
-    if not files:
+    if left_out:
+        reason = sim_trace.left_out_reason(left_out)
+        problems.append(LogProblem(str(folder / TRACE), None, reason, lines=left_out))
+    if not tables:
         raise BadInput(f"{problems[0]}; nothing of the trace can be read")
-    whole: dict[str, Any] = {}
-    for name in STEP_COLUMNS:
+    files += sorted(tables)
+    whole = pa.concat_tables([tables.pop(path) for path in sorted(tables)]).unify_dictionaries()
+    columns: dict[str, Any] = {}
+    for name, (kind, _) in STEP_COLUMNS.items():
         if name in _CONSTANT:
-            whole[name] = _constant(name, at)
-        elif name in _WORDS:
-            whole[name] = pd.Categorical.from_codes(codes[name][:at], list(place[name]))
+            columns[name] = _constant(name, len(whole))
+        elif kind == "category":
+            columns[name] = whole[name].to_pandas()
         else:
-            whole[name] = columns[name][:at]
-    return pd.DataFrame(whole, copy=False)
-
-
-def _last(found: Sequence[Path], counts: list[int], problems: list[LogProblem]) -> list[int]:
-    """Return the rows to be read of each file: 0 of the first files where all together have too many."""
-    so_far = np.cumsum(counts[::-1])[::-1]
-    read = [
-        count if after <= sim_trace.MOST_STEPS else 0
-        for count, after in zip(counts, so_far.tolist(), strict=True)
-    ]
-    gone = sum(counts) - sum(read)
-    if gone:
-        reason = sim_trace.left_out_reason(gone)
-        problems.append(LogProblem(str(found[0].parent), None, reason, lines=gone))
-    return read
-
-
-def _count(path: Path, problems: list[LogProblem]) -> int:
-    """Return the rows of a file, 0 for one that cannot be read."""
-    try:
-        found = pq.read_metadata(path)
-    except (OSError, pa.ArrowException) as error:
-        problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
-        return 0
-    missing = [name for name in _READ if name not in found.schema.to_arrow_schema().names]
-    if missing:
-        problems.append(LogProblem(str(path), None, f"left out: no column {', '.join(missing)}"))
-        return 0
-    return int(found.num_rows)
-
-
-def _numbers(column: pa.ChunkedArray) -> np.ndarray:
-    if column.null_count:  # the action of a policy that gives [steer, throttle] itself
-        column = column.cast(pa.float64())
-    return column.to_numpy()
-
-
-def _codes(column: pa.ChunkedArray, place: dict[str, int]) -> np.ndarray:
-    """Return the words as numbers; a word that is new gets the next one."""
-    parts = []
-    for chunk in column.chunks:
-        chunk = chunk if pa.types.is_dictionary(chunk.type) else chunk.dictionary_encode()
-        number = [place.setdefault(word, len(place)) for word in chunk.dictionary.to_pylist()]
-        parts.append(np.array(number, np.int16)[chunk.indices.to_numpy()])
-    return np.concatenate(parts)
+            columns[name] = whole[name].to_numpy().astype(kind, copy=False)
+    steps = pd.DataFrame(columns, copy=False)
+    words = steps["episode_status"].cat
+    others = [word for word in words.categories if word not in EPISODE_STATUS]
+    steps["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
+    return steps
 
 
 def _constant(name: str, count: int) -> Any:
@@ -254,35 +200,13 @@ def _number(value: Any) -> float:
 
 def _metadata(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> ModelMetadata | None:
     """Return the action space; our policies have no camera, and the service's default stands in for it."""
-    space = config.get("action_space")
-    if space is None:
+    if config.get("action_space") is None:
         return None
     try:
-        if space.get("file") is not None:
-            return read_model_metadata(space["file"])
-        discrete = space["kind"] != "continuous"
-        steering, speed = (space.get(name) for name in ("steering_angle", "speed"))
-        return ModelMetadata(
-            actions=_actions(space) if discrete else (),
-            low=None if discrete else Action(float(steering["low"]), float(speed["low"])),
-            high=None if discrete else Action(float(steering["high"]), float(speed["high"])),
-        )
-    except (BadInput, TypeError, ValueError, KeyError, AttributeError) as error:
-        problems.append(
-            LogProblem(str(folder / CONFIG), None, f"action_space is not told: {_one_line(error)}")
-        )
+        return metadata_of(build_action_space(_ACTION_SPACE.validate_python(config["action_space"])))
+    except (BadInput, ValidationError) as error:
+        problems.append(LogProblem(str(folder / CONFIG), None, f"action_space: {_one_line(error)}"))
         return None
-
-
-def _actions(space: Mapping[str, Any]) -> tuple[Action, ...]:
-    """Return the choices; a grid has every steering level with every speed level, steering in the outer loop."""
-    if space["kind"] == "discrete":
-        return tuple(Action(float(one["steering_angle"]), float(one["speed"])) for one in space["actions"])
-    steering, speed = (
-        np.linspace(space[name]["low"], space[name]["high"], space[levels]).tolist()
-        for name, levels in (("steering_angle", "steering_levels"), ("speed", "speed_levels"))
-    )
-    return tuple(Action(angle, pace) for angle in steering for pace in speed)
 
 
 def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -290,7 +214,8 @@ def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
     own = config.get("algorithm")
     if not isinstance(own, Mapping):
         return None
-    return {word: own[name] for word, name in LEARNING.items() if own.get(name) is not None}
+    keys = {word: key.removeprefix("algorithm.") for word, key in TAKEN.items()}
+    return {word: own[key] for word, key in keys.items() if own.get(key) is not None}
 
 
 def _track(config: Mapping[str, Any]) -> str | None:

@@ -85,8 +85,7 @@ def test_what_was_trained_with_is_told_in_the_services_words(trained):
 @pytest.mark.parametrize("space", ["grid_fine", "continuous"])
 def test_the_action_space_is_that_of_the_environment(trained, space):
     from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.env.action_space import build_action_space
-    from deepracer_exp.export.aws_files import metadata_of
+    from deepracer_exp.env.action_space import build_action_space, metadata_of
 
     overrides = (f"action_space={space}",)
     experiment, _ = compose_experiment(overrides)
