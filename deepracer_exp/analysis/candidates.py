@@ -23,9 +23,6 @@ def candidates(iterations: pd.DataFrame) -> pd.DataFrame:
 
     Fast and dense (after TheRayG/deepracer-log-analysis): at least `LEAST_LAPS` complete laps and `DENSE` of the
     highest share of complete laps; among those the ones with the lowest 25th percentile of the lap time.
-
-    Args:
-        iterations: `LogView.iterations`.
     """
     enough = iterations["lap_time_p25_s"].notna() & (iterations["complete"] >= LEAST_LAPS)
     dense = iterations["lap_share"] >= DENSE * iterations.loc[enough, "lap_share"].max()

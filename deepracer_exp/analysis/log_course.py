@@ -122,10 +122,6 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
     """Return the course with the waypoint numbers of the log.
 
     A route that was sampled differently has other numbers; then the waypoints are moved to where the log has them.
-
-    Args:
-        course: in driving direction.
-        steps: rows with `X`, `Y` and `closest_waypoint`.
     """
     sample = steps.iloc[:: max(1, len(steps) // (10 * _SAMPLE))]
     waypoint = sample["closest_waypoint"].to_numpy(np.intp)

@@ -13,41 +13,11 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head
 
-from .charts.actions import action_use_by_section, entropy_along_track, zero_steering_top_speed
-from .charts.driving_line import (
-    acceleration_map,
-    lap_line,
-    racing_line,
-    sector_times,
-    slide_map,
-    speed_steering_by_waypoint,
-    waypoint_map,
-)
+from .charts import actions, driving_line, laps, mistakes, rewards, training
 from .charts.figure import Chart
-from .charts.laps import correlations, lap_delta, lap_time_histogram, lap_time_percentile, start_position
-from .charts.mistakes import episode_ends_map, off_track_risk, visits_map
-from .charts.rewards import (
-    common_rewards,
-    discount_factors,
-    reward_by_waypoint,
-    reward_distribution,
-    reward_map,
-    reward_terms,
-    scatter_time_reward,
-    value_map,
-)
 from .charts.runs import generalisation_matrix, generations, run_folder, runs_compared
-from .charts.training import evaluations, learning_vs_lap_time, quarters, stability, training_progress
 from .findings import Finding, findings
-from .log_tables import (
-    best_laps,
-    candidate_rows,
-    count,
-    facts,
-    headline,
-    iteration_rows,
-    problem_rows,
-)
+from .log_tables import best_laps, candidate_rows, count, facts, headline, iteration_rows, problem_rows
 from .log_view import LogView, prepare
 from .next_steps import next_steps, outcome
 from .page import Plot, plot_of, render
@@ -56,29 +26,38 @@ from .reward_comparison import RewardComparison
 MOST_FILES = 400
 _BESIDE, _PAID = "Generations, runs and tracks", "What the reward pays for"
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
-    "How it learned": (training_progress, learning_vs_lap_time, evaluations, quarters, stability),
+    "How it learned": (
+        *(training.training_progress, training.learning_vs_lap_time, training.evaluations),
+        *(training.quarters, training.stability),
+    ),
     _BESIDE: (),
-    "Lap times": (lap_time_percentile, lap_time_histogram, lap_delta, correlations, start_position),
+    "Lap times": (
+        *(laps.lap_time_percentile, laps.lap_time_histogram, laps.lap_delta),
+        *(laps.correlations, laps.start_position),
+    ),
     "The line it drives": (
-        *(lap_line, sector_times, speed_steering_by_waypoint, racing_line, acceleration_map, slide_map),
+        *(driving_line.lap_line, driving_line.sector_times, driving_line.speed_steering_by_waypoint),
+        *(driving_line.racing_line, driving_line.acceleration_map, driving_line.slide_map),
     ),
-    "Where it goes wrong": (off_track_risk, episode_ends_map, visits_map),
-    "What it does": (action_use_by_section, zero_steering_top_speed, entropy_along_track),
+    "Where it goes wrong": (mistakes.off_track_risk, mistakes.episode_ends_map, mistakes.visits_map),
+    "What it does": (
+        *(actions.action_use_by_section, actions.zero_steering_top_speed, actions.entropy_along_track),
+    ),
     _PAID: (
-        *(reward_map, reward_by_waypoint, value_map, reward_distribution, common_rewards),
-        *(scatter_time_reward, discount_factors),
+        *(rewards.reward_map, rewards.reward_by_waypoint, rewards.value_map, rewards.reward_distribution),
+        *(rewards.common_rewards, rewards.scatter_time_reward, rewards.discount_factors),
     ),
-    "The course": (waypoint_map,),
+    "The course": (driving_line.waypoint_map,),
 }
 """The figures of a training, in the order of the page; a new one is added here."""
 RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
-    "How it raced": (evaluations,),
+    "How it raced": (training.evaluations,),
     _BESIDE: (),
-    "Lap times": (lap_time_histogram, lap_delta),
-    "The line it drives": (lap_line, sector_times, speed_steering_by_waypoint, racing_line),
-    "Where it goes wrong": (episode_ends_map,),
+    "Lap times": (laps.lap_time_histogram, laps.lap_delta),
+    "The line it drives": SECTIONS["The line it drives"][:4],
+    "Where it goes wrong": (mistakes.episode_ends_map,),
     _PAID: (),
-    "The course": (waypoint_map,),
+    "The course": (driving_line.waypoint_map,),
 }
 """The figures of a recording without a training."""
 
@@ -128,7 +107,7 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     drawn |= {title: [draw_one(view) for draw_one in some] for title, some in sections.items()}
     drawn[_BESIDE] += [runs_compared(views), generations(views), generalisation_matrix(views)]
     if page.terms is not None:
-        drawn[_PAID].append(reward_terms(view, page.terms))
+        drawn[_PAID].append(rewards.reward_terms(view, page.terms))
     known = {title: [chart for chart in some if chart is not None] for title, some in drawn.items()}
     return {title: some for title, some in known.items() if some}
 

@@ -76,11 +76,7 @@ def off_track_rows(steps: pd.DataFrame) -> Rows:
 
 
 def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
-    """Return the places where the car runs off most often, at most `PLACES`.
-
-    Args:
-        steps: of a `LogView`, or a part of them made of whole episodes.
-    """
+    """Return the places where the car runs off most often, at most `PLACES`; the steps are those of whole episodes."""
     rows = off_track_rows(steps)
     position = steps["lap_position"].to_numpy(np.float64)
     rows = rows[np.isfinite(position[rows])]
@@ -196,12 +192,7 @@ def risk_counts(episodes: pd.DataFrame, n: int, reach: int = 0) -> tuple[Values,
     """Return for each of n waypoints how many episodes passed it, and how many left the road there.
 
     An episode passes every waypoint from that of its first row to that of its last row, also those that a control
-    step jumped over; a complete lap passes all of them.
-
-    Args:
-        episodes: of a `LogView`, or some of them.
-        n: number of waypoints.
-        reach: waypoints to either side that count as well.
+    step jumped over; a complete lap passes all of them. So many waypoints to either side as `reach` count as well.
     """
     first, last = (episodes[name].to_numpy(np.int64) for name in ("first_waypoint", "last_waypoint"))
     progress = episodes["progress"].to_numpy(np.float64)

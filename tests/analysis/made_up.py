@@ -77,7 +77,7 @@ def made_up_recording(
         drives: its episodes, in their order.
         course: of the catalogue.
         entropy: nats, of the policy update of each iteration.
-        evaluated: completion in per cent that the five evaluation episodes after each iteration are told to have.
+        evaluated: completion in per cent of the five evaluation episodes after each iteration.
         evaluations: drives of other streams.
         name: of the recording.
         seed: of what is drawn by chance.
@@ -104,7 +104,7 @@ def made_up_recording(
         name=name,
         steps=_typed(steps, STEP_COLUMNS),
         updates=_typed(updates, UPDATE_COLUMNS),
-        metrics=_told(drives, evaluated),
+        metrics=_evaluated(drives, evaluated),
         metadata=_metadata(speeds),
         hyperparameters={"discount_factor": 0.99},
         reward_source=None,
@@ -212,26 +212,16 @@ def _turns(track: Track, place: np.ndarray) -> np.ndarray:
     return ((yaw[1] - yaw[0] + np.pi) % (2 * np.pi) - np.pi) / (0.02 * track.length_m)
 
 
-def _told(drives: Sequence[Drive], evaluated: Sequence[float]) -> pd.DataFrame:
+def _evaluated(drives: Sequence[Drive], evaluated: Sequence[float]) -> pd.DataFrame:
     last = {drive.iteration: episode for episode, drive in enumerate(drives)}
     rows = [
-        (
-            "training",
-            0,
-            iteration,
-            last[iteration],
-            trial + 1,
-            "evaluation",
-            completion,
-            completion,
-            10.0,
-            "Off track",
-            np.nan,
-        )
-        for iteration, completion in enumerate(evaluated)
-        for trial in range(5)
+        {"iteration": k, "episode": last[k], "trial": trial, "reward": completion, "completion": completion}
+        for k, completion in enumerate(evaluated)
+        for trial in range(1, 6)
     ]
-    return _typed(pd.DataFrame(rows, columns=list(METRICS_COLUMNS)), METRICS_COLUMNS)
+    more = {"stream": "training", "worker": 0, "phase": "evaluation", "time_s": 10.0}
+    more |= {"episode_status": "Off track", "resets": np.nan}
+    return _typed(pd.DataFrame(rows, columns=list(METRICS_COLUMNS)).assign(**more), METRICS_COLUMNS)
 
 
 def _typed(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:

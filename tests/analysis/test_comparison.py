@@ -21,17 +21,10 @@ from .chart_layers import layers
 
 
 def row(iteration: int, lap_s: float | None = None, **more: object) -> dict:
-    return {
-        **{
-            "iteration": iteration,
-            "env_steps": 1000 * iteration,
-            "wall_clock_s": 6.0 * iteration,
-            "laps": iteration,
-        },
-        **{"completion": 5.0 * iteration, "mean_return": 2.0, "entropy": 1.5, "lap_share": 0.5},
-        **{"best_lap_time_s": lap_s, "mean_lap_time_s": lap_s and lap_s + 1},
-        **more,
-    }
+    found = {"iteration": iteration, "env_steps": 1000 * iteration, "wall_clock_s": 6.0 * iteration}
+    found |= {"laps": iteration, "completion": 5.0 * iteration, "mean_return": 2.0, "entropy": 1.5}
+    laps = {"best_lap_time_s": lap_s, "mean_lap_time_s": lap_s and lap_s + 1}
+    return found | {"lap_share": 0.5, **laps, **more}
 
 
 @pytest.fixture
@@ -50,9 +43,18 @@ def record(tmp_path: Path) -> Callable[..., RunRecord]:
     return make
 
 
-def test_configurations_differ_in_exactly_what_was_overridden(record):
-    found = run_differences([record("a"), record("b", "algorithm.lr=3e-4", "seed=7"), record("c", "seed=7")])
-    assert found == {"seed": [0, 7, 7], "algorithm.lr": [0.001, 0.0003, 0.001]}
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ([[], ["algorithm.lr=3e-4", "seed=7"]], {"seed": [0, 7], "algorithm.lr": [0.001, 0.0003]}),
+        ([["track=Oval_track"], []], {"track": ["Oval_track", "reinvent_base"]}),
+        ([[], ["runs_dir=elsewhere", "tracking=off", "debug=true"]], {}),
+    ],
+    ids=["what was overridden", "tracks by their names", "nothing that the driving depends on"],
+)
+def test_configurations_differ_in_exactly_what_changes_the_driving(record, overrides, expected):
+    records = [record(str(number), *some) for number, some in enumerate(overrides)]
+    assert run_differences(records) == expected
 
 
 def test_a_key_that_only_some_runs_have_shows_nothing_at_the_others(record):
@@ -60,25 +62,9 @@ def test_a_key_that_only_some_runs_have_shows_nothing_at_the_others(record):
     assert found["stopping.episodes"] == [NOTHING, 50]
 
 
-def test_tracks_differ_by_their_names_not_by_their_points(record):
-    found = run_differences([record("a"), record("b", "track=Oval_track")])
-    assert found == {"track": ["reinvent_base", "Oval_track"]}
-
-
-def test_what_does_not_change_the_driving_is_no_difference(record):
-    assert (
-        run_differences([record("a"), record("b", "runs_dir=elsewhere", "tracking=off", "debug=true")]) == {}
-    )
-
-
 def test_a_reward_function_that_was_edited_is_a_difference_though_its_file_has_the_same_name(record):
     found = run_differences([record("a", sha256="1" * 64), record("b", sha256="2" * 64)])
     assert found == {"reward_function.py": ["sha256 11111111", "sha256 22222222"]}
-
-
-def test_figures_of_the_training_are_those_of_its_last_iteration_as_in_the_view(record):
-    assert last_value(record("a"), "completion") == 100.0
-    assert last_value(record("a", lap_s=None), "mean_lap_time_s") is None
 
 
 def test_figures_of_the_best_checkpoint_are_those_of_the_summary(record):
@@ -101,11 +87,13 @@ def test_figures_of_the_best_checkpoint_are_those_of_the_summary(record):
     }
 
 
-def test_lap_times_of_several_tracks_count_only_where_each_has_one(record):
+def test_metrics_of_the_training_are_those_of_its_last_iteration(record):
+    assert last_value(record("a"), "completion") == 100.0
+    assert last_value(record("a", lap_s=None), "mean_lap_time_s") is None
     both = record("a", **{"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 12.0})
     both.rows[-1]["best_lap_time_s"] = None
     assert last_value(both, "best_lap_time_s") == 10.0
-    both.rows[-1]["best_lap_time_s/B"] = None
+    both.rows[-1]["best_lap_time_s/B"] = None  # of several tracks each must have one
     assert last_value(both, "best_lap_time_s") is None
 
 
@@ -123,11 +111,7 @@ def test_long_values_are_shortened_in_their_middle():
     assert len(text) <= 48
     assert text.startswith('{"knots": [0, 1')
     assert text.endswith("98, 99]}")
-    assert (value_text(None), value_text(True), value_text("reinvent_base")) == (
-        "null",
-        "true",
-        "reinvent_base",
-    )
+    assert [value_text(value) for value in (None, True, "reinvent_base")] == ["null", "true", "reinvent_base"]
 
 
 def test_runs_of_any_kind_are_drawn_over_each_other(record):

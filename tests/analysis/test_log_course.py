@@ -43,7 +43,6 @@ def test_a_course_driven_against_its_waypoints_is_turned_around() -> None:
         **{name: steps[name].to_numpy()[::-1] for name in ("X", "Y")}, yaw=steps["yaw"] + 180.0
     )
     view = prepare(replace(recording, steps=back))
-    assert view.course is not None
     assert view.course.reversed
     assert view.steps["skew_deg"].abs().max() < 10.0
 
@@ -54,32 +53,24 @@ def elsewhere(recording: Recording) -> Recording:
     return replace(moon, steps=moon.steps.assign(X=moon.steps["X"] + 100.0))
 
 
-def test_a_course_that_is_nowhere_known_is_named_with_the_option_that_takes_its_route() -> None:
-    found = find_courses(elsewhere(made_up_recording([Drive()])))
-    assert not found.tracks
-    (problem,) = found.problems
+def test_an_unknown_course_is_reported_and_drawn_from_the_recorded_positions() -> None:
+    around = elsewhere(made_up_recording([Drive(offset_m=side) for side in (-0.2, 0.0, 0.2)]))
+    (problem,) = find_courses(around).problems
     assert "'moon' is none of the service's 127 worlds (17.709 m long)" in problem.reason
     assert "`--track ROUTE` takes the file of its route (.npy)" in problem.reason
-
-
-def test_an_unknown_course_is_drawn_from_the_recorded_positions() -> None:
-    around = elsewhere(made_up_recording([Drive(offset_m=side) for side in (-0.2, 0.0, 0.2)]))
     view, known = prepare(around), made_up_course()
-    assert view.course is not None
     assert "drawn from recorded positions" in view.course.title
     assert view.course.length_m == pytest.approx(known.length_m, rel=0.05)
     off_m = view.course.project(known.waypoints + np.array([100.0, 0.0])).offset_m
     assert np.abs(off_m).max() < 0.1
     # Half of the road is not: the car must have come all around.
-    half = elsewhere(made_up_recording([Drive(until=0.5)]))
-    assert prepare(half).course is None
+    assert prepare(elsewhere(made_up_recording([Drive(until=0.5)]))).course is None
 
 
 def test_a_route_given_by_hand_takes_the_place_of_an_unknown_course(tmp_path: Path) -> None:
     route = world_rows("reinvent_base") + np.array([100.0, 0.0] * 3)
     np.save(tmp_path / "moon_route.npy", route)
     view = prepare(elsewhere(made_up_recording([Drive()])), str(tmp_path / "moon_route.npy"))
-    assert view.course is not None
     assert (view.course.name, view.problems) == ("moon_route", ())
     assert view.steps["offset_m"].abs().max() < 1e-3
 
@@ -90,7 +81,6 @@ def test_a_page_has_the_waypoint_numbers_of_its_log_wherever_it_has_any(every: i
     last = len(made_up_course().waypoints) - 1
     steps = recording.steps.assign(closest_waypoint=recording.steps["closest_waypoint"] // every)
     view = prepare(replace(recording, steps=steps))
-    assert view.course is not None
     assert len(view.course.waypoints) == pytest.approx(last / every + 1, abs=2)
     found = view.course.project(steps[["X", "Y"]].to_numpy())
     logged = steps["closest_waypoint"].to_numpy()

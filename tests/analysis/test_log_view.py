@@ -35,16 +35,13 @@ def view() -> LogView:
     )
 
 
-def test_lap_times_are_length_over_speed(view: LogView) -> None:
-    expected = [LENGTH_M / 1.0, LENGTH_M / 2.0, math.nan, math.nan]
-    np.testing.assert_allclose(view.episodes["lap_time_s"], expected, rtol=1e-9)
-    assert view.episodes["complete"].tolist() == [True, True, False, False]
-
-
-def test_statuses_progress_and_waypoints_are_those_of_the_last_rows(view: LogView) -> None:
-    assert view.episodes["status"].tolist() == ["lap_complete", "lap_complete", "off_track", "in_progress"]
-    assert view.episodes["progress"].iloc[3] == pytest.approx(50.0)
-    assert view.episodes["last_waypoint"].iloc[2] == 40
+def test_lap_times_statuses_and_waypoints_are_those_of_the_drives(view: LogView) -> None:
+    table = view.episodes
+    np.testing.assert_allclose(table["lap_time_s"], [LENGTH_M / 1.0, LENGTH_M / 2.0, math.nan, math.nan])
+    assert table["complete"].tolist() == [True, True, False, False]
+    assert table["status"].tolist() == ["lap_complete", "lap_complete", "off_track", "in_progress"]
+    assert table["progress"].iloc[3] == pytest.approx(50.0)
+    assert table["last_waypoint"].iloc[2] == 40
 
 
 def test_iterations_sum_up_their_episodes_and_take_what_the_update_told(view: LogView) -> None:
@@ -59,16 +56,17 @@ def test_iterations_sum_up_their_episodes_and_take_what_the_update_told(view: Lo
     assert first["steps"] + second["steps"] == len(view.steps)
 
 
-def test_evaluations_stand_beside_the_training(view: LogView) -> None:
+def test_evaluations_stand_beside_the_training_and_every_table_has_its_documented_columns(
+    view: LogView,
+) -> None:
     assert view.evaluation_episodes["stream"].tolist() == ["race"]
     assert view.evaluation_episodes["lap_time_s"].tolist() == pytest.approx([LENGTH_M / 2])
     assert set(view.steps["stream"]) == {"training"}
-
-
-def test_every_documented_column_is_there_and_no_other(view: LogView) -> None:
-    assert list(view.steps) == [*STEP_COLUMNS, *DERIVED_COLUMNS]
-    assert list(view.episodes) == list(EPISODE_COLUMNS)
-    assert list(view.iterations) == list(ITERATION_COLUMNS)
+    for some in (view, prepare(made_up_recording([Drive()]))):
+        assert list(some.steps) == [*STEP_COLUMNS, *DERIVED_COLUMNS]
+        assert list(some.episodes) == list(EPISODE_COLUMNS)
+        assert list(some.iterations) == list(ITERATION_COLUMNS)
+        assert list(some.evaluation_episodes) == [*EPISODE_COLUMNS, "stream"]
 
 
 def test_on_the_centre_line_at_constant_speed_nothing_accelerates_or_slides_away(view: LogView) -> None:
@@ -84,6 +82,8 @@ def test_on_the_centre_line_at_constant_speed_nothing_accelerates_or_slides_away
 def test_a_car_that_starts_elsewhere_has_the_lap_position_of_the_course(view: LogView) -> None:
     rows = view.steps[view.steps["episode"] == 1]
     np.testing.assert_allclose(rows["lap_position"], (0.25 + rows["progress"] / 100) % 1.0, atol=1e-6)
+    left = prepare(made_up_recording([Drive(offset_m=0.2)])).steps["offset_m"]
+    assert left.median() == pytest.approx(0.2, abs=0.01)
 
 
 def test_speeding_up_is_acceleration_and_slowing_down_is_braking() -> None:
@@ -93,11 +93,6 @@ def test_speeding_up_is_acceleration_and_slowing_down_is_braking() -> None:
     assert steps.loc[place.between(0.39, 0.42), "acceleration_mps2"].max() > 5.0
     assert steps.loc[place.between(0.59, 0.63), "braking_mps2"].max() > 5.0
     assert steps.loc[place.between(0.39, 0.42), "braking_mps2"].max() < 0.5
-
-
-def test_left_of_the_centre_line_is_a_positive_offset() -> None:
-    steps = prepare(made_up_recording([Drive(offset_m=0.2)])).steps
-    assert steps["offset_m"].median() == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_tail_that_comes_round_slides_to_its_side_and_rolling_wheels_do_not() -> None:
@@ -135,9 +130,3 @@ def test_without_steps_there_is_nothing_to_prepare() -> None:
     recording = made_up_recording([Drive()])
     with pytest.raises(BadInput, match="no control steps"):
         prepare(replace(recording, steps=recording.steps.iloc[:0]))
-
-
-def test_a_training_without_evaluations_has_empty_tables_with_all_columns() -> None:
-    view = prepare(made_up_recording([Drive()]))
-    assert len(view.evaluation_episodes) == 0
-    assert list(view.evaluation_episodes) == [*EPISODE_COLUMNS, "stream"]

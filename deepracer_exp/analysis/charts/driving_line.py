@@ -202,16 +202,16 @@ def acceleration_map(view: LogView) -> Chart | None:
     rows = rows[rows["steps"] > STARTING_STEPS]
     if view.course is None or not len(rows):
         return None
-    grid = Grid.over(view.course, 8_000)
     change = rows["acceleration_mps2"] - rows["braking_mps2"]
-    mean = means(grid.of(rows["X"], rows["Y"]), change, grid.count, LEAST_STEPS)
+    scale = "change of speed, m/s²"
+    cells = Grid.over(view.course, 8_000).means(rows, change, scale, LEAST_STEPS, diverging=True)
     return Chart(
         name="acceleration_map",
         title="Where the car accelerates and where it brakes",
         caption="Mean change of the speed along the track in each cell, in the last third of the iterations, without "
         "standing starts: positive where the car gets faster. A car should brake before a bend and accelerate in its "
         "second half; braking on a straight is time lost.",
-        rows=[[map_panel(view.course, [grid.cells(mean, "change of speed, m/s²", diverging=True)])]],
+        rows=[[map_panel(view.course, [cells])]],
     )
 
 
@@ -221,9 +221,8 @@ def slide_map(view: LogView) -> Chart | None:
     if view.course is None or not len(rows):
         return None
     slide = rows["slide_deg"].abs().where(rows["track_speed_mps"] >= SLIDE_LEAST_MPS)
-    grid = Grid.over(view.course, 8_000)
-    mean = means(grid.of(rows["X"], rows["Y"]), slide, grid.count, LEAST_STEPS)
-    if not np.isfinite(mean).any():
+    cells = Grid.over(view.course, 8_000).means(rows, slide, "slide, degrees", LEAST_STEPS)
+    if not np.isfinite(cells.z).any():
         return None
     return Chart(
         name="slide_map",
@@ -231,7 +230,7 @@ def slide_map(view: LogView) -> Chart | None:
         caption="Mean angle between the direction in which the rear axle moved and the heading of the car, in the "
         "last third of the iterations; 0 is rolling without slip. Bright cells are bends taken at the limit of grip: "
         "only another line can be faster there.",
-        rows=[[map_panel(view.course, [grid.cells(mean, "slide, degrees")])]],
+        rows=[[map_panel(view.course, [cells])]],
     )
 
 

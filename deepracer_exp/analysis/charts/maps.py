@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 from shapely import get_coordinates, get_parts, get_rings
 
-from deepracer_exp.analysis.statistics import Values
+from deepracer_exp.analysis.statistics import Values, means
 from deepracer_exp.tracks.track import Track
 
 from .figure import Layer, Panel, colored_points, heatmap, line, note
@@ -69,6 +70,12 @@ class Grid:
     def count(self) -> int:
         """Number of cells."""
         return self.columns * self.rows
+
+    def means(
+        self, rows: pd.DataFrame, values: ArrayLike, scale: str, least: int = 1, **more: Any
+    ) -> go.Heatmap:
+        """Return the means of values in the cells of the rows' `X` and `Y` as the layer of a map."""
+        return self.cells(means(self.of(rows["X"], rows["Y"]), values, self.count, least), scale, **more)
 
     def cells(self, values: Values, scale: str, **more: Any) -> go.Heatmap:
         """Return values (count,) as the layer of a map; see `heatmap`."""

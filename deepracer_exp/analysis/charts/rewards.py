@@ -80,8 +80,7 @@ def value_map(view: LogView) -> Chart | None:
     if view.course is None or not len(rows):
         return None
     future = rows["discounted_future_reward"].to_numpy(np.float64)
-    grid = Grid.over(view.course, 12_000)
-    value = means(grid.of(rows["X"], rows["Y"]), future, grid.count)
+    cells = Grid.over(view.course, 12_000).means(rows, future, "future reward, discounted")
     n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), _ROWS)
     low, high = quantiles(waypoint[part], future[part], n, (0.1, 0.9))
     layers = [
@@ -96,7 +95,7 @@ def value_map(view: LogView) -> Chart | None:
         "it. Dark places lead off the road or are close to the end of the lap, and the spread at a waypoint is what "
         "good driving is worth there.",
         rows=[
-            [map_panel(view.course, [grid.cells(value, "future reward, discounted")])],
+            [map_panel(view.course, [cells])],
             [waypoint_panel(layers, "future reward", n)],
         ],
     )
