@@ -33,11 +33,7 @@ def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def best_trial(study: optuna.Study) -> FrozenTrial:
-    """Return the winner: the best on fresh laps, or else the best complete trial.
-
-    Raises:
-        BadInput: no trial is complete.
-    """
+    """Return the winner: the best on fresh laps, or else the best complete trial."""
     complete = complete_trials(study)
     if not complete:
         raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
@@ -46,32 +42,20 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
 
 
 def best_values(study: optuna.Study) -> list[float]:
-    """Return the values of the best trial, on fresh laps if it drove some.
-
-    Raises:
-        BadInput: no trial is complete.
-    """
+    """Return the values of the best trial, on fresh laps if it drove some."""
     trial = best_trial(study)
     again = next((one for one in reranked(study) if one["trial"] == trial.number), None)
     return list(trial.values if again is None else again["values"])
 
 
 def best_shown(study: optuna.Study) -> str:
-    """Return the values of the best trial as text, with "on fresh laps" if they are from there.
-
-    Raises:
-        BadInput: no trial is complete.
-    """
+    """Return the values of the best trial as text, with "on fresh laps" if they are from there."""
     number, values = best_trial(study).number, shown_values(objectives_of(study), best_values(study))
     return values + " on fresh laps" * any(one["trial"] == number for one in reranked(study))
 
 
 def best_line(study: optuna.Study) -> str:
-    """Return the command that trains with the winning values, quoted for a shell.
-
-    Raises:
-        BadInput: no trial is complete.
-    """
+    """Return the command that trains with the winning values, quoted for a shell."""
     overrides = [str(override) for override in best_trial(study).user_attrs.get("overrides", ())]
     if parent := study.user_attrs.get("parent_run"):
         run, *checkpoint = parent
@@ -80,11 +64,7 @@ def best_line(study: optuna.Study) -> str:
 
 
 def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
-    """Return the folder of the best run, over all seeds, of the best trial.
-
-    Args:
-        study: with the runs of its trials.
-        runs_dir: where runs are; None: where the study says.
+    """Return the folder of the best run, over all seeds, of the best trial; `runs_dir`: where the study says.
 
     Raises:
         BadInput: no trial is complete, or the folder is neither where it was nor in `runs_dir`.

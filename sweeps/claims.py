@@ -48,7 +48,6 @@ _table = sa.Table(
     sa.Column("slot", sa.Integer, primary_key=True, autoincrement=False),
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("owner", sa.String(255), nullable=False),
-    sa.Column("previous_owner", sa.String(255)),
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("expires_s", sa.Double, nullable=False),
     sa.Column("trial_id", sa.Integer),
@@ -90,7 +89,6 @@ class Claim:
     attempt: int
     """1 for the first owner, one more for each takeover."""
     owner: str
-    previous_owner: str | None
     state: str
     """`claimed`, `settled` (has its result) or `told` (Optuna has the result, too)."""
     result: TrialResult | None
@@ -110,12 +108,7 @@ class TrialClaims:
     """
 
     def __init__(self, engine: sa.Engine, study: str):
-        """Create the table if it is missing.
-
-        Args:
-            engine: of the study's database.
-            study: its name.
-        """
+        """Create the table in the study's database if it is missing."""
         self.study = study
         self._engine = engine
         self._now = sa.literal_column(_CLOCKS[engine.dialect.name], sa.Double)
@@ -132,15 +125,7 @@ class TrialClaims:
         """Claim a trial for an owner, who may hold one at a time.
 
         In this order: the trial that it holds already (the answer to its first claim was lost), one whose lease has
-        run out, a new one.
-
-        Args:
-            owner: unique name of a worker.
-            total: number of trials of the study.
-            lease_s: how long the claim is valid without renewal, seconds.
-
-        Returns:
-            None if no trial is free now.
+        run out, a new one of the study's `total`; None if no trial is free now.
         """
         lost = 0
         while True:
@@ -162,12 +147,8 @@ class TrialClaims:
     def renew(self, claim: Claim, lease_s: float, progress: Mapping[str, Any] | None = None) -> bool:
         """Restart the lease of a claim; return False if another worker has taken it over.
 
-        A lease that has run out can still be renewed until another worker takes the trial over.
-
-        Args:
-            claim: held by the caller.
-            lease_s: how long the claim is valid from now on, seconds.
-            progress: how far the trial is, for the live view; None: unchanged.
+        A lease that has run out can still be renewed until another worker takes the trial over. `progress` is for the
+        live view; None: unchanged.
         """
         more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
         return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more}, (_CLAIMED,))
@@ -209,10 +190,8 @@ class TrialClaims:
     def release(self, owner: str, *, is_lost: bool = False) -> int:
         """End the leases of an owner that is gone or about to end; return their number.
 
-        Args:
-            owner: of the leases.
-            is_lost: its process died unasked, perhaps because of its trial: the attempts at its run stay counted.
-                Otherwise they start again from zero.
+        If its process died unasked (`is_lost`), perhaps because of its trial, the attempts at its run stay counted;
+        otherwise they start again from zero.
         """
         where = (_of.owner == owner, _of.state == _CLAIMED, _of.expires_s > _RELEASED)
         with self._engine.begin() as connection:
@@ -277,12 +256,7 @@ class TrialClaims:
             return None
 
     def _take_over(self, seen: sa.Row[Any], owner: str, lease_s: float) -> Claim | None:
-        taken = {
-            _of.owner: owner,
-            _of.previous_owner: seen.owner,
-            _of.attempt: seen.attempt + 1,
-            _of.expires_s: self._now + lease_s,
-        }
+        taken = {_of.owner: owner, _of.attempt: seen.attempt + 1, _of.expires_s: self._now + lease_s}
         as_seen = (
             _of.slot == seen.slot,
             _of.attempt == seen.attempt,
@@ -319,14 +293,7 @@ class Lease:
     """
 
     def __init__(self, claims: TrialClaims, claim: Claim, lease_s: float, patience_s: float):
-        """Hold a fresh claim.
-
-        Args:
-            claims: of the study.
-            claim: just made.
-            lease_s: how long it is valid without renewal, seconds.
-            patience_s: how long to wait for a database that does not answer, seconds.
-        """
+        """Hold a fresh claim, valid for `lease_s` seconds without renewal."""
         self.claim = claim
         self._claims, self._lease_s, self._patience_s = claims, lease_s, patience_s
         self._progress: Mapping[str, Any] = {}
@@ -361,12 +328,7 @@ class Lease:
             raise TakenOver(f"trial {self.claim.index} was taken over")
 
     def held(self, write: Callable[[], bool]) -> None:
-        """Make a write that returns False if the claim is lost.
-
-        Raises:
-            TakenOver: it returned False.
-            RunFailed: the database has not answered for too long.
-        """
+        """Make a write that returns False if the claim is lost; raise as `confirm` does."""
         if not patiently(write, self._patience_s):
             self._lost = True
         self.confirm()
@@ -436,7 +398,6 @@ def _as_claim(row: sa.Row[Any]) -> Claim:
         index=row.slot,
         attempt=row.attempt,
         owner=row.owner,
-        previous_owner=row.previous_owner,
         state=row.state,
         result=result,
         trial_id=row.trial_id,

@@ -11,7 +11,8 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.training.signals import Interruption
 
 from .claims import Claim, TrialClaims
-from .launcher import Launcher, WorkerProcess
+from .launcher import LocalLauncher, LocalWorker
+from .ray_launcher import RayLauncher, RayWorker
 from .storage import Storage, patiently
 from .view import SweepView
 from .worker_config import WorkerConfig, is_gone
@@ -32,22 +33,14 @@ class Driver:
         self,
         config: WorkerConfig,
         storage: Storage,
-        launcher: Launcher,
+        launcher: LocalLauncher | RayLauncher,
         view: SweepView,
         on_ended: OnEnded,
     ):
-        """Start nothing yet.
-
-        Args:
-            config: of the workers.
-            storage: of the study, which exists.
-            launcher: starts them.
-            view: has been entered.
-            on_ended: called with all claims whenever trials have ended.
-        """
+        """Start nothing yet; `on_ended` is called with all claims whenever trials have ended."""
         self._config, self._launcher, self._view, self._on_ended = config, launcher, view, on_ended
         self._claims = TrialClaims(storage.engine, config.study)
-        self._running: list[WorkerProcess] = []
+        self._running: list[LocalWorker | RayWorker] = []
         self._all_made = False
         """A worker has found nothing left to do."""
         self._losses = 0

@@ -6,7 +6,6 @@ and with one trace per trial, which is slow for hundreds.
 
 import html
 import math
-import random
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
@@ -16,7 +15,7 @@ from typing import Any
 import optuna
 import plotly.graph_objects as go
 from optuna.distributions import CategoricalDistribution
-from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 from optuna.visualization import (
     plot_optimization_history,
@@ -25,7 +24,7 @@ from optuna.visualization import (
     plot_slice,
 )
 
-from deepracer_exp.analysis.charts.style import CATEGORIES, GRID, INK, NARROW_WIDTH, SPINE, base_layout
+from deepracer_exp.analysis.charts.style import CATEGORIES, GRID, NARROW_WIDTH, SPINE, base_layout
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS, read_metrics
 
@@ -36,7 +35,6 @@ from .objectives import MEASURES, NONE, objectives_of
 FEWEST_COMPLETE = 20
 """Complete trials below which importance is chance: the best quarter would be fewer than five trials."""
 _EVALUATOR = PedAnovaImportanceEvaluator(target_quantile=0.25)
-_RESAMPLES = 40
 _MOST_PARAMETERS = 12
 _COLUMNS = 4
 _PANEL, _GAP = 210.0, 62.0
@@ -44,8 +42,8 @@ _PANEL, _GAP = 210.0, 62.0
 _FAR, _NEAR = 5.0, 0.25
 """A trial is off the axis if it is farther from the best than this many times the median is, and worse than the best
 by more than this share of it."""
-_MOST_POINTS = 15_000  # of all entropy curves together: 0.3 MB of the page
-_FEWEST_POINTS = 12  # of a curve
+_MOST_POINTS, _FEWEST_POINTS = 15_000, 12
+"""Of all entropy curves together (0.3 MB of the page), and of one curve."""
 
 Target = Callable[[FrozenTrial], float]
 
@@ -57,42 +55,37 @@ def figures(study: optuna.Study) -> dict[str, go.Figure]:
         By name: `history`, `pareto` (several objectives), `importance`, `slice`, `parallel`, `entropy`. With several
         objectives `history`, `importance` and `slice` are one each, such as `slice-lap_time`, and `pareto` one per
         pair.
-
-    Raises:
-        BadInput: the study was not made by a sweep.
     """
     objectives = objectives_of(study)
     trials = study.get_trials(deepcopy=False)
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    drawn: dict[str, go.Figure | None] = {}
+    drawn: dict[str, go.Figure] = {}
     if complete:
         keys = short_keys(sorted({key for trial in complete for key in trial.params}))
-        several = len(objectives) > 1
-        shares: dict[str, float] = {}
+        shown = list(keys)[:_MOST_PARAMETERS]
         for at, objective in enumerate(objectives):
-            target = _target(at) if several else None
-            name = f"-{objective}" if several else ""
-            title = f": {MEASURES[objective].words}" if several else ""
-            drawn[f"history{name}"] = _history(study, complete, objective, at, target, title)
+            several = len(objectives) > 1
+            name, title = (f"-{objective}", f": {MEASURES[objective].words}") if several else ("", "")
+            axis = _value_axis(complete, objective, at)
+            drawn[f"history{name}"] = _history(
+                study, objective, _target(at) if several else None, axis, title
+            )
             if len(complete) >= FEWEST_COMPLETE and len(keys) > 1:
                 # PED-ANOVA takes low values for good.
-                low_is_good = _target(at, 1.0 if MEASURES[objective].minimize else -1.0) if several else None
-                own = _importances(study, low_is_good)
-                drawn[f"importance{name}"] = _importance_bars(study, complete, own, keys, low_is_good, title)
-                shares = {key: max(share, shares.get(key, 0.0)) for key, share in own.items()}
-        shown = sorted(keys, key=lambda key: (-shares.get(key, 0.0), key))[:_MOST_PARAMETERS]
-        for at, objective in enumerate(objectives) if shown else ():
-            name, title = (f"-{objective}", f": {MEASURES[objective].words}") if several else ("", "")
-            drawn[f"slice{name}"] = _slices(study, complete, shown, keys, objective, at, title)
+                sign = 1.0 if MEASURES[objective].minimize else -1.0
+                importance, ranked = _importance(study, keys, _target(at, sign) if several else None, title)
+                if importance is not None:
+                    drawn[f"importance{name}"] = importance
+                shown = ranked[:_MOST_PARAMETERS] if at == 0 else shown
+            if keys:
+                drawn[f"slice{name}"] = _slices(study, shown, keys, _target(at), objective, axis, title)
         for pair in combinations(range(len(objectives)), 2):
-            name = "-".join(
-                ["pareto", *(objectives[at] for at in pair)] if len(objectives) > 2 else ["pareto"]
-            )
-            drawn[name] = _pareto(study, complete, objectives, pair)
-        if shown and len(complete) > 1:
+            names = [objectives[at] for at in pair] if len(objectives) > 2 else []
+            drawn["-".join(["pareto", *names])] = _pareto(study, complete, objectives, pair)
+        if keys and len(complete) > 1:
             drawn["parallel"] = _parallel(complete, shown, keys, objectives)
-    drawn["entropy"] = _entropy_curves(study, trials)
-    return {name: figure for name, figure in drawn.items() if figure is not None}
+    entropy = _entropy_curves(study, trials)
+    return drawn if entropy is None else drawn | {"entropy": entropy}
 
 
 def narrowed(figure: go.Figure) -> go.Figure:
@@ -105,12 +98,11 @@ def narrowed(figure: go.Figure) -> go.Figure:
     body = layout.height - layout.margin.t - layout.margin.b
     if len(_panels(figure)) > 1:
         body = _arrange(narrow, _panels(figure), 1)
-    narrow.update_layout(
+    return narrow.update_layout(
         height=round(head + body + foot),
         margin={"l": 62, "r": 12, "t": head, "b": foot},
         legend={"orientation": "h", "x": 0, "y": -layout.margin.b / body, "yanchor": "top"},
     )
-    return narrow
 
 
 def least_width(figure: go.Figure) -> int:
@@ -122,10 +114,6 @@ def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
     """Return the ends of an axis that shows the better trials well; far worse ones lie off it.
 
     A trial without a lap has ten times the seconds of one with laps, beside which all laps would look the same.
-
-    Args:
-        values: of the complete trials, one at least.
-        minimize: whether less is better.
     """
     sign = 1.0 if minimize else -1.0
     costs = sorted(sign * value for value in values)
@@ -154,9 +142,7 @@ def _styled(figure: go.Figure, title: str, height: float, *, legend: bool = True
         colorway=CATEGORIES,
     )
     axes = {"gridcolor": GRID, "zeroline": False, "linecolor": SPINE, "title": {"font": {"size": 13}}}
-    figure.update_xaxes(**axes)
-    figure.update_yaxes(**axes)
-    return figure
+    return figure.update_xaxes(**axes).update_yaxes(**axes)
 
 
 def _value_axis(complete: Sequence[FrozenTrial], objective: str, at: int) -> dict[str, Any]:
@@ -173,30 +159,23 @@ def _panels(figure: go.Figure) -> list[str]:
 
 def _arrange(figure: go.Figure, panels: Sequence[str], columns: int) -> float:
     """Arrange panels in a grid; return its height, pixels."""
-    rows = math.ceil(len(panels) / columns)
-    body = rows * (_PANEL + _GAP) - _GAP
+    body = math.ceil(len(panels) / columns) * (_PANEL + _GAP) - _GAP
     for at, number in enumerate(panels):
         row, column = divmod(at, columns)
         top = 1 - row * (_PANEL + _GAP) / body
         domain = column / columns + 0.03 * (column > 0), (column + 1) / columns - 0.01 * (columns > 1)
-        figure.layout[f"yaxis{number}"].update(domain=(max(0.0, top - _PANEL / body), top))
-        figure.layout[f"yaxis{number}"].update(showticklabels=column == 0)
+        rows = {"domain": (max(0.0, top - _PANEL / body), top), "showticklabels": column == 0}
+        figure.layout[f"yaxis{number}"].update(rows)
         figure.layout[f"xaxis{number}"].update(domain=domain)
     return body
 
 
 def _history(
-    study: optuna.Study,
-    complete: Sequence[FrozenTrial],
-    objective: str,
-    at: int,
-    target: Target | None,
-    title: str,
+    study: optuna.Study, objective: str, target: Target | None, axis: Mapping[str, Any], title: str
 ) -> go.Figure:
     figure = plot_optimization_history(study, target=target, target_name=MEASURES[objective].title)
     _styled(figure, f"Values of the complete trials{title}", 440)
-    figure.update_xaxes(title_text="trial", tickformat="d")
-    return figure.update_yaxes(**_value_axis(complete, objective, at))
+    return figure.update_xaxes(title_text="trial", tickformat="d").update_yaxes(**axis)
 
 
 def _pareto(
@@ -213,73 +192,32 @@ def _pareto(
     return figure.update_yaxes(**_value_axis(complete, names[1], pair[1]))
 
 
-def _importances(study: optuna.Study, target: Target | None) -> dict[str, float]:
+def _importance(
+    study: optuna.Study, keys: Mapping[str, str], target: Target | None, title: str
+) -> tuple[go.Figure | None, list[str]]:
+    """Return the bars, None if all trials have the same values, and the keys, the most important first."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of any target: that low values are taken for good
-        return get_param_importances(study, evaluator=_EVALUATOR, target=target)
-
-
-def _importance_bars(
-    study: optuna.Study,
-    complete: Sequence[FrozenTrial],
-    shares: Mapping[str, float],
-    keys: Mapping[str, str],
-    target: Target | None,
-    title: str,
-) -> go.Figure | None:
-    """Draw importances with 90 per cent intervals from as many trials drawn from these, with replacement."""
-    if not any(shares.values()):  # all trials have the same values
-        return None
-    draws = []
-    for seed in range(_RESAMPLES):
-        again = optuna.create_study(directions=study.directions)
-        again.add_trials(random.Random(seed).choices(complete, k=len(complete)))
-        draws.append(_importances(again, target))
-    shown = list(shares)[:_MOST_PARAMETERS]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # as in `_importances`
         figure = plot_param_importances(study, evaluator=_EVALUATOR, target=target)
-    _styled(figure, f"Which parameters mattered most{title}", 150 + 34 * len(shown), legend=False)
     (bars,) = figure.data
-    kept = [at for at, key in enumerate(bars.y) if key in shown]
-    names = [bars.y[at] for at in kept]
-    ends = {key: sorted(draw.get(key, 0.0) for draw in draws) for key in names}
-    low = {key: ends[key][_RESAMPLES // 20] for key in names}
-    high = {key: ends[key][-1 - _RESAMPLES // 20] for key in names}
-    bars.update(
-        x=[shares[key] for key in names],
-        y=[_plain(keys[key], 40) for key in names],
-        text=[f" {shares[key]:.0%} ({low[key]:.0%} to {high[key]:.0%})" for key in names],
-        textposition="none",
-        hovertemplate=[f"{_plain(key)}: %{{text}}<extra></extra>" for key in names],
-        error_x={
-            "type": "data", "symmetric": False, "color": INK, "thickness": 1.2, "width": 4,
-            "array": [max(high[key] - shares[key], 0.0) for key in names],
-            "arrayminus": [max(shares[key] - low[key], 0.0) for key in names],
-        },
-    )  # fmt: skip
-    for label, text in zip(bars.y, bars.text, strict=True):
-        figure.add_annotation(x=1, xref="x domain", xanchor="right", y=label, text=text, showarrow=False)
-    ticks = [at / 5 for at in range(6)]
-    figure.update_xaxes(
-        title_text="importance for being in the best quarter",
-        range=[0, 1.28],
-        tickvals=ticks,
-        tickformat=".0%",
-    )
-    return figure.update_yaxes(title_text="", automargin=True, ticksuffix="  ")
+    ranked = sorted(keys, key=dict(zip(bars.y, bars.x, strict=True)).__getitem__, reverse=True)
+    bars.update(y=[_plain(keys[key], 40) for key in bars.y], hovertemplate="%{y}: %{x:.0%}<extra></extra>")
+    _styled(figure, f"Which parameters mattered most{title}", 150 + 34 * len(keys), legend=False)
+    figure.update_xaxes(title_text="importance for being in the best quarter", tickformat=".0%")
+    figure.update_yaxes(title_text="", automargin=True, ticksuffix="  ")
+    return figure if any(bars.x) else None, ranked
 
 
 def _slices(
     study: optuna.Study,
-    complete: Sequence[FrozenTrial],
     shown: Sequence[str],
     keys: Mapping[str, str],
+    target: Target,
     objective: str,
-    at: int,
+    axis: Mapping[str, Any],
     title: str,
 ) -> go.Figure:
-    figure = plot_slice(study, list(shown), target=_target(at), target_name=MEASURES[objective].title)
+    figure = plot_slice(study, list(shown), target=target, target_name=MEASURES[objective].title)
     panels = _panels(figure)
     _styled(figure, f"Each parameter against the value{title}", _PANEL, legend=False)
     figure.update_traces(marker={"size": 7, "colorscale": "Viridis", "line": {"width": 0}})
@@ -287,10 +225,10 @@ def _slices(
     figure.update_layout(height=round(body + 120), margin={"r": 90})
     figure.update_xaxes(tickangle=0, nticks=4, exponentformat="power")
     figure.for_each_xaxis(
-        lambda axis: axis.update(range=[-0.5, len(axis.categoryarray) - 0.5]), {"type": "category"}
+        lambda one: one.update(range=[-0.5, len(one.categoryarray) - 0.5]), {"type": "category"}
     )
-    figure.for_each_xaxis(lambda axis: axis.title.update(text=_plain(keys[axis.title.text], 40)))
-    figure.update_yaxes(**_value_axis(complete, objective, at) | {"title_text": ""})
+    figure.for_each_xaxis(lambda one: one.title.update(text=_plain(keys[one.title.text], 40)))
+    figure.update_yaxes({**axis, "title_text": ""})
     for number in panels[::_COLUMNS]:
         figure.layout[f"yaxis{number}"].title.text = MEASURES[objective].label
     return figure
@@ -302,11 +240,11 @@ def _parallel(
     """Draw every complete trial as a line through its parameters, coloured by its first objective."""
     axes = []
     for at, objective in enumerate(objectives):
-        measure = MEASURES[objective]
-        low, high = usual_range([trial.values[at] for trial in complete], measure.minimize)
+        low, high = _value_axis(complete, objective, at)["range"]
         values = [_short(min(max(trial.values[at], low), high)) for trial in complete]
-        axes.append({"label": measure.label, "values": values, "range": (low, high)})
+        axes.append({"label": MEASURES[objective].label, "values": values, "range": (low, high)})
     axes += [_parameter_axis(key, keys[key], complete) for key in shown]
+    crowded = len(axes) > 7
     lines = go.Parcoords(
         dimensions=axes,
         line={
@@ -316,23 +254,23 @@ def _parallel(
             "showscale": True,
             "colorbar": {"title": {"text": axes[0]["label"], "side": "right"}, "thickness": 14},
         },
-        labelangle=-12 if len(axes) > 7 else 0,
+        labelangle=-12 if crowded else 0,
         unselected={"line": {"opacity": 0.06}},
     )
     figure = _styled(go.Figure(lines), "Every complete trial a line: drag along an axis to choose", 480)
-    return figure.update_layout(margin={"l": 90, "r": 40, "t": 130 if len(axes) > 7 else 110, "b": 30})
+    return figure.update_layout(margin={"l": 90, "r": 40, "t": 130 if crowded else 110, "b": 30})
 
 
 def _parameter_axis(key: str, label: str, trials: Sequence[FrozenTrial]) -> dict[str, Any]:
     """Return an axis of parallel coordinates; a trial without the parameter crosses it at a dash."""
     distribution: Any = next(trial.distributions[key] for trial in trials if key in trial.params)
     params = [trial.params.get(key) for trial in trials]
+    lacking = [NONE] * (None in params)
     axis: dict[str, Any] = {"label": _plain(label, 40)}
     if isinstance(distribution, CategoricalDistribution):
         choices = [one for one in distribution.choices if one in params]
-        ticks = [NONE] * (None in params) + [_plain(one, 24) for one in choices]
-        first = len(ticks) - len(choices)
-        places = [0 if one is None else first + choices.index(one) for one in params]
+        ticks = lacking + [_plain(one, 24) for one in choices]
+        places = [0 if one is None else len(lacking) + choices.index(one) for one in params]
         return axis | {"values": places, "tickvals": list(range(len(ticks))), "ticktext": ticks}
     scale: Callable[[float], float] = math.log10 if distribution.log else float
     low, high = scale(distribution.low), scale(distribution.high)
@@ -340,9 +278,10 @@ def _parameter_axis(key: str, label: str, trials: Sequence[FrozenTrial]) -> dict
     texts = [parameter(10**end if distribution.log else end) for end in ends]
     below = low - 0.12 * (high - low or 1.0)
     axis["values"] = [below if one is None else _short(scale(one)) for one in params]
-    if None in params:
-        return axis | {"range": (below, high), "tickvals": [below, *ends], "ticktext": [NONE, *texts]}
-    return axis | {"range": (low, high if high > low else low + 1.0), "tickvals": ends, "ticktext": texts}
+    top = high if high > low else low + 1.0
+    if lacking:
+        return axis | {"range": (below, top), "tickvals": [below, *ends], "ticktext": [NONE, *texts]}
+    return axis | {"range": (low, top), "tickvals": ends, "ticktext": texts}
 
 
 def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Figure | None:
@@ -352,20 +291,21 @@ def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Fi
         return None
     every = [row for runs in rows.values() for run in runs for row in run]
     column = "entropy_share" if any(row.get("entropy_share") is not None for row in every) else "entropy"
-    most = max(_FEWEST_POINTS, _MOST_POINTS // sum(map(len, rows.values())))
     known = [trial for trial in trials if trial.number in rows]
     figure = go.Figure()
     for outcome, style in OUTCOMES.items():
-        if some := [trial for trial in known if outcome_of(trial) == outcome]:
+        if some := [rows[trial.number] for trial in known if outcome_of(trial) == outcome]:
+            numbers = [trial.number for trial in known if outcome_of(trial) == outcome]
             line = {"color": style.color, "dash": style.dash, "width": 1.3}
-            look = {"name": outcome_words(outcome), "line": line, "opacity": 0.75}
-            figure.add_trace(_curves(some, rows, column, most, look))
+            most = max(_FEWEST_POINTS, _MOST_POINTS // sum(map(len, rows.values())))
+            curves = _curves(dict(zip(numbers, some, strict=True)), column, most)
+            figure.add_trace(curves.update(name=outcome_words(outcome), line=line, opacity=0.75))
     if any(trial.state == TrialState.COMPLETE for trial in trials):
         best = best_trial(study)
         if best.number in rows:
-            look = {"name": f"best: trial {best.number}"}
-            look |= {"line": {"color": OUTCOMES[outcome_of(best)].color, "width": 4.5}}
-            figure.add_trace(_curves([best], rows, column, most, look))
+            line = {"color": OUTCOMES[outcome_of(best)].color, "width": 4.5}
+            curves = _curves({best.number: rows[best.number]}, column, _MOST_POINTS)
+            figure.add_trace(curves.update(name=f"best: trial {best.number}", line=line))
     _styled(figure, "Entropy of the policies, by outcome of their trials", 460)
     figure.update_xaxes(title_text="control steps", rangemode="tozero")
     if column == "entropy_share":
@@ -373,26 +313,20 @@ def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Fi
     return figure.update_yaxes(title_text="entropy, nats")
 
 
-def _curves(
-    trials: Sequence[FrozenTrial],
-    rows: Mapping[int, list[list[dict[str, Any]]]],
-    column: str,
-    most: int,
-    look: Mapping[str, Any],
-) -> go.Scatter:
+def _curves(rows: Mapping[int, list[list[dict[str, Any]]]], column: str, most: int) -> go.Scatter:
     """Return the curves of trials as one trace with gaps between them, since hundreds of traces would be slow."""
     x: list[int | None] = []
     y: list[float | None] = []
     numbers: list[int] = []
-    for trial in trials:
-        for run in rows[trial.number]:
+    for number, runs in rows.items():
+        for run in runs:
             known = [row for row in run if row.get(column) is not None and math.isfinite(row[column])]
             some = thinned(known, most)
             x += [*(int(row["env_steps"]) for row in some), None]
             y += [*(round(row[column], 4) for row in some), None]
-            numbers += [trial.number] * (len(some) + 1)
+            numbers += [number] * (len(some) + 1)
     hover = "<b>Trial %{customdata}</b><br>%{x:.3s} steps: %{y:.3f}<extra></extra>"
-    return go.Scatter(x=x, y=y, mode="lines", customdata=numbers, hovertemplate=hover, **look)
+    return go.Scatter(x=x, y=y, mode="lines", customdata=numbers, hovertemplate=hover)
 
 
 def _rows(study: optuna.Study, trial: FrozenTrial) -> list[list[dict[str, Any]]]:

@@ -1,14 +1,12 @@
 """Labels for people: how trials ended, with colours; short names of keys; numbers, steps and durations."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from optuna.trial import FrozenTrial, TrialState
 
 
-@dataclass(frozen=True)
-class OutcomeStyle:
+class OutcomeStyle(NamedTuple):
     """How trials with one outcome are drawn."""
 
     color: str
@@ -26,9 +24,7 @@ OUTCOMES: Mapping[str, OutcomeStyle] = {
     "collapsed": OutcomeStyle("#D55E00", "dash", "entropy fell before it could drive"),
     "not_learning": OutcomeStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
     "median": OutcomeStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
-    "percentile": OutcomeStyle(
-        "#882255", "dot", "worse than the given share of the others at the same point"
-    ),
+    "percentile": OutcomeStyle("#882255", "dot", "not among the best share of the others at the same point"),
     "hyperband": OutcomeStyle("#A060E0", "dashdot", "lost its bracket"),
     "wilcoxon": OutcomeStyle("#332288", "longdash", "lost to the best trial, seed by seed"),
     "pruned": OutcomeStyle("#A04080", "solid", "worse than the others"),
@@ -69,8 +65,7 @@ def parameter(value: Any) -> str:
     """Return a parameter's value for a table, short: ``0.00031``, ``3.1e-5``, ``1200``, ``mlp``."""
     if not isinstance(value, float):
         return str(value)
-    text = f"{value:.3g}" if abs(value) < 1000 else f"{value:.4g}"
-    return text.replace("e-0", "e-")
+    return (f"{value:.3g}" if abs(value) < 1000 else f"{value:.4g}").replace("e-0", "e-")
 
 
 def steps(count: float) -> str:

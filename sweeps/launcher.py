@@ -6,7 +6,6 @@ import os
 import sys
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Protocol
 
 from deepracer_exp.addresses import take_over
 from deepracer_exp.errors import BadInput, RunFailed
@@ -18,69 +17,14 @@ from .worker_config import WorkerConfig, owner_name
 _log = logging.getLogger("deepracer_exp")
 
 
-class WorkerProcess(Protocol):
-    """A worker as the driver sees it: started, or waiting for room on a cluster."""
-
-    @property
-    def owner(self) -> str | None:
-        """Its name in the trial claims; None before it has started."""
-
-    @property
-    def exitcode(self) -> int | None:
-        """Exit code; None while it lives."""
-
-    @property
-    def is_seen(self) -> bool:
-        """Whether a worker that ended is certainly gone; on a lost machine it may still run."""
-
-    def terminate(self) -> None:
-        """Ask it to end, with a checkpoint of its trial."""
-
-    def join(self, timeout_s: float) -> None:
-        """Wait for its end, at most this long."""
-
-    def kill(self) -> None:
-        """End it at once."""
-
-
-class Launcher(Protocol):
-    """Starts workers somewhere."""
-
-    workers: int
-    """How many run at a time."""
-    cores: int
-    """Per worker."""
-
-    def folder(self, runs_dir: Path) -> Path:
-        """Return the folder of runs as the workers see it."""
-
-    def start(self, config: WorkerConfig, token: str) -> WorkerProcess:
-        """Start a worker.
-
-        Args:
-            config: of the worker.
-            token: of the worker's name.
-
-        Raises:
-            BadInput, RunFailed: no worker can ever start here.
-        """
-
-    def close(self) -> None:
-        """Free everything."""
-
-
 class LocalLauncher:
-    """Starts processes on this machine."""
+    """Starts workers as processes of this machine, one per core unless told how many."""
 
     def __init__(self, workers: int | None):
-        """Start nothing yet.
-
-        Args:
-            workers: how many; None: one per core.
-        """
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self.workers = workers or cores
         self.cores = max(1, cores // self.workers)
+        """Per worker."""
         # A fork server has imported once what all workers need; see `start_workers_early`.
         forks = sys.platform.startswith("linux")
         self._context = (
@@ -88,11 +32,11 @@ class LocalLauncher:
         )
 
     def folder(self, runs_dir: Path) -> Path:
-        """Return it unchanged: workers have the working folder of the sweep."""
+        """Return the folder of runs as the workers see it: they have the working folder of the sweep."""
         return runs_dir
 
     def start(self, config: WorkerConfig, token: str) -> "LocalWorker":
-        """Start a process."""
+        """Start a worker; `token` makes its name unique."""
         log = str(config.folder / "workers.log")
         started = self._context.Process(target=run_worker, args=(config, token, log))
         started.start()
@@ -103,13 +47,16 @@ class LocalLauncher:
 
 
 class LocalWorker:
-    """A process on this machine."""
+    """A worker process as the driver sees it."""
 
     is_seen = True
+    """Whether a worker that ended is certainly gone; on a lost machine it may still run."""
 
     def __init__(self, started: BaseProcess, token: str):
         assert started.pid is not None
-        self._process, self.owner = started, owner_name(started.pid, token)
+        self._process = started
+        self.owner: str | None = owner_name(started.pid, token)
+        """Its name in the trial claims; None while it waits for room on a cluster."""
 
     @property
     def exitcode(self) -> int | None:
@@ -117,11 +64,11 @@ class LocalWorker:
         return self._process.exitcode
 
     def terminate(self) -> None:
-        """Ask it to end."""
+        """Ask it to end, with a checkpoint of its trial."""
         self._process.terminate()
 
     def join(self, timeout_s: float) -> None:
-        """Wait for its end."""
+        """Wait for its end, at most this long."""
         self._process.join(timeout_s)
 
     def kill(self) -> None:
@@ -131,14 +78,9 @@ class LocalWorker:
 
 
 def run_worker(config: WorkerConfig, token: str, log: str) -> None:
-    """Run a worker; the target of its process.
+    """Run a worker; the target of its process, whose output goes to the file `log`.
 
     Exits with 0 when the study has all its trials, 130 or 143 when asked to end, 3 if the database stays away.
-
-    Args:
-        config: of the worker.
-        token: of the worker's name.
-        log: file for stdout and stderr.
     """
     take_over(config.addresses)
     # A session of its own: Ctrl-C in the terminal goes to the driver, which asks its workers to end.

@@ -50,11 +50,7 @@ def objectives_of(study: optuna.Study) -> tuple[str, ...]:
         BadInput: the study was not made by a sweep.
     """
     names = study.user_attrs.get("objectives")
-    if (
-        not isinstance(names, list | tuple)
-        or len(names) != len(study.directions)
-        or not set(names) <= set(MEASURES)
-    ):
+    if not isinstance(names, list | tuple) or not set(names) <= set(MEASURES):
         raise BadInput(
             f"study {study.study_name}: has no objectives that a sweep writes ({', '.join(MEASURES)}); "
             "it was not made by `deepracer-exp sweep`"
@@ -80,11 +76,8 @@ def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
 def values_of(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s: float) -> list[float]:
     """Return the values of the objectives, means over tracks; lap time and completion of the usual conditions.
 
-    Args:
-        evaluation: of the policy.
-        objectives: names in MEASURES.
-        trial_time_s: the longest that a trial of the evaluation may take. A policy without a complete lap gets more
-            than that, and more the less of the lap it drives, because samplers need a number for it as well.
+    A policy without a complete lap gets more seconds than `trial_time_s`, the longest that a trial of the evaluation
+    may take, and more the less of the lap it drives, because samplers need a number for it as well.
     """
     from deepracer_exp.evaluation.result import USUAL
 
@@ -101,9 +94,7 @@ def values_of(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s:
 def without_lap(completion: float, trial_time_s: float) -> float:
     """Return seconds for a policy that completes no lap, from one to two times `trial_time_s`.
 
-    Args:
-        completion: mean share of the lap that it drives, per cent.
-        trial_time_s: the longest that a trial of the evaluation may take.
+    `completion` is the mean share of the lap that it drives, per cent.
     """
     return trial_time_s * (2 - min(completion, 100.0) / 100)
 

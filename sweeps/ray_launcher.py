@@ -14,8 +14,8 @@ from deepracer_exp.config.sweep import RayExecutor, SweepConfig
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking.store import Store
 
-from .database import resolve_database
 from .launcher import run_worker
+from .storage import resolve_database
 from .worker_config import WorkerConfig, owner_name
 
 _REQUESTED_BY = "sweep/executor=ray"
@@ -24,7 +24,7 @@ _LOST = -9
 
 
 class RayLauncher:
-    """Starts workers where the cluster has room.
+    """Starts workers where the cluster has room; methods as of `LocalLauncher`.
 
     Each is a process below a `WorkerActor` that reserves the cores. The process is that of a sweep on one machine, so
     that it takes signals, ends with its parent, and loses its trial when its lease runs out.
@@ -32,12 +32,6 @@ class RayLauncher:
 
     def __init__(self, config: SweepConfig, executor: RayExecutor, runs_dir: Path, store: Store | None):
         """Join the cluster.
-
-        Args:
-            config: of the sweep.
-            executor: of the sweep.
-            runs_dir: where its runs are.
-            store: where they are recorded.
 
         Raises:
             BadInput: Ray is missing, no cluster answers, it has room for no worker, or its nodes cannot reach the
@@ -90,7 +84,7 @@ class RayLauncher:
 
 
 class RayWorker:
-    """A worker on some node, as the driver sees it."""
+    """A worker on some node, as the driver sees it; attributes and methods as of `LocalWorker`."""
 
     def __init__(self, actor: Any, begun: Any):
         self._actor, self._begun = actor, begun
@@ -117,10 +111,10 @@ class RayWorker:
         if self._ended is None:
             self.kill()
         else:
-            self._actor.terminate.remote()
+            self._actor.signal.remote("terminate")
 
     def join(self, timeout_s: float) -> None:
-        """Wait for its end."""
+        """Wait for its end, at most this long."""
         if self._exitcode is None:
             self._look(timeout_s)
 
@@ -130,7 +124,7 @@ class RayWorker:
 
         with contextlib.suppress(ray.exceptions.RayError):
             if self._exitcode is None and self._ended is not None:
-                ray.get(self._actor.kill.remote(), timeout=10.0)
+                ray.get(self._actor.signal.remote("kill"), timeout=10.0)
         ray.kill(self._actor)
         self._exitcode = _LOST if self._exitcode is None else self._exitcode
 
@@ -158,20 +152,13 @@ class RayWorker:
 class WorkerActor:
     """Reserves cores of a node and runs a worker's process there; a Ray actor with two threads."""
 
-    def __init__(self) -> None:
-        self._process: BaseProcess | None = None
+    _process: BaseProcess
 
     def begin(self, config: WorkerConfig, token: str, mark: Path, folder: str) -> str:
-        """Start the process and return the worker's name.
-
-        Args:
-            config: of the worker; its folder is an absolute path.
-            token: of the name.
-            mark: a file that the driver has made in the folder of the runs.
-            folder: the working folder of the sweep, which relative paths of the trials start from.
+        """Start the process in the sweep's working folder and return the worker's name.
 
         Raises:
-            BadInput: this node does not see the folder of the runs.
+            BadInput: this node does not see `mark`, a file that the driver has made in the folder of the runs.
         """
         import ray
 
@@ -184,42 +171,27 @@ class WorkerActor:
             os.chdir(folder)
         # For a trial with collector=ray.
         os.environ["RAY_ADDRESS"] = ray.get_runtime_context().gcs_address
-        log = config.folder / f"workers-{os.uname().nodename}.log"
+        log = str(config.folder / f"workers-{os.uname().nodename}.log")
         # The actor's process is its parent, which it does not outlive.
-        started = multiprocessing.get_context("spawn").Process(
-            target=run_worker, args=(config, token, str(log))
+        self._process = multiprocessing.get_context("spawn").Process(
+            target=run_worker, args=(config, token, log)
         )
-        started.start()
-        assert started.pid is not None
-        self._process = started
-        return owner_name(started.pid, token)
+        self._process.start()
+        assert self._process.pid is not None
+        return owner_name(self._process.pid, token)
 
-    def ended(self) -> int:
+    def ended(self) -> int | None:
         """Wait for the process and return its exit code."""
-        assert self._process is not None
         self._process.join()
-        assert self._process.exitcode is not None
         return self._process.exitcode
 
-    def terminate(self) -> None:
-        """Ask the process to end."""
-        assert self._process is not None
-        self._process.terminate()
-
-    def kill(self) -> None:
-        """End the process at once."""
-        assert self._process is not None
-        self._process.kill()
+    def signal(self, how: str) -> None:
+        """Ask the process to end (`terminate`), or end it at once (`kill`)."""
+        getattr(self._process, how)()
 
 
 def refuse_files(storage: str | None, runs_dir: Path, store: Store | None, nodes: Sequence[str]) -> None:
     """Refuse databases that are files if the cluster has nodes on several machines.
-
-    Args:
-        storage: of the configuration.
-        runs_dir: where runs are.
-        store: where they are recorded.
-        nodes: addresses of the machines.
 
     Raises:
         BadInput: the study's database, or MLflow's, is a file.

@@ -1,7 +1,6 @@
 """The HTML page of a study, which needs nothing beside it."""
 
 import base64
-import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_bytes
 from deepracer_exp.runs.files import BEST_LAP, read_head
 
-from .best import best_line, best_run, best_trial, best_values, complete_trials, reranked
+from .best import best_line, best_run, best_shown, best_trial, complete_trials, reranked
 from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
 from .labels import OUTCOMES, duration, outcome_of, outcome_words, parameter, short_keys, steps
 from .objectives import MEASURES, NONE, objectives_of, shown, shown_or_dash, shown_values
@@ -34,8 +33,7 @@ _NOTES = {
     "pareto": "Complete trials only. Trials far worse than the better half lie outside the axes: double-click to see "
     "them all.",
     "importance": "PED-ANOVA over the complete trials: how much the values of the best quarter differ from those of "
-    "all. The lines and the numbers in brackets are 90 % bootstrap intervals: where two of them overlap, it is not "
-    "known which parameter mattered more. A parameter that only some trials have is measured among those.",
+    "all. A parameter that only some trials have is measured among those.",
     "slice": "Complete trials, coloured by their number. A slope or a cloud at one end shows where to search next.",
     "parallel": "Drag along an axis to see only the trials in that part, drag a name to move its axis. A dash is a "
     "trial without this parameter. Trials far worse than the better half are at the end of the objective's axis.",
@@ -54,18 +52,14 @@ def write_study_page(study: optuna.Study, path: Path) -> Path:
 
 
 def study_page(study: optuna.Study) -> str:
-    """Return a study's page: HTML that loads nothing.
-
-    Raises:
-        BadInput: the study was not made by a sweep.
-    """
+    """Return a study's page: HTML that loads nothing."""
     objectives = objectives_of(study)
     trials = study.get_trials(deepcopy=False)
+    complete = complete_trials(study)
     plots = [
         plot(figure, name, figure.layout.meta["title"], narrowed(figure), least_width(figure))
         for name, figure in figures(study).items()
     ]
-    won = any(trial.state == TrialState.COMPLETE for trial in trials)
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
     return render(
         "sweeps",
@@ -74,15 +68,13 @@ def study_page(study: optuna.Study) -> str:
         study=study.study_name,
         headline=study_summary(study),
         outcomes=outcomes(trials),
-        winner=_winner(study, keys) if won else [],
-        steps=_next_steps(study) if won else [(_resume(study), "continue the search")],
-        picture=_picture(study) if won else None,
-        best=best_trial(study).number if won else None,
+        winner=_winner(study, keys) if complete else [],
+        steps=_next_steps(study) if complete else [(_resume(study), "continue the search")],
+        picture=_picture(study) if complete else None,
+        best=best_trial(study).number if complete else None,
         winners=_winners(study, objectives, keys),
         notes={one.name: _NOTES[one.name.partition("-")[0]] for one in plots},
-        too_few=None
-        if sum(t.state == TrialState.COMPLETE for t in trials) >= FEWEST_COMPLETE
-        else FEWEST_COMPLETE,
+        too_few=FEWEST_COMPLETE if len(complete) < FEWEST_COMPLETE else None,
         trials=_table(study, objectives, keys),
         failures=_failures(trials),
         space=study.user_attrs.get("space") or {},
@@ -93,42 +85,39 @@ def study_page(study: optuna.Study) -> str:
 
 def study_summary(study: optuna.Study) -> list[str]:
     """Return the results of a study in a few sentences, the most important first."""
-    objectives, trials = objectives_of(study), study.get_trials(deepcopy=False)
+    trials = study.get_trials(deepcopy=False)
     ended = [trial for trial in trials if trial.state.is_finished()]
     complete = [trial for trial in ended if trial.state == TrialState.COMPLETE]
     total = study.user_attrs.get("trials", len(trials))
     sentences = []
     if complete:
         best = best_trial(study)
-        again = next((one for one in reranked(study) if one["trial"] == best.number), None)
-        fresh = " on fresh laps" if again else ""
-        sentences.append(
-            f"Trial {best.number} is the best: {shown_values(objectives, best_values(study))}{fresh}."
-        )
+        sentences.append(f"Trial {best.number} is the best: {best_shown(study)}.")
         if best.user_attrs.get("lap_time_s") is None:
             sentences.append("It completed no lap.")
-        if len(objectives) > 1:
+        if len(study.directions) > 1:
             sentences.append(f"{len(study.best_trials)} trials are on the Pareto front.")
     else:
         sentences.append("No trial is complete, so there is no best one.")
     spent, wasted = _spent(ended), _spent([t for t in ended if t.state != TrialState.COMPLETE])
     share = f", {100 * wasted / spent:.0f} % of them in trials that were pruned or failed" if spent else ""
-    sentences.append(
+    return [
+        *sentences,
         f"{len(ended)} of {total} trials ended, {len(complete)} of them complete; they drove {steps(spent)} control "
-        f"steps{share}."
-    )
-    return sentences
+        f"steps{share}.",
+    ]
 
 
 def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
     """Return the winner's parameters and results, as names and values."""
     best = best_trial(study)
-    found = [(f"{keys[key]}", parameter(value)) for key, value in best.params.items()]
-    found.append(("Lap time in evaluation", shown_or_dash("lap_time", best.user_attrs.get("lap_time_s"))))
-    found.append(("Completion in evaluation", shown_or_dash("completion", best.user_attrs.get("completion"))))
-    found.append(
-        ("How its training ended", str(best.user_attrs.get("reason") or outcome_words(outcome_of(best))))
-    )
+    attrs = best.user_attrs
+    found = [
+        *((keys[key], parameter(value)) for key, value in best.params.items()),
+        ("Lap time in evaluation", shown_or_dash("lap_time", attrs.get("lap_time_s"))),
+        ("Completion in evaluation", shown_or_dash("completion", attrs.get("completion"))),
+        ("How its training ended", str(attrs.get("reason") or outcome_words(outcome_of(best)))),
+    ]
     try:
         run = read_head(best_run(study))
     except BadInput:  # moved or removed since
@@ -163,18 +152,20 @@ def _picture(study: optuna.Study) -> str | None:
 
 def outcomes(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     """Return for each outcome its trials and control steps, with their shares in per cent."""
-    total, spent, found = len(trials), _spent(trials), []
+    spent, found = _spent(trials), []
     for outcome, style in OUTCOMES.items():
-        some = [trial for trial in trials if outcome_of(trial) == outcome]
-        if some:
-            row = {
-                "outcome": outcome_words(outcome),
-                "color": style.color,
-                "meaning": style.meaning,
-                "count": len(some),
-            }
-            row |= {"trials_share": 100 * len(some) / total, "steps": steps(_spent(some))}
-            found.append(row | {"steps_share": 100 * _spent(some) / spent if spent else 0.0})
+        if some := [trial for trial in trials if outcome_of(trial) == outcome]:
+            found.append(
+                {
+                    "outcome": outcome_words(outcome),
+                    "color": style.color,
+                    "meaning": style.meaning,
+                    "count": len(some),
+                    "trials_share": 100 * len(some) / len(trials),
+                    "steps": steps(_spent(some)),
+                    "steps_share": 100 * _spent(some) / spent if spent else 0.0,
+                }
+            )
     return found
 
 
@@ -187,17 +178,20 @@ def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str
     by_number = {trial.number: trial for trial in complete_trials(study)}
     found = []
     for one in reranked(study):
-        trial = by_number.get(one["trial"])
-        interval = one.get("interval")
-        row: dict[str, Any] = {"trial": one["trial"], "now": shown_values(objectives, one["values"])}
-        row["before"] = shown_values(objectives, trial.values) if trial else NONE
-        row["interval"] = " to ".join(shown(objectives[0], end) for end in interval) if interval else NONE
-        row["lap_time"] = shown_or_dash("lap_time", one.get("lap_time_s"))
-        row["completion"] = shown_or_dash("completion", one.get("completion"))
-        row["held_out"] = shown_or_dash("completion", one.get("held_out_completion"))
-        parameters = trial.params.items() if trial else ()
-        row["parameters"] = ", ".join(f"{keys[key]} {parameter(value)}" for key, value in parameters)
-        found.append(row)
+        trial, interval = by_number[one["trial"]], one.get("interval")
+        params = ", ".join(f"{keys[key]} {parameter(value)}" for key, value in trial.params.items())
+        found.append(
+            {
+                "trial": trial.number,
+                "now": shown_values(objectives, one["values"]),
+                "before": shown_values(objectives, trial.values),
+                "interval": " to ".join(shown(objectives[0], end) for end in interval) if interval else NONE,
+                "lap_time": shown_or_dash("lap_time", one.get("lap_time_s")),
+                "completion": shown_or_dash("completion", one.get("completion")),
+                "held_out": shown_or_dash("completion", one.get("held_out_completion")),
+                "parameters": params,
+            }
+        )
     return found
 
 
@@ -206,7 +200,7 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     trials = study.get_trials(deepcopy=False)
     rank = {trial.number: at for at, trial in enumerate(complete_trials(study))}
     order = sorted(trials, key=lambda t: (_ORDER.index(t.state), rank.get(t.number, t.number)))
-    columns = [key for key in keys if any(key in trial.params for trial in trials)][:_MOST_PARAMETERS]
+    columns = list(keys)[:_MOST_PARAMETERS]
     extra = [
         (attr, objective)
         for attr, objective in (("lap_time_s", "lap_time"), ("completion", "completion"))
@@ -214,13 +208,11 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     ]
     rows = []
     for trial in order[:_MOST_ROWS]:
-        attrs = trial.user_attrs
-        values = [shown_or_dash(name, _value(trial, objectives, at)) for at, name in enumerate(objectives)]
+        attrs, outcome = trial.user_attrs, outcome_of(trial)
+        values = [shown_or_dash(name, _value(trial, at)) for at, name in enumerate(objectives)]
         values += [shown_or_dash(objective, attrs.get(attr)) for attr, objective in extra]
         values.append(shown_or_dash("completion", attrs.get("held_out_completion")))
-        outcome = outcome_of(trial)
-        reason = str(attrs.get("reason") or "")
-        clock_s = attrs.get("wall_clock_s")
+        reason, clock_s = str(attrs.get("reason") or ""), attrs.get("wall_clock_s")
         rows.append(
             {
                 "number": trial.number,
@@ -230,28 +222,26 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
                 "values": values,
                 "steps": steps(attrs["env_steps"]) if attrs.get("env_steps") else NONE,
                 "time": NONE if clock_s is None else duration(clock_s),
-                "parameters": [parameter(trial.params[k]) if k in trial.params else NONE for k in columns],
+                "parameters": [parameter(trial.params.get(key, NONE)) for key in columns],
                 "reason": reason if len(reason) <= _LONGEST_REASON else f"{reason[: _LONGEST_REASON - 1]}…",
             }
         )
-    heads = [MEASURES[name].title for name in (*objectives, *(objective for _, objective in extra))]
     return {
         "rows": rows,
         "left_out": max(0, len(order) - _MOST_ROWS),
-        "measures": [*heads, "Held-out"],
+        "measures": [*(MEASURES[name].title for name in (*objectives, *dict(extra).values())), "Held-out"],
         "parameters": [(keys[key], key) for key in columns],
         "more_parameters": len(keys) - len(columns),
     }
 
 
-def _value(trial: FrozenTrial, objectives: Sequence[str], at: int) -> float | None:
+def _value(trial: FrozenTrial, at: int) -> float | None:
     """Return a trial's value of one objective, of a pruned one the last it had; None if it has none."""
-    value: float | None = None
     if trial.state == TrialState.COMPLETE:
-        value = trial.values[at]
-    elif trial.state == TrialState.PRUNED and len(objectives) == 1 and trial.intermediate_values:
-        value = trial.intermediate_values[max(trial.intermediate_values)]
-    return value if value is not None and math.isfinite(value) else None
+        return trial.values[at]
+    if trial.state == TrialState.PRUNED and trial.last_step is not None:
+        return trial.intermediate_values[trial.last_step]
+    return None
 
 
 def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
@@ -274,12 +264,11 @@ def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
 
 def _facts(study: optuna.Study, objectives: Sequence[str]) -> list[tuple[str, str]]:
     attrs = study.user_attrs
-    facts: list[tuple[str, str]] = [
+    facts = [
         ("Objective" + "s" * (len(objectives) > 1), ", ".join(MEASURES[name].words for name in objectives)),
         ("Evaluation", str(attrs.get("protocol", NONE))),
         ("Seeds of a trial", str(attrs.get("seeds", 1))),
         ("Runs", f"{attrs.get('runs_dir', 'runs')}/{study.study_name}"),
     ]
-    if run_id := attrs.get("mlflow_run_id"):
-        facts.append(("MLflow run", str(run_id)))
-    return facts
+    run_id = attrs.get("mlflow_run_id")
+    return [*facts, ("MLflow run", str(run_id))] if run_id else facts

@@ -53,14 +53,7 @@ def rerank(
 ) -> list[Reranked]:
     """Race the best checkpoints of the best trials on fresh laps; return the trials in the new order.
 
-    Args:
-        worker_config: of the sweep.
-        study: of the sweep.
-        on_next: called with each trial before its laps.
-        on_step: called after each control step; an exception it raises ends the re-ranking.
-
-    Raises:
-        RunFailed: a car's state became NaN.
+    `on_next` is called with each trial before its laps, `on_step` after each control step; what they raise ends it.
     """
     config = worker_config.config
     protocol = fresh(worker_config.protocol, config.rerank_laps)
@@ -77,10 +70,7 @@ def interval_of(
 ) -> tuple[float, float]:
     """Return the bootstrap interval of an objective; trials are resampled within each track and each evaluation.
 
-    Args:
-        evaluations: of the policies that the value is the mean of.
-        objective: its name.
-        trial_time_s: the longest that a trial of the evaluation may take.
+    `trial_time_s` is the longest that a trial of an evaluation may take.
     """
     groups = [group for one in evaluations for group in one.groups if group.condition == USUAL]
     rng = np.random.default_rng(0)

@@ -59,11 +59,7 @@ class PerTrialSampler(BaseSampler):
     """
 
     def __init__(self, make: Callable[[int], BaseSampler]):
-        """Start without any sampler.
-
-        Args:
-            make: returns the sampler of the trial with an index.
-        """
+        """Start without any sampler; `make` returns that of the trial with an index."""
         self._make = make
         self._open: dict[int, BaseSampler] = {}
 

@@ -1,36 +1,175 @@
-"""The storage of studies: Optuna's tables, opened safely by many processes at once, and the wait for a database."""
+"""The database of studies: its address checked, opened safely by many processes at once, and waited for."""
 
 import glob
 import logging
+import os
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
+from filelock import FileLock
 from optuna.exceptions import StorageInternalError
 from optuna.storages import RDBStorage
-from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DBAPIError,
+    InterfaceError,
+    InternalError,
+    NoSuchModuleError,
+    OperationalError,
+)
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay
 from tenacity.wait import wait_exponential_jitter
 
-from deepracer_exp.addresses import redact
-from deepracer_exp.errors import BadInput, RunFailed, reading
+from deepracer_exp.addresses import redact, with_password, without_passwords
+from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
 from deepracer_exp.tracking.store import one_line
-
-from .database import Database, resolve_database
 
 Result = TypeVar("Result")
 
+DEFAULT_FILE = "sweeps.db"
+"""In `runs_dir`."""
 DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInternalError)
 """Errors of a database that is down or locked, among others; see `_may_pass`."""
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 10.0
-_SAY_AFTER_S = 5.0
+_FIRST_WAIT_S, _LONGEST_WAIT_S, _SAY_AFTER_S = 0.1, 10.0, 5.0
+
+_KINDS = ("sqlite", "postgresql", "mysql")
+_ACCEPTED = (
+    "accepted: sqlite:////path/sweeps.db, postgresql+psycopg://user@host/name, mysql+pymysql://user@host/name"
+)
+_DRIVERS = {"psycopg": "psycopg[binary]", "pymysql": "pymysql", "mysqldb": "mysqlclient"}
+"""Package of each driver."""
+_CONNECT_S = 10
+_STUCK_S = 60
+"""How long a process may leave a transaction open, or wait for one: a suspended machine blocks others no longer."""
+_LOCK, _LOCK_NUMBER = "deepracer_exp sweeps", 0x64726578
 
 _log = logging.getLogger("deepracer_exp")
+
+
+@dataclass(frozen=True)
+class Database:
+    """A database that can hold studies."""
+
+    url: sa.URL = field(repr=False)
+    """With its password, if it has one."""
+    shown: str
+    """The setting it came from, for messages, without password."""
+
+    @property
+    def file(self) -> Path | None:
+        """The file of an SQLite database."""
+        return Path(str(self.url.database)) if self.url.get_backend_name() == "sqlite" else None
+
+    def engine_options(self) -> dict[str, Any]:
+        """Return arguments of SQLAlchemy's `create_engine` besides the URL.
+
+        Each transaction on a server has its own connection. A pool would keep one or two connections per worker open
+        for hours, of which PostgreSQL allows 100 by default, and all of them would break when the server restarts.
+        """
+        if self.file is not None:
+            return {"connect_args": {"timeout": _STUCK_S}}
+        driver = self.url.get_driver_name()
+        arguments: dict[str, Any] = {}
+        if driver in ("psycopg", "psycopg2"):
+            arguments = {
+                "connect_timeout": _CONNECT_S,
+                "keepalives_idle": 15,
+                "keepalives_interval": 5,
+                "keepalives_count": 4,
+                "tcp_user_timeout": 30_000,
+                "options": f"-c idle_in_transaction_session_timeout={_STUCK_S}s -c lock_timeout={_STUCK_S}s",
+            }
+        elif driver in ("pymysql", "mysqldb"):
+            arguments = {
+                "connect_timeout": _CONNECT_S,
+                "read_timeout": 2 * _STUCK_S,
+                "write_timeout": 2 * _STUCK_S,
+                "init_command": f"SET SESSION wait_timeout={_STUCK_S}, innodb_lock_wait_timeout={_STUCK_S}",
+            }
+        given = {key: value for key, value in arguments.items() if key not in self.url.query}
+        return {"poolclass": sa.NullPool, "connect_args": given}
+
+    @contextmanager
+    def creation_lock(self, engine: sa.Engine | None) -> Iterator[None]:
+        """Let one process at a time create what must exist once: the tables, the study's run in MLflow.
+
+        Optuna has no lock of its own here: of processes that start together all but one fail, with "table already
+        exists" or with a version stored twice. The lock ends with the process that holds it. A file needs no engine.
+        """
+        if self.file is not None:
+            with FileLock(f"{self.file}.lock"):
+                yield
+            return
+        assert engine is not None
+        with engine.connect() as connection:
+            if engine.dialect.name == "postgresql":
+                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK_NUMBER)))
+            else:
+                connection.execute(sa.select(sa.func.get_lock(_LOCK, _STUCK_S)))
+            yield
+
+
+def resolve_database(url: str | None, runs_dir: Path) -> Database:
+    """Return the database named by `sweep.storage`, or the file in `runs_dir`, without connecting.
+
+    Raises:
+        BadInput: not a URL, an unknown kind, a missing driver, a file that cannot be written.
+    """
+    if url is None:
+        return _of_file(runs_dir / DEFAULT_FILE, f"runs_dir={runs_dir}")
+    try:
+        parsed = sa.make_url(with_password(url))
+    except (ArgumentError, ValueError):
+        # Without a form it is unknown which part of it is the password.
+        raise BadInput(f"sweep.storage: not the URL of a database; {_ACCEPTED}") from None
+    shown = f"sweep.storage={without_passwords(url)}"
+    kind = parsed.get_backend_name()
+    if kind not in _KINDS:
+        raise BadInput(
+            f"{shown}: not a kind of database that holds sweeps{nearest(kind, _KINDS)}; {_ACCEPTED}"
+        )
+    name = parsed.database
+    if kind == "sqlite" and (not name or name.startswith((":", "file:")) or parsed.host or parsed.query):
+        raise BadInput(f"{shown}: names no file; accepted: sqlite:////path/sweeps.db")
+    _check_driver(parsed, shown)
+    if not name:
+        raise BadInput(f"{shown}: names no database; accepted: {kind}://user@host/NAME")
+    return _of_file(Path(name), shown) if kind == "sqlite" else Database(parsed, shown)
+
+
+def _check_driver(url: sa.URL, shown: str) -> None:
+    try:
+        dialect = url.get_dialect()
+        if dialect.is_async:
+            raise BadInput(f"{shown}: a driver for asynchronous programs; {_ACCEPTED}")
+        dialect.import_dbapi()
+    except NoSuchModuleError:
+        raise BadInput(f"{shown}: SQLAlchemy knows no such driver; {_ACCEPTED}") from None
+    except ImportError as error:
+        package = _DRIVERS.get(url.get_driver_name(), error.name)
+        raise BadInput(f"{shown}: its driver is missing; install it with: pip install '{package}'") from None
+
+
+def _of_file(file: Path, shown: str) -> Database:
+    # The workers may have another working folder.
+    file = file.absolute()
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{shown}: folder {file.parent} cannot be created: {error.strerror}") from None
+    if file.is_dir():
+        raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
+    # SQLite keeps two files beside it, so the folder must be writable, too.
+    if not all(os.access(path, os.W_OK) for path in (file, file.parent) if path.exists()):
+        raise BadInput(f"{shown}: {file} cannot be written; choose a writable place")
+    return Database(sa.URL.create("sqlite", database=str(file)), shown)
 
 
 @dataclass(frozen=True)
@@ -45,12 +184,9 @@ class Storage:
 
 
 def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> Storage:
-    """Connect to the database named by `sweep.storage`, or to `sweeps.db` in `runs_dir`; create what is missing.
+    """Connect to a database, see `resolve_database`; create what is missing.
 
-    Args:
-        url: as SQLAlchemy reads it; None: the file.
-        runs_dir: of the file; created if it is missing.
-        patience_s: how long to wait for a server that does not answer, seconds.
+    Waits up to `patience_s` for a server that does not answer.
 
     Raises:
         BadInput: unknown kind, missing driver, unreachable, not writable, or used by another program.
@@ -85,12 +221,10 @@ def _waiting(call: Callable[[], Result], patience_s: float) -> Result:
 
     def say(state: RetryCallState) -> None:
         nonlocal said
-        if said or (state.seconds_since_start or 0.0) < _SAY_AFTER_S:
-            return
-        said = True
         error = state.outcome.exception() if state.outcome is not None else None
-        reason = _reason(error) if isinstance(error, Exception) else ""
-        _log.warning("waiting up to %g s for the study's database: %s", patience_s, reason)
+        if not said and error is not None and (state.seconds_since_start or 0.0) >= _SAY_AFTER_S:
+            said = True
+            _log.warning("waiting up to %g s for the study's database: %s", patience_s, _reason(error))
 
     return Retrying(
         retry=retry_if_exception(_may_pass),
@@ -118,9 +252,7 @@ def _reason(error: BaseException) -> str:
     """Return the error in one line, without the statement and its values."""
     if isinstance(error, StorageInternalError) and error.__cause__ is not None:
         return _reason(error.__cause__)
-    if isinstance(error, DBAPIError) and isinstance(error.orig, Exception):
-        return one_line(error.orig)
-    return one_line(error) if isinstance(error, Exception) else type(error).__name__
+    return one_line(error.orig if isinstance(error, DBAPIError) and error.orig is not None else error)
 
 
 def _open(database: Database) -> RDBStorage:
@@ -149,8 +281,7 @@ def _create_file(database: Database, file: Path) -> None:
     new = file.with_name(f"{file.name}.new")
     for left in file.parent.glob(f"{glob.escape(new.name)}*"):
         left.unlink()
-    aside = Database(sa.URL.create("sqlite", database=str(new)), database.shown)
-    rdb = _rdb(aside, create=True)
+    rdb = _rdb(Database(sa.URL.create("sqlite", database=str(new)), database.shown), create=True)
     rdb.remove_session()
     rdb.engine.dispose()
     _write_ahead(new)

@@ -15,7 +15,7 @@ from deepracer_exp.errors import BadInput, nearest
 
 from .objectives import MEASURES
 from .space import SearchSpace
-from .storage import Storage, open_storage
+from .storage import DEFAULT_FILE, Storage, open_storage
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
@@ -93,15 +93,7 @@ def open_study(
     storage: Storage,
     runs_dir: Path,
 ) -> Study:
-    """Begin a study, or open the one of that name.
-
-    Args:
-        request: of the sweep.
-        overrides: that it was composed from.
-        space: of the request.
-        parent: as `WorkerConfig.parent`.
-        storage: where studies are.
-        runs_dir: where its runs are.
+    """Begin a study, or open the one of that name; `parent` as of `WorkerConfig`.
 
     Raises:
         BadInput: a study of that name exists, and its trials cannot be compared with these.
@@ -164,7 +156,7 @@ def _known(request: SweepRequest, must_exist: bool, runs_dir: Path) -> Study | N
     """Return the study that the request names, if it exists; no file is created by looking."""
     if request.entry.study is None:
         return None
-    if request.entry.sweep.storage is None and not (runs_dir / "sweeps.db").exists():
+    if request.entry.sweep.storage is None and not (runs_dir / DEFAULT_FILE).exists():
         return None
     find = load_study if must_exist else find_study
     return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))

@@ -2,7 +2,7 @@
 
 import collections
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
-from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from deepracer_exp.config.compose import Composition, compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.running import MLflowTracking, TrackingConfig
@@ -21,23 +21,23 @@ from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.tracking.store import Store, resolve_store
+from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
 from .best import best_line, best_shown, best_trial, best_values, complete_trials, write_best
 from .claims import Claim, TrialClaims, fail_unclaimed_trials, report_results
-from .database import resolve_database
 from .driver import Driver
-from .launcher import Launcher, LocalLauncher
+from .launcher import LocalLauncher
 from .pruners import build_pruner
+from .ray_launcher import RayLauncher
 from .samplers import build_sampler
 from .space import SearchSpace
-from .storage import Storage, open_storage, patiently
+from .storage import Storage, open_storage, patiently, resolve_database
 from .study import load_request, open_study, runs_dir_of
-from .trial_run import Interrupted
 from .view import SweepView
+from .worker import Interrupted
 from .worker_config import WorkerConfig
 
 _DELIVERY_S, _FAREWELL_S = 30.0, 2.0
@@ -47,14 +47,7 @@ REPORT = "sweep.html"
 
 
 def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]:
-    """Make the missing trials of a study.
-
-    Args:
-        overrides: as given on the command line.
-        console: of stderr, for the view.
-
-    Returns:
-        The study, the folder of its runs, and the exit code.
+    """Make the missing trials of a study; return it, the folder of its runs, and the exit code.
 
     Raises:
         BadInput: before anything is begun; nothing is left behind.
@@ -67,13 +60,23 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
     request = _without_rules(request, overrides)
     parent = _parent(request, runs_dir, known)
-    space = SearchSpace.from_request(request, _check(request, parent, runs_dir))
+    compose = partial(_composed, request.study, parent, runs_dir)
+    space = SearchSpace.from_request(request, (lambda lines: compose(lines)[1].mapping) if parent else None)
     build_sampler(config, space)
     build_pruner(config)
-    experiment = _experiment(request, parent, space, runs_dir)
+    experiment, _ = compose(space.example())
+    if not parent:
+        setup = build_setup(experiment)
+        RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     tracking = experiment.tracking
     store = resolve_store(tracking.uri, runs_dir) if isinstance(tracking, MLflowTracking) else None
-    with contextlib.closing(_launcher(config, runs_dir, store)) as launcher:
+    executor = config.executor
+    launcher = (
+        LocalLauncher(config.workers)
+        if executor.kind == "local"
+        else RayLauncher(config, executor, runs_dir, store)
+    )
+    with contextlib.closing(launcher):
         storage = open_storage(config.storage, runs_dir)
         study = open_study(request, overrides, space, parent, storage, runs_dir)
         study_run, study_run_id = begin_study_run(request, space, tracking, storage, runs_dir)
@@ -109,15 +112,7 @@ def begin_study_run(
 ) -> tuple[StudyRun | None, str | None]:
     """Begin or continue the run of a study in MLflow; return it with its id.
 
-    Args:
-        request: of the sweep.
-        space: of the request.
-        tracking: of the trials.
-        storage: of the study.
-        runs_dir: where its runs are.
-
-    Returns:
-        None, None with `tracking=off`; no id if the store does not answer.
+    None, None with `tracking=off`; no id if the store does not answer.
     """
     # MLflow cannot create a run only if there is none: one driver at a time looks and creates it.
     with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
@@ -130,7 +125,7 @@ def _run(
     worker_config: WorkerConfig,
     storage: Storage,
     study: Study,
-    launcher: Launcher,
+    launcher: LocalLauncher | RayLauncher,
     console: Console,
     study_run: StudyRun | None,
 ) -> int:
@@ -234,10 +229,7 @@ def _conclude(
 def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequest:
     """Remove the stopping rule unless the pruner `entropy` or a rule beside the pruners is asked for.
 
-    Args:
-        request: of the sweep.
-        overrides: of it; if they choose the pruners, the rule that a ready-made sweep pairs with its own does not
-            count.
+    If the overrides choose the pruners, the rule that a ready-made sweep pairs with its own does not count.
     """
     if "entropy" in request.entry.sweep.pruners:
         return request
@@ -269,33 +261,17 @@ def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple
     return f"run={lineage.parent_dir}", f"checkpoint={int(lineage.checkpoint)}"
 
 
-def _check(request: SweepRequest, parent: tuple[str, ...], runs_dir: Path) -> Any:
-    """Return what checks overrides of a trial: None as for a training, or a function that clones the parent."""
+def _composed(
+    study: str, parent: tuple[str, ...], runs_dir: Path, overrides: list[str]
+) -> tuple[Experiment, Composition]:
+    """Return the experiment of a trial with these overrides, of a clone if trials have a parent."""
     if not parent:
-        return None
+        return compose_experiment(overrides)
 
     from deepracer_exp.training.clone import prepare_clone
 
-    def check(overrides: list[str]) -> Mapping[str, Any]:
-        clone = prepare_clone([*parent, *overrides, f"name={request.study}"], runs_dir, None)
-        return clone.composition.mapping
-
-    return check
-
-
-def _experiment(
-    request: SweepRequest, parent: tuple[str, ...], space: SearchSpace, runs_dir: Path
-) -> Experiment:
-    """Return the experiment of one trial, after reading its files."""
-    if parent:
-        from deepracer_exp.training.clone import prepare_clone
-
-        line = [*parent, *space.example(), f"name={request.study}"]
-        return prepare_clone(line, runs_dir, None).experiment
-    experiment, _ = compose_experiment(space.example())
-    setup = build_setup(experiment)
-    RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
-    return experiment
+    clone = prepare_clone([*parent, *overrides, f"name={study}"], runs_dir, None)
+    return clone.experiment, clone.composition
 
 
 def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
@@ -311,11 +287,3 @@ def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
     if budget.env_steps is not None:
         limits.append(-(-budget.env_steps // algorithm.frames_per_iteration))
     return min(limits) // every if limits else None
-
-
-def _launcher(config: SweepConfig, runs_dir: Path, store: Store | None) -> Launcher:
-    if config.executor.kind == "local":
-        return LocalLauncher(config.workers)
-    from .ray_launcher import RayLauncher
-
-    return RayLauncher(config, config.executor, runs_dir, store)

@@ -3,7 +3,6 @@
 import collections
 import time
 from collections.abc import Mapping, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from rich.console import Console, Group
@@ -34,13 +33,6 @@ class SweepView:
     """
 
     def __init__(self, config: WorkerConfig, workers: int, console: Console):
-        """Show nothing yet.
-
-        Args:
-            config: of the workers.
-            workers: number of workers.
-            console: of stderr, since stdout is for results.
-        """
         self._study, self._folder, self._sweep = config.study, config.folder, config.config
         self._workers, self._console = workers, console
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
@@ -57,13 +49,11 @@ class SweepView:
         if self._live is not None:
             self._live.start()
         else:
-            trials = self._sweep.trials
-            self._line(f"{self._study}: {trials} trials, {self._workers} workers; runs in {self._folder}")
+            total = self._sweep.trials
+            self._line(f"{self._study}: {total} trials, {self._workers} workers; runs in {self._folder}")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._live is not None:
             self._live.stop()
 
@@ -109,8 +99,6 @@ class SweepView:
         ended = counts.total()
         words = ", ".join(f"{counts[one]} {word}" for one, word in _STATES.items())
         grid = Table.grid(padding=(0, 2))
-        grid.add_column(style="dim")
-        grid.add_column()
         grid.add_row("trials", ProgressBar(total, min(ended, total), width=40))
         grid.add_row("", f"{ended} of {total}: {words}")
         grid.add_row("time", f"{duration(time.monotonic() - self._began)}, {self._left(claims)}")

@@ -44,12 +44,7 @@ class WorkerConfig:
 
 
 def owner_name(pid: int, token: str) -> str:
-    """Return a name that no other worker has or ever will have.
-
-    Args:
-        pid: of its process.
-        token: a few random characters, because process ids are reused.
-    """
+    """Return a worker's unique name; the token is random, because process ids are reused."""
     return f"{socket.gethostname()}:{pid}:{token}"
 
 

@@ -12,7 +12,7 @@ import pytest
 import sqlalchemy as sa
 
 from sweeps.claims import TrialClaims
-from sweeps.database import resolve_database
+from sweeps.storage import resolve_database
 
 PATIENCE_S = 120.0
 MYSQL = "SWEEPS_TEST_MYSQL"

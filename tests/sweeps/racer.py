@@ -8,7 +8,7 @@ import sqlalchemy as sa
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from sweeps.claims import TrialClaims
-from sweeps.database import resolve_database
+from sweeps.storage import resolve_database
 
 
 def _ready() -> None:
@@ -34,7 +34,7 @@ def claim(url: str, owner: str, total: str, lease_s: str) -> None:
     _ready()
     count = 0
     while (claim := claims.claim(f"{owner}.{count}", int(total), float(lease_s))) is not None:
-        print(claim.index, claim.attempt, claim.previous_owner, claim.trial_id, flush=True)
+        print(claim.index, claim.attempt, claim.trial_id, flush=True)
         count += 1
 
 

@@ -11,7 +11,7 @@ from deepracer_exp.training.signals import Interruption
 from sweeps.driver import Driver
 from sweeps.storage import open_storage
 from sweeps.sweep import _conclude
-from sweeps.trial_run import Interrupted
+from sweeps.worker import Interrupted
 
 from .studies import add, new_study
 

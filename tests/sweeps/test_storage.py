@@ -13,8 +13,7 @@ import sqlalchemy as sa
 
 from deepracer_exp.errors import BadInput, RunFailed
 from sweeps.claims import TrialClaims
-from sweeps.database import resolve_database
-from sweeps.storage import open_storage, patiently
+from sweeps.storage import open_storage, patiently, resolve_database
 
 HOUR_S = 3600.0
 

@@ -17,7 +17,7 @@ def claim(number, outcome=None, values=None, share=0.0, params=None, **attrs):
     progress |= {"share": share, "params": params or {}}
     result = outcome and TrialResult(state=outcome, values=values, attrs={"number": number, **attrs})
     return Claim(
-        index=number, attempt=1, owner="host:1:a", previous_owner=None, state="told" if outcome else "claimed",
+        index=number, attempt=1, owner="host:1:a", state="told" if outcome else "claimed",
         result=result, trial_id=number, runs=(), progress=progress, expired=False,
     )  # fmt: skip
 

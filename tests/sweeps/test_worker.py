@@ -13,8 +13,7 @@ from sweeps.claims import TrialResult
 from sweeps.space import SearchSpace
 from sweeps.storage import open_storage
 from sweeps.study import open_study
-from sweeps.trial_run import TrialRun
-from sweeps.worker import Worker
+from sweeps.worker import TrialRun, Worker
 from sweeps.worker_config import WorkerConfig
 
 SPACE = {
