@@ -15,17 +15,16 @@ from optuna.trial import FrozenTrial
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.runs.files import read_config, read_object
+from deepracer_exp.runs.files import TRACKING, read_config, read_object
 from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
-from deepracer_exp.tracking import tracking_file
 from deepracer_exp.training.callbacks import BUDGET_REACHED
 from sweeps.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary
 from .pruning_replay import Course, Pace
 
-_LEFT_BEHIND = ("trace", tracking_file.NAME)
+_LEFT_BEHIND = ("trace", TRACKING)
 """Of a trial's run: most of its bytes, and its run in MLflow."""
 _NOTED, _SCORES = "sweep_started.json", "scores.json"
 _NOTE_S = 5.0

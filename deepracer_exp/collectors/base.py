@@ -4,7 +4,6 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from types import TracebackType
 from typing import Any, Self
 
 import torch
@@ -28,9 +27,7 @@ class Collector(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -38,10 +35,7 @@ class Collector(ABC):
             yield self.next_batch()
 
     def collect(self, algorithm: AlgorithmConfig) -> tuple[TensorDictBase, float]:
-        """Return what one update learns from, and the seconds it took to collect.
-
-        Args:
-            algorithm: says how many frames or episodes an iteration has.
+        """Return what one update learns from, as much as the algorithm says, and the seconds it took to collect.
 
         Raises:
             RunFailed: a worker is lost.
@@ -71,21 +65,15 @@ class Collector(ABC):
 
     @abstractmethod
     def publish_policy(self) -> None:
-        """Let the next batches be driven with the policy's weights as they are now.
-
-        Raises:
-            RunFailed: a worker is lost.
-        """
+        """Let the next batches be driven with the policy's weights as they are now; raises as `next_batch`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """Return all that the next batch depends on but the policy: arrays and plain values.
 
         It is that of the last batch's end, to be asked for before the next batch is. Asynchronous workers are in the
-        middle of other batches by then: there is no such state of them, and what is returned is empty.
-
-        Raises:
-            RunFailed: a worker is lost.
+        middle of other batches by then: there is no such state of them, and what is returned is empty. Raises as
+        `next_batch`.
         """
 
     @abstractmethod
@@ -109,11 +97,7 @@ def worker_name(worker: int) -> str:
 
 
 def refuse_other_cars(state: Mapping[str, Any], names: set[str]) -> None:
-    """Refuse the state of other workers than those of these names; an empty one fits all.
-
-    Raises:
-        BadInput: it is of others.
-    """
+    """Refuse the state of other workers than those of these names; an empty one fits all."""
     if state and set(state) != names:
         raise BadInput(
             f"the checkpoint does not fit: it has the cars of {len(state)} processes that wait for one another; "

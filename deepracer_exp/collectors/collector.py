@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import torch
@@ -96,9 +95,7 @@ class LocalCollector(Collector):
                 self._restore_cars()
                 undo.pop_all()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is not None and self._watchdog is not None:
             # TorchRL asks its workers to end and waits up to 10 s for those that are driving.
             self._watchdog.close()
@@ -136,15 +133,10 @@ class LocalCollector(Collector):
             self._collector.shutdown()
             # TorchRL gives this process the workers' threads, and with other threads sums have other last digits.
             torch.set_num_threads(threads)
-        if self._workers:
-            self._close_weight_queues()
-
-    def _close_weight_queues(self) -> None:
-        """Close what weights travelled through.
-
-        TorchRL does so when its collector is garbage: after a failure that is never, and the interpreter's end would
-        wait without end for a queue that nobody empties.
-        """
+        if not self._workers:
+            return
+        # TorchRL closes what weights travelled through when its collector is garbage: after a failure that is never,
+        # and the interpreter's end would wait without end for a queue that is never emptied.
         for scheme in (self._collector._weight_sync_schemes or {}).values():
             for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
                 for queue in (getattr(scheme, name, None) or {}).values():
@@ -207,16 +199,14 @@ class LocalCollector(Collector):
     def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
         """Return the workers' answer; TorchRL waits for it without end, even if the worker is dead.
 
-        Args:
-            question: asks them.
-            silence: says who did not answer.
+        `silence` says who did not answer.
         """
         answer: Future[_T] = Future()
 
         def ask() -> None:
             try:
                 answer.set_result(question())
-            except BaseException as error:  # noqa: BLE001 - handed on to the thread that waits
+            except BaseException as error:  # noqa: BLE001 - raised again by the thread that waits
                 answer.set_exception(error)
 
         threading.Thread(target=ask, name="ask the workers", daemon=True).start()

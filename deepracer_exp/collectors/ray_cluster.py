@@ -12,11 +12,7 @@ _ANSWER_S = 5.0
 
 
 def connect(address: str, asked_by: str) -> None:
-    """Join a cluster that runs; none is ever started here, so that none is left behind.
-
-    Args:
-        address: HOST:PORT of its head, or `auto`.
-        asked_by: the setting that wants it, for messages.
+    """Join a cluster that runs, by HOST:PORT of its head or `auto`; none is ever started, so that none is left behind.
 
     Raises:
         BadInput: Ray is not installed, or no cluster answers.
@@ -31,20 +27,20 @@ def connect(address: str, asked_by: str) -> None:
     ray_constants.NUM_REDIS_GET_RETRIES = 1
     if ray.is_initialized():
         return
-    told = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
+    known = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
     try:
-        if told != "auto":
-            _knock(told)
-        ray.init(told, log_to_driver=False, logging_level="error")
+        if known != "auto":
+            _knock(known)
+        ray.init(known, log_to_driver=False, logging_level="error")
     except (OSError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
         raise BadInput(
-            f"{asked_by}: no Ray cluster at {told}: {reason}; start one with: ray start --head --disable-usage-stats"
+            f"{asked_by}: no Ray cluster at {known}: {reason}; start one with: ray start --head --disable-usage-stats"
         ) from None
 
 
 def leave() -> None:
-    """Take leave of the cluster: what this process has started there ends."""
+    """Leave the cluster: what this process has started there ends."""
     import ray
 
     ray.shutdown()
@@ -56,11 +52,7 @@ def node_addresses() -> list[str]:
 
 
 def room(needs: dict[str, float]) -> int:
-    """Return how many workers the cluster has room for when nothing else runs on it.
-
-    Args:
-        needs: what each of them takes of Ray's resources, as `CPU` and `GPU`.
-    """
+    """Return for how many workers that each need these resources, `CPU` and `GPU`, the cluster has room when idle."""
     wanted = {name: amount for name, amount in needs.items() if amount > 0}
     return sum(
         int(min(node["Resources"].get(name, 0.0) / amount for name, amount in wanted.items()))

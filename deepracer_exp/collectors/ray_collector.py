@@ -1,32 +1,149 @@
-"""Batches of driving, from cars on a Ray cluster."""
+"""Batches of driving from cars on a Ray cluster, and what runs in its processes."""
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector as TorchRLCollector
 
 from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
+from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import REWARD_PRINTS
 
 from . import ray_cluster
 from .base import Collector, refuse_other_cars, worker_name
-from .ray_beats import Beats
-from .ray_cars import Cars, FarEnvFactory
+from .worker import EnvFactory
 
 _LOOK_EVERY_S = 0.2
+_REPORT_EVERY_S = 0.5
 _START_TIMEOUT_S = 120.0
 _LONGEST_PRINTS = 10_000_000
 """Bytes of the file that takes them, as on one machine."""
 
 _log = logging.getLogger("deepracer_exp")
+
+Key = str | tuple[str, ...]
+
+
+class Beats:
+    """Knows how many control steps each worker has done; an actor of its own, because the others are driving."""
+
+    def __init__(self) -> None:
+        self._steps: dict[int, int] = {}
+
+    def report(self, worker: int, steps: int) -> None:
+        """Take a worker's sign of life."""
+        self._steps[worker] = steps
+
+    def steps(self) -> dict[int, int]:
+        """Return the control steps of the workers that have reported any."""
+        return self._steps
+
+
+class KeptPrints(RewardPrints):
+    """Prints of reward functions that are kept until they are asked for: the run's folder may be out of reach."""
+
+    def __init__(self) -> None:
+        super().__init__(Path(os.devnull))
+        self._lines: list[str] = []
+
+    def take(self) -> str:
+        """Return what was printed since the last time."""
+        text = "".join(self._lines)
+        self._lines.clear()
+        return text
+
+    def _write(self, text: str) -> None:
+        self._lines.append(text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RemoteEnvFactory(EnvFactory):
+    """Builds the cars of one process that shares no file with the training process."""
+
+    kept: KeptPrints = field(default_factory=KeptPrints)
+    on_step: Callable[[], None] | None = None
+
+    def _prints(self) -> RewardPrints:
+        return self.kept
+
+    def _sign_of_life(self) -> Callable[[], None] | None:
+        return self.on_step
+
+
+class Cars:
+    """The cars of one process; a Ray actor whose methods run in its main thread.
+
+    Only there a reward function that hangs can be stopped (`env.reward_guard`), so that its steps are reported to
+    `Beats` and not asked for from another thread of it.
+    """
+
+    def build(
+        self, factory: RemoteEnvFactory, policy: torch.nn.Module, frames_per_batch: int, beats: Any
+    ) -> tuple[str, int]:
+        """Put the cars on the road; return the address of the node and the number of the process."""
+        import ray
+
+        # As in worker processes of one machine: with other threads sums have other last digits.
+        torch.set_num_threads(1)
+        self._policy, self._kept = policy, factory.kept
+        steps, reported_at = 0, 0.0
+
+        def on_step() -> None:
+            nonlocal steps, reported_at
+            steps += 1
+            now = time.monotonic()
+            if now > reported_at + _REPORT_EVERY_S:
+                reported_at = now
+                beats.report.remote(factory.worker, steps)
+
+        self._collector = TorchRLCollector(
+            replace(factory, on_step=on_step)(),
+            policy,
+            frames_per_batch=frames_per_batch,
+            total_frames=-1,
+            use_buffers=True,
+            trust_policy=True,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        self._source = iter(self._collector)
+        return ray.util.get_node_ip_address(), os.getpid()
+
+    def drive(self) -> tuple[dict[Key, np.ndarray], str]:
+        """Return a batch [cars, T] by key, and what the reward function printed.
+
+        Raises:
+            RunFailed: as `RaceEnv` does.
+        """
+        batch = next(self._source)
+        return {key: value.numpy() for key, value in batch.items(True, True)}, self._kept.take()
+
+    def take_weights(self, weights: Mapping[str, np.ndarray]) -> None:
+        """Drive with these weights from the next batch on."""
+        # Arrays that Ray shares between processes cannot be written.
+        self._policy.load_state_dict({name: torch.from_numpy(w.copy()) for name, w in weights.items()})
+        self._collector.update_policy_weights_()
+
+    def take_state(self) -> dict[str, Any]:
+        """Return all that the next batch depends on but the policy."""
+        state: dict[str, Any] = self._collector.env.take_state()
+        return state
+
+    def put_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from what `take_state` returned."""
+        self._collector.env.put_state(state)
+        self._collector.reset()
 
 
 class RayCollector(Collector):
@@ -57,7 +174,7 @@ class RayCollector(Collector):
         refuse_other_cars(self._begun_from, {worker_name(worker) for worker in range(config.processes)})
         ray_cluster.check_collector(config)
         self._beats = ray.remote(num_cpus=0)(Beats).remote()
-        self._asked, self._told = self._beats.steps.remote(), dict[int, int]()
+        self._asked, self._reported = self._beats.steps.remote(), dict[int, int]()
         kind = ray.remote(num_cpus=config.threads or 1, scheduling_strategy="SPREAD", max_restarts=0)(Cars)
         self._cars = [kind.remote() for _ in range(config.processes)]
         self._where = ["Ray cluster"] * config.processes
@@ -69,12 +186,13 @@ class RayCollector(Collector):
 
     def _start(self, config: CollectorConfig, setup: RaceSetup, frames_per_batch: int) -> None:
         frames = -(-frames_per_batch // (len(self._cars) * config.cars)) * config.cars
+        threads = config.threads or 1
         factories = [
-            FarEnvFactory(
+            RemoteEnvFactory(
                 setup=setup,
                 worker=worker,
                 n_cars=config.cars,
-                threads=config.threads or 1,
+                threads=threads,
                 run_dir=self._run_dir,
                 heartbeat=None,
             )
@@ -96,21 +214,13 @@ class RayCollector(Collector):
         return self._joined(self._ask(lambda worker: self._cars[worker].drive.remote()))
 
     def publish_policy(self) -> None:
-        """Give the workers the policy's weights as they are now.
-
-        Raises:
-            RunFailed: a worker is lost.
-        """
+        """Give the workers the policy's weights as they are now."""
         # Once for each node, and not for each worker.
         weights = self._ray.put({name: w.detach().numpy() for name, w in self._policy.state_dict().items()})
         self._ask(lambda worker: self._cars[worker].take_weights.remote(weights))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the next batch depends on but the policy; see `Collector`.
-
-        Raises:
-            RunFailed: a worker is lost.
-        """
+        """Return the state of the cars after the last batch."""
         if not self._began:
             return dict(self._begun_from)
         states = self._ask(lambda worker: self._cars[worker].take_state.remote())
@@ -125,20 +235,17 @@ class RayCollector(Collector):
         ray_cluster.leave()
 
     def _joined(self, parts: Sequence[tuple[dict[Any, np.ndarray], str]]) -> TensorDictBase:
-        self._print("".join(printed for _, printed in parts))
+        printed = "".join(text for _, text in parts)
+        file = self._run_dir / REWARD_PRINTS
+        if printed and (not file.exists() or file.stat().st_size + len(printed) <= _LONGEST_PRINTS):
+            with file.open("a", encoding="utf-8", errors="backslashreplace") as out:
+                out.write(printed)
         batches = [batch for batch, _ in parts]
         # One copy: what Ray returns cannot be written.
         whole = {
             key: torch.from_numpy(np.concatenate([batch[key] for batch in batches])) for key in batches[0]
         }
-        steps = whole["action"].shape[1]
-        return TensorDict(whole, batch_size=[len(whole["action"]), steps])
-
-    def _print(self, text: str) -> None:
-        file = self._run_dir / REWARD_PRINTS
-        if text and (not file.exists() or file.stat().st_size + len(text) <= _LONGEST_PRINTS):
-            with file.open("a", encoding="utf-8", errors="backslashreplace") as out:
-                out.write(text)
+        return TensorDict(whole, batch_size=whole["action"].shape[:2])
 
     def _ask(self, ask: Callable[[int], Any], timeout_s: float | None = None) -> list[Any]:
         """Return the workers' answers in the order of the workers.
@@ -160,17 +267,17 @@ class RayCollector(Collector):
             if not waiting:
                 break
             now = time.monotonic()
-            told = self._steps()
+            reported = self._steps()
             for worker in waiting.values():
                 # A longer pause was ours: the whole run stopped with Ctrl-Z.
-                moved = told.get(worker) != steps.get(worker)
+                moved = reported.get(worker) != steps.get(worker)
                 idle_s[worker] = 0.0 if moved else idle_s[worker] + min(now - looked, 2 * _LOOK_EVERY_S)
                 if idle_s[worker] > timeout_s:
                     raise RunFailed(
                         f"collector worker {worker} ({self._where[worker]}) took no step for {timeout_s:.0f} s "
-                        f"(after {told.get(worker, 0)} steps) and was ended"
+                        f"(after {reported.get(worker, 0)} steps) and was ended"
                     )
-            steps, looked = told, now
+            steps, looked = reported, now
         return [answers[worker] for worker in range(len(self._cars))]
 
     def _answer(self, worker: int, reference: Any) -> Any:
@@ -188,14 +295,14 @@ class RayCollector(Collector):
             ) from error
 
     def _steps(self) -> dict[int, int]:
-        """Return what the workers have told last; it is never waited for."""
+        """Return what the workers have reported last; it is never waited for."""
         done, _ = self._ray.wait([self._asked], timeout=0)
         if done:
             try:
-                self._told = self._ray.get(self._asked)
+                self._reported = self._ray.get(self._asked)
             except self._ray.exceptions.RayError as error:
                 raise RunFailed(
                     "the process that counts the steps of the collector's workers is lost, or its node is gone"
                 ) from error
             self._asked = self._beats.steps.remote()
-        return self._told
+        return self._reported

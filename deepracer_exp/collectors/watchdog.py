@@ -24,18 +24,14 @@ class Watchdog:
 
     A worker that should be stepping and has not for `timeout_s` is killed, which the collector then reports as a
     lost process; `verdict` says that it hung. Of workers that die, the first is remembered: TorchRL ends the others
-    before it tells.
+    before it reports.
     """
 
     def __init__(self, heartbeat: Path, workers: int, timeout_s: float, lockstep: bool):
-        """Create the counters' file and start watching.
+        """Create the counters' file, one int64 per worker, and start watching.
 
-        Args:
-            heartbeat: file to create, one int64 per worker.
-            workers: number of workers.
-            timeout_s: seconds without a step that count as hanging.
-            lockstep: every worker delivers one part of each batch, and may rest until the next is asked for
-                (synchronous collection).
+        In `lockstep` (synchronous collection) every worker delivers one part of each batch, and may rest until the next
+        is asked for.
         """
         self._file = heartbeat
         np.full(workers, -1, np.int64).tofile(heartbeat)
@@ -56,7 +52,7 @@ class Watchdog:
         self._thread.start()
 
     def workers_started(self, processes: Sequence[BaseProcess]) -> None:
-        """Tell whom to watch."""
+        """Watch these processes."""
         self._processes = processes
         sentinels = [process.sentinel for process in processes]
 
@@ -103,10 +99,10 @@ class Watchdog:
 
     def _end(self, worker: int, idle_s: float, steps: int) -> None:
         known = worker in self.verdict
-        # Before the kill: whoever sees the death asks for the verdict.
+        # Before the kill: who sees the death asks for the verdict.
         self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
         if self._processes is None:
-            # They are still being started, and nothing says yet which is which: none of them can go on alone. Again
+            # They are still being started, and nothing says yet which is which: none of them can continue alone. Again
             # and again, because one may be started only now.
             for process in multiprocessing.active_children():
                 process.kill()
@@ -117,7 +113,7 @@ class Watchdog:
 
 
 def _end_fork_servers_children() -> None:
-    """End the workers that the fork server has forked; one of them may not have been told yet what it is.
+    """End the workers that the fork server has forked; one of them may not know yet what it is.
 
     Until it has read that, `multiprocessing` does not list it, and the training process waits for it to read.
     """

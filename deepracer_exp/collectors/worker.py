@@ -55,23 +55,19 @@ class EnvFactory:
         )
         if self.heartbeat is None:
             return _StateKeepingEnv(race, on_step=self._sign_of_life())
-        return _WorkerEnv(race, self._beat(self.heartbeat), self.run_dir, self.worker)
+        beats, worker = np.memmap(self.heartbeat, np.int64, "r+"), self.worker
+        beats[worker] = 0
+
+        def beat() -> None:
+            beats[worker] += 1
+
+        return _WorkerEnv(race, beat, self.run_dir, worker)
 
     def _prints(self) -> RewardPrints:
         return RewardPrints(self.run_dir / REWARD_PRINTS)
 
     def _sign_of_life(self) -> Callable[[], None] | None:
         return None
-
-    def _beat(self, heartbeat: Path) -> Callable[[], None]:
-        beats = np.memmap(heartbeat, np.int64, "r+")
-        worker = self.worker
-        beats[worker] = 0
-
-        def beat() -> None:
-            beats[worker] += 1
-
-        return beat
 
 
 class _StateKeepingEnv(RaceEnv):
@@ -82,7 +78,7 @@ class _StateKeepingEnv(RaceEnv):
         return {"race": self.race.state_dict(), "random": torch.get_rng_state().numpy()}
 
     def put_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `take_state` returned; the reset that follows leaves the cars there and draws nothing."""
+        """Continue from what `take_state` returned; the reset that follows leaves the cars there and draws nothing."""
         self.resume_from(state["race"])
         torch.set_rng_state(torch.from_numpy(state["random"]))
 

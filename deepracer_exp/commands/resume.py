@@ -67,10 +67,10 @@ def _resume(args: argparse.Namespace) -> int:
 
 def _deliver(run_dir: Path, uri: str | None, ended: Exception) -> int:
     """Deliver the points of an ended run that MLflow lacks; if there are none, raise that the run has ended."""
+    from deepracer_exp.runs.files import TRACKING
     from deepracer_exp.tracking.delivery import deliver
-    from deepracer_exp.tracking.tracking_file import NAME
 
-    if not (run_dir / NAME).exists():
+    if not (run_dir / TRACKING).exists():
         raise ended
     points = deliver(run_dir, uri or read_config(run_dir)["tracking"].get("uri"), run_dir.parent.parent)
     if not points:

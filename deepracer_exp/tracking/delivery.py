@@ -1,17 +1,18 @@
 """Record in MLflow, from a run folder, what the training could not record itself."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.files import METRICS, SUMMARY, read_metrics, read_object, read_run_id
+from deepracer_exp.runs.files import METRICS, SUMMARY, TRACKING, read_metrics, read_object, read_run_id
 
 from .metadata import END_TAG
 from .metrics import now_ms, points_at, points_of
-from .store import has_store, one_line, resolve_store
-from .tracking_file import NAME, Status, TrackedRun, TrackingFile
+from .store import Store, StoreRefusedError, StoreUnavailableError, has_store, one_line, resolve_store
+from .tracking_file import Status, TrackedRun, TrackingFile
 
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
@@ -45,23 +46,19 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
     metrics = run_dir / METRICS
     rows = read_metrics(metrics) if metrics.exists() else []
     store = resolve_store(uri, runs_dir)
-    file = TrackingFile.read(run_dir / NAME, store.shown)
-    from .mlflow_run import MLflowRun
-    from .store import StoreRefusedError, StoreUnavailableError
-
-    run = MLflowRun(store)
+    file = TrackingFile.read(run_dir / TRACKING, store.shown)
     try:
-        run.connect()
-        run.reopen(file.run)
-        file.change(run_id=run.run_id)
-        run.log_params(file.run.params)
-        written = run.log_metrics(
-            [point for row in rows for point in points_of(row, row["env_steps"], file.run.start_ms)]
-        )
-        _log_files(run, run_dir, file.run)
-        run.conclude(file.run, summary)
-        run.set_tags({END_TAG: f"{summary['status']}: {summary['reason']}"})
-        run.end(file.run.status or ENDS.get(summary["status"], "KILLED"), file.run.end_ms or now_ms())
+        with _connected(store) as run:
+            run.reopen(file.run)
+            file.change(run_id=run.run_id)
+            run.log_params(file.run.params)
+            written = run.log_metrics(
+                [point for row in rows for point in points_of(row, row["env_steps"], file.run.start_ms)]
+            )
+            _log_files(run, run_dir, file.run)
+            run.conclude(file.run, summary)
+            run.set_tags({END_TAG: f"{summary['status']}: {summary['reason']}"})
+            run.end(file.run.status or ENDS.get(summary["status"], "KILLED"), file.run.end_ms or now_ms())
     except StoreRefusedError as error:
         raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused it: {one_line(error)}") from error
     except StoreUnavailableError as error:
@@ -80,10 +77,10 @@ def deliver_evaluation(
     metrics: Mapping[str, float | None],
     files: Mapping[Path, str],
 ) -> None:
-    """Record the results of evaluating a checkpoint in MLflow; errors are logged.
+    """Record the results of evaluating a checkpoint of a recorded run in MLflow; errors are logged.
 
     Args:
-        run_dir: the run's folder; nothing happens if the run is not recorded.
+        run_dir: the run's folder.
         uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
         runs_dir: where runs are.
         env_steps: of the checkpoint.
@@ -94,18 +91,23 @@ def deliver_evaluation(
     if run_id is None or not has_store(uri, runs_dir):
         return
     store = resolve_store(uri, runs_dir)
-    from .mlflow_run import MLflowRun
-    from .store import StoreRefusedError, StoreUnavailableError
-
-    run = MLflowRun(store)
-    run.run_id = run_id
     try:
-        run.connect()
-        run.log_metrics(points_at(metrics, env_steps, now_ms()))
-        for file, folder in files.items():
-            run.log_artifact(file, folder)
+        with _connected(store) as run:
+            run.run_id = run_id
+            run.log_metrics(points_at(metrics, env_steps, now_ms()))
+            for file, folder in files.items():
+                run.log_artifact(file, folder)
     except (StoreRefusedError, StoreUnavailableError) as error:
         _log.warning("MLflow (%s): this evaluation was not recorded: %s", store.shown, one_line(error))
+
+
+@contextmanager
+def _connected(store: Store) -> "Iterator[MLflowRun]":
+    from .mlflow_run import MLflowRun
+
+    run = MLflowRun(store)
+    run.connect()
+    yield run
 
 
 def _log_files(run: "MLflowRun", run_dir: Path, tracked: TrackedRun) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.overrides import key_of
+from deepracer_exp.runs.files import BEST_LAP, REPORT
 from deepracer_exp.runs.lineage import Lineage
 
 from .metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
@@ -45,6 +46,9 @@ def param_text(value: Scalar) -> str:
     mark = f"… sha256:{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     return text[: LONGEST_PARAM - len(mark)] + mark
 
+
+NOTE = "mlflow.note.content"
+"""Tag of a run or an experiment that MLflow shows as its description."""
 
 PARENT = "mlflow.parentRunId"
 """Tag of a run that is nested under another one in the UI."""
@@ -92,12 +96,7 @@ EXPERIMENT_TAGS: Mapping[str, str] = {
 
 
 def study_view(objectives: Sequence[str], searched: Sequence[str]) -> dict[str, str]:
-    """Return the experiment tag that makes its runs table open with the columns of a study.
-
-    Args:
-        objectives: of the study; their columns come first.
-        searched: the parameters of the search space.
-    """
+    """Return the experiment tag that makes its runs table open with a study's objectives and searched parameters."""
     metrics = dict.fromkeys(map(trial_metric, (*objectives, "lap_time", "completion")))
     columns = [
         *(f"metrics.`{name}`" for name in metrics),
@@ -132,11 +131,7 @@ def run_params(
 ) -> dict[str, Scalar]:
     """Return the parameters by which runs are compared; the run's config.yaml has all values.
 
-    Args:
-        choices: the option of each group.
-        names: readable names of some choices.
-        config: all values of the experiment.
-        overrides: that it was composed from; their keys become parameters, too.
+    These are the choices, by readable names where there are some, what racers vary, and the keys of the overrides.
     """
     compared = {*_COMPARED, *({*map(key_of, overrides)} - choices.keys())}
     values = {
@@ -165,7 +160,7 @@ def run_tags(
         "run_dir": str(run_dir),
         "mlflow.source.name": "deepracer-exp train",
         "mlflow.source.type": "LOCAL",
-        "mlflow.note.content": (
+        NOTE: (
             f"{choices}\n\nRun folder: `{run_dir}`\n\n"
             f"Metrics, against control steps of all cars:\n\n{metrics}\n"
         ),
@@ -176,12 +171,6 @@ def run_tags(
         tags |= {"git_commit": git_commit, "mlflow.source.git.commit": git_commit}
     return tags
 
-
-NOTE = "mlflow.note.content"
-"""Tag of a run or an experiment that MLflow shows as its description."""
-
-PICTURE, REPORT = "best_lap.png", "report.html"
-"""Files of a run that its description shows or mentions."""
 
 WORKFLOW = "workflowType=machine_learning"
 """Part of an address that opens MLflow's pages for trainings: by default they open for language models, and no tag of
@@ -199,29 +188,19 @@ _RACE = {
 
 
 def race_result(metrics: Mapping[str, float | None]) -> str:
-    """Return an evaluation in words: ``race score 8.34 s, lap 8.21 s, 99.1 % of the lap``.
-
-    Args:
-        metrics: by name in MLflow; the part before the last slash is ignored.
-    """
+    """Return an evaluation, by MLflow's names, in words: ``race score 8.34 s, lap 8.21 s, 99.1 % of the lap``."""
     values = {name.rpartition("/")[2]: value for name, value in metrics.items()}
     parts = [words.format(values[name]) for name, words in _RACE.items() if values.get(name) is not None]
     return ", ".join(parts) or "no complete lap"
 
 
 def result_note(summary: Mapping[str, Any], run_id: str, files: Mapping[str, Any]) -> str:
-    """Return the result of a run, for the top of its description.
-
-    Args:
-        summary: its summary.json.
-        run_id: MLflow's.
-        files: of the run in MLflow.
-    """
+    """Return the result of a run, for the top of its description; `files` are those that MLflow has."""
     best = summary.get("best")
     lines = [f"**{summary['status']}**: {summary['reason']}"]
     if best is not None:
         lines.append(f"**Best policy, iteration {best['iteration']}**: {race_result(best_metrics(summary))}")
-    if PICTURE in files:
+    if BEST_LAP in files:
         lines.append(picture(run_id))
     if REPORT in files:
         lines.append(f"Report: `{REPORT}` among the artifacts.")
@@ -236,5 +215,5 @@ def experiment_note(best_run: str, run_id: str, experiment_id: str, metrics: Map
 
 def picture(run_id: str) -> str:
     """Return the Markdown for the picture of a run's fastest lap."""
-    address = f"get-artifact?path={PICTURE}&run_uuid={run_id}"
+    address = f"get-artifact?path={BEST_LAP}&run_uuid={run_id}"
     return f"The fastest lap of the training:\n\n![fastest lap]({address})"

@@ -80,11 +80,9 @@ def best_metrics(summary: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def evaluate_metric(column: str, track: str | None) -> str:
-    """Return MLflow's name of a result of `deepracer-exp evaluate`.
+    """Return MLflow's name of a result of `deepracer-exp evaluate`, on one of several tracks or on all.
 
-    Args:
-        column: of the same result in metrics.jsonl.
-        track: its label; None for the run's only track, or for all tracks together.
+    `column` is that of the same result in metrics.jsonl.
     """
     name = f"race/evaluate/{METRICS[column][0].removeprefix('race/')}"
     return name if track is None else f"{name}/{track}"
@@ -139,9 +137,6 @@ def track_metric(metric: str, label: str) -> str:
 Point = tuple[str, float, int, int]
 """Key, value, time in ms, step."""
 
-_STEP = "env_steps"
-_CLOCK = "wall_clock_s"
-
 
 def now_ms() -> int:
     """Return the time in ms since 1970."""
@@ -153,25 +148,16 @@ def points_of(row: Mapping[str, float | None], step: int, start_ms: int) -> tupl
 
     A point's time is the run's start plus the row's `wall_clock_s`, so that a row recorded again, even by another
     process, is the same point, which MLflow keeps once. A row without that column gets the current time.
-
-    Args:
-        row: its `env_steps` is the step and gives no point.
-        step: env steps.
-        start_ms: the run's start.
     """
-    clock_s = row.get(_CLOCK)
+    clock_s = row.get("wall_clock_s")
     time_ms = now_ms() if clock_s is None else start_ms + round(1000 * clock_s)
-    return points_at(metric_names({key: value for key, value in row.items() if key != _STEP}), step, time_ms)
+    return points_at(
+        metric_names({key: value for key, value in row.items() if key != "env_steps"}), step, time_ms
+    )
 
 
 def points_at(metrics: Mapping[str, float | None], step: int, time_ms: int) -> tuple[Point, ...]:
-    """Return the points of metrics, without None, NaN and infinite values.
-
-    Args:
-        metrics: by name in MLflow.
-        step: that they are recorded against.
-        time_ms: since 1970.
-    """
+    """Return the points of metrics by MLflow's names, without None, NaN and infinite values."""
     return tuple(
         (key, float(value), time_ms, step)
         for key, value in metrics.items()

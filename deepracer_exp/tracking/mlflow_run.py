@@ -40,7 +40,7 @@ class MLflowRun:
         self._store = store
         self._client: MlflowClient
         self._params: Mapping[str, str] = {}
-        self._goes_on = False
+        self._is_reopened = False
         self._there: dict[str, dict[int, float]] = {}
         self._contradicted: set[tuple[str, int]] = set()
 
@@ -68,14 +68,10 @@ class MLflowRun:
                 self.run_id = run.info.run_id
 
     def create_once(self, tracked: TrackedRun, mark: Sequence[str]) -> None:
-        """Create a run, or reopen the oldest one in its experiment that has the same values of some tags.
+        """Create a run, or reopen the oldest one in its experiment that has the same values of the tags `mark`.
 
         Of two processes that create it at once, one sees the other's, continues that and deletes its own; MLflow has
         no way to be sure of it, so that rarely there may be two.
-
-        Args:
-            tracked: of the run.
-            mark: tags that identify it.
         """
         sought = {key: tracked.tags[key] for key in mark}
         with store_errors():
@@ -105,7 +101,7 @@ class MLflowRun:
             if END_TAG in run.data.tags and END_TAG not in tracked.tags:
                 self._client.delete_tag(self.run_id, END_TAG)
         self._params = run.data.params
-        self._goes_on = True
+        self._is_reopened = True
         self._there = {}
         # MLflow's own tags, such as the description, may have been edited in the UI.
         self.set_tags({key: value for key, value in tracked.tags.items() if not key.startswith("mlflow.")})
@@ -120,7 +116,7 @@ class MLflowRun:
     def log_metrics(self, points: Sequence[Point]) -> int:
         """Write points, for a reopened run only the missing ones, and return their number."""
         with store_errors():
-            missing = [point for point in points if not self._has(point)] if self._goes_on else points
+            missing = [point for point in points if not self._has(point)] if self._is_reopened else points
             for start in range(0, len(missing), MAX_METRICS_PER_BATCH):
                 chunk = [Metric(*point) for point in missing[start : start + MAX_METRICS_PER_BATCH]]
                 self._client.log_batch(self.run_id, metrics=chunk)

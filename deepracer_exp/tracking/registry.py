@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +13,9 @@ from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
 from deepracer_exp.runs.clean import StoreOverview
-from deepracer_exp.runs.files import CHECKPOINTS, METRICS, read_metrics, read_run_id
+from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, read_metrics, read_run_id
 
-from .metadata import PICTURE, REPORT, picture, race_result
+from .metadata import picture, race_result
 from .metrics import metric_names
 from .store import open_client, pages
 
@@ -55,11 +55,7 @@ def is_alias(text: str) -> bool:
 
 
 def check_alias(what: str, alias: str) -> None:
-    """Refuse an invalid alias; `what` begins the message.
-
-    Raises:
-        BadInput: it is invalid.
-    """
+    """Refuse an invalid alias; `what` begins the message."""
     if not is_alias(alias):
         raise BadInput(
             f"{what}: {alias!r} is not an alias; accepted: a letter, then letters, digits, '_' and '-', at most 80; "
@@ -68,11 +64,7 @@ def check_alias(what: str, alias: str) -> None:
 
 
 def check_model(what: str, model: str) -> None:
-    """Refuse an invalid model name; `what` begins the message.
-
-    Raises:
-        BadInput: it is invalid.
-    """
+    """Refuse an invalid model name; `what` begins the message."""
     try:
         safe_name(model)
     except ValueError as error:
@@ -80,34 +72,30 @@ def check_model(what: str, model: str) -> None:
 
 
 def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
-    """Look up `MODEL@ALIAS`, or `ALIAS` if exactly one model has it.
-
-    Args:
-        reference: either.
-        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
-        runs_dir: where runs are.
+    """Look up `MODEL@ALIAS`, or `ALIAS` if exactly one model has it, in a store as of `open_client`.
 
     Raises:
         BadInput: no model or several have it, it was not registered by us, or the store does not answer.
     """
-    what = reference
     model, at, alias = reference.rpartition("@")
-    check_alias(what, alias)
+    check_alias(reference, alias)
     if at:
-        check_model(what, model)
-    with open_client(what, uri, runs_dir) as client:
-        known = [(found.name, name) for found in _models(client) for name in found.aliases]
+        check_model(reference, model)
+    with open_client(reference, uri, runs_dir) as client:
+        known = [
+            (found.name, name) for found in pages(client.search_registered_models) for name in found.aliases
+        ]
         matches = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
         if len(matches) == 1:
             version = client.get_model_version_by_alias(*matches[0])
-            return _registered(what, version, alias)
+            return _registered(reference, version, alias)
     names = [f"{name}@{given}" for name, given in known]
     if matches:
         raise BadInput(
-            f"{what}: ambiguous: {len(matches)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS"
+            f"{reference}: ambiguous: {len(matches)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS"
         )
     raise BadInput(
-        f"{what}: no registered model has this alias{nearest(reference, names)}; "
+        f"{reference}: no registered model has this alias{nearest(reference, names)}; "
         f"known: {', '.join(names[:10]) or 'none'}; deepracer-exp runs promote registers one"
     )
 
@@ -127,8 +115,8 @@ def promote(
         model: name, created if it does not exist.
         alias: moved from the version that has it.
         features: names of the policy's observations.
-        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
-        runs_dir: where runs are.
+        uri: the store, as of `open_client`.
+        runs_dir: likewise.
 
     Raises:
         BadInput: a name is invalid, the checkpoint is missing or corrupt, the run is not recorded in this store or was
@@ -143,11 +131,7 @@ def promote(
         raise BadInput(
             f"{run}: is not recorded in MLflow (another tracking=, or the store was down), so it cannot be registered"
         )
-    tags = {
-        _RUN_DIR: str(run.resolve()),
-        _CHECKPOINT: folder.name,
-        _SHA256: checkpoint_sha256(folder),
-    }
+    tags = {_RUN_DIR: str(run.resolve()), _CHECKPOINT: folder.name, _SHA256: checkpoint_sha256(folder)}
     what = f"promote {run.name}"
     with open_client(what, uri, runs_dir) as client:
         recorded = client.get_run(run_id)
@@ -155,7 +139,7 @@ def promote(
         raise BadInput(f"{what}: was deleted in MLflow (run {run_id}); restore it there")
     pin(run / CHECKPOINTS, folder.name, f"registered as {model}")
     with open_client(what, uri, runs_dir) as client:
-        if not any(found.name == model for found in _models(client)):
+        if not any(found.name == model for found in pages(client.search_registered_models)):
             client.create_registered_model(
                 model, description=f"Policies of `deepracer-exp`, experiment `{model}`."
             )
@@ -211,7 +195,7 @@ def _log_model(
     )
     with tempfile.TemporaryDirectory() as aside:
         described.save(str(Path(aside) / "MLmodel"))
-        for name in (PICTURE, REPORT):
+        for name in (BEST_LAP, REPORT):
             if (run / name).exists():
                 shutil.copy(run / name, aside)
         client.log_model_artifacts(logged.model_id, aside)
@@ -287,7 +271,3 @@ def _folder(run: Path, name: str) -> Path:
             f"checkpoint={name}: {folder} does not exist; accepted: best, last or the iteration of a checkpoint"
         )
     return folder.resolve()
-
-
-def _models(client: "MlflowClient") -> Iterator[Any]:
-    return pages(client.search_registered_models)

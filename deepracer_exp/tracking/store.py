@@ -3,7 +3,6 @@
 MLflow takes seconds to import, so that only what opens a store imports it.
 """
 
-import fcntl
 import logging
 import os
 import re
@@ -13,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
+
+from filelock import FileLock
 
 from deepracer_exp.addresses import redact, with_password, without_passwords
 from deepracer_exp.errors import BadInput, nearest
@@ -84,8 +85,7 @@ class Store:
         if (file := self.sqlite_file) is None:
             yield
             return
-        with open(f"{file}.lock", "w", encoding="utf-8") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with FileLock(f"{file}.lock"):
             yield
 
 
@@ -187,12 +187,7 @@ def has_store(uri: str | None, runs_dir: Path) -> bool:
 
 
 def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
-    """Return the folder of a recorded run.
-
-    Args:
-        run_id: MLflow's.
-        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
-        runs_dir: where runs are.
+    """Return the folder of a recorded run in a store as of `open_client`.
 
     Raises:
         BadInput: the store has no such run, it was deleted there, or the store does not answer.

@@ -45,10 +45,8 @@ class StoreThread:
     def __init__(self, store: Store, meanwhile: str, on_rejected: Callable[[], None] = lambda: None) -> None:
         """Start the thread, which opens the store.
 
-        Args:
-            store: to record in.
-            meanwhile: what continues while the store does not answer, for the log.
-            on_rejected: called by the thread when it ends because a vital call was refused.
+        `meanwhile` says what continues while the store does not answer; the thread calls `on_rejected` when it ends
+        because a vital call was refused.
         """
         self.run: MLflowRun | None = None
         self.is_rejected = False
@@ -66,13 +64,7 @@ class StoreThread:
         self._thread.start()
 
     def put(self, what: str, do: "Callable[[MLflowRun, bool], object]", vital: bool = False) -> None:
-        """Make a call later.
-
-        Args:
-            what: it writes, for the log.
-            do: the call; its bool says whether it is a repetition.
-            vital: whether the thread ends if it is refused.
-        """
+        """Make a call later; its bool says whether it is a repetition, `what` it writes is for the log."""
         with self._changed:
             self._calls.append(_Call(what, do, vital))
             self._changed.notify()

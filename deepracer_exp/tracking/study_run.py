@@ -8,21 +8,14 @@ import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.config.running import MLflowTracking, TrackingConfig
 
-from .metadata import END_TAG, PARENT, param_text, study_view
+from .metadata import END_TAG, NOTE, PARENT, param_text, study_view
 from .metrics import now_ms, points_at, trial_metrics
-from .store import (
-    Store,
-    StoreRefusedError,
-    StoreUnavailableError,
-    one_line,
-    resolve_store,
-)
+from .store import Store, StoreRefusedError, StoreUnavailableError, one_line, resolve_store
 from .store_thread import StoreThread
 from .tracking_file import Status, TrackedRun
 
@@ -31,6 +24,8 @@ if TYPE_CHECKING:
 
 STUDY, SEARCH, KIND, TRIAL = "sweep.study", "sweep.search", "sweep.kind", "sweep.trial"
 """Tags: the study's name, a hash of what it searches, `study` or `trial`, the number of the trial."""
+_SOURCE = {"mlflow.source.name": "deepracer-exp sweep", "mlflow.source.type": "LOCAL"}
+_ENDS = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "interrupted"}
 
 _log = logging.getLogger(__name__)
 
@@ -85,17 +80,11 @@ class StudyRun:
         space: Mapping[str, str],
         base: Sequence[str],
     ) -> None:
-        """Start creating or finding the run.
-
-        Args:
-            store: where trials are recorded.
-            study: its name, which is also the experiment of its runs.
-            objectives: what trials are compared by.
-            space: search expressions by key.
-            base: overrides of all trials.
-        """
-        self._store = store
-        self._tracked = _tracked_study(store, study, space, base)
+        """Start creating or finding the run of a search: expressions by key, and overrides of all trials."""
+        params = _params(space, base)
+        search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
+        tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE}
+        self._tracked = TrackedRun(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
         self._lock = threading.Lock()
@@ -125,16 +114,15 @@ class StudyRun:
             self._progress = progress
         self._thread.put("the study's progress", self._write_progress)
 
-    def log_files(self, files: Sequence[Path], folder: str | None = None) -> None:
-        """Store files, such as the report, with the run; they are read later, and replace files of the same names."""
-        for path in files:
-            self._thread.put(f"file {path}", partial(_log_file, path, folder))
+    def log_file(self, path: Path) -> None:
+        """Store a file with the run, such as the report; it is read later, and replaces one of the same name."""
+        self._thread.put(f"file {path}", lambda run, _: run.log_artifact(path, None))
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
         """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
-        is_ended = self._thread.finish(lambda run, _: self._end(run, status), deadline_s)
+        is_ended = self._thread.finish(lambda run, _: _end(run, status, _ENDS[status]), deadline_s)
         if not is_ended:
-            _log.warning("MLflow (%s): the study's run could not be marked %s", self._store.shown, status)
+            _log.warning("MLflow (%s): the study's run could not be marked %s", self._tracked.store, status)
         return is_ended
 
     def _begin(self, run: "MLflowRun", _: bool) -> None:
@@ -163,14 +151,14 @@ class StudyRun:
             raise
 
     def _write(self, run: "MLflowRun", progress: Progress) -> None:
-        tags = {"sweep.progress": str(progress), "mlflow.note.content": self._note(progress)}
+        tags = {"sweep.progress": str(progress), NOTE: self._note(progress)}
         if progress.best_trial is not None:
             tags["sweep.best_trial"] = str(progress.best_trial)
         metrics = trial_metrics(
             {"lap_time": progress.lap_time_s, "completion": progress.completion, **progress.best_values}
         )
-        metrics |= {"study/complete": progress.complete, "study/pruned": progress.pruned}
-        metrics |= {"study/failed": progress.failed, "study/env_steps": progress.env_steps}
+        counts = ("complete", "pruned", "failed", "env_steps")
+        metrics |= {f"study/{name}": getattr(progress, name) for name in counts}
         run.set_tags(tags)
         if self._is_late:
             self._adopt(run)
@@ -190,22 +178,12 @@ class StudyRun:
             line = " \\\n    ".join([f"{command} {what}", *words])
             lines.append(f"```\n{line}\n```")
         params = self._tracked.params
-        for title, keys in (
-            ("Searched", self._searched),
-            ("All trials", params.keys() - set(self._searched)),
-        ):
+        shared = params.keys() - set(self._searched)
+        for title, keys in (("Searched", self._searched), ("All trials", shared)):
             if listed := [f"- `{key}`: `{value}`" for key, value in params.items() if key in keys]:
                 lines.append("\n".join([f"{title}:", "", *listed]))
         lines.append("Pictures: `sweep.html` among the artifacts.")
         return "\n\n".join(lines)
-
-    def _end(self, run: "MLflowRun", status: Status) -> None:
-        run.set_tags({END_TAG: {"FINISHED": "finished", "FAILED": "failed"}.get(status, "interrupted")})
-        run.end(status, now_ms())
-
-
-def _log_file(path: Path, folder: str | None, run: "MLflowRun", _: bool) -> None:
-    run.log_artifact(path, folder)
 
 
 def open_study_run(
@@ -216,11 +194,7 @@ def open_study_run(
     space: Mapping[str, str],
     base: Sequence[str],
 ) -> StudyRun | None:
-    """Start the run of a study; None unless `tracking=mlflow`.
-
-    Raises:
-        BadInput: `tracking.uri` can never work.
-    """
+    """Start the run of a study; None unless `tracking=mlflow`."""
     if not isinstance(config, MLflowTracking):
         return None
     return StudyRun(resolve_store(config.uri, runs_dir), study, objectives, space, base)
@@ -236,22 +210,12 @@ def open_trial_run(
 ) -> str | None:
     """Return the id in MLflow of the run that groups the seeds of a trial, created on the first call.
 
-    Args:
-        store: where trials are recorded.
-        study: its name.
-        trial: number of the trial.
-        parent_run_id: of the study's run.
-        base: overrides of the trial.
-        deadline_s: longest time to wait.
-
-    Returns:
-        None if the store refuses or does not answer; the seeds are then nested under the study itself.
+    None if the store refuses or does not answer; the seeds are then nested under the study itself.
     """
     tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE}
     tracked = TrackedRun(None, f"trial {trial}", study, now_ms(), store.shown, _params({}, base), tags)
 
     def open_run(run: "MLflowRun") -> None:
-        run.connect()
         run.create_once(tracked, (STUDY, KIND, TRIAL, PARENT))
         run.log_params(tracked.params)
 
@@ -259,37 +223,21 @@ def open_trial_run(
 
 
 def end_trial_run(
-    store: Store,
-    study: str,
-    run_id: str,
-    status: Status,
-    reason: str,
-    values: Mapping[str, float | None],
-    deadline_s: float = 30.0,
+    store: Store, study: str, run_id: str, status: Status, reason: str, values: Mapping[str, float | None]
 ) -> None:
-    """End the run that groups the seeds of a trial.
-
-    Args:
-        store: where trials are recorded.
-        study: its name.
-        run_id: of the run.
-        status: in MLflow.
-        reason: of the end.
-        values: metrics of the trial, means over its seeds.
-        deadline_s: longest time to wait.
-    """
+    """End the run of a trial with its values by metric; errors are logged."""
 
     def end_run(run: "MLflowRun") -> None:
-        run.connect()
         run.reopen(TrackedRun(run_id, "", study, 0, store.shown))
         run.log_metrics(points_at(values, 0, now_ms()))
-        run.set_tags({END_TAG: reason})
-        run.end(status, now_ms())
+        _end(run, status, reason)
 
-    _within(deadline_s, store, f"run {run_id} was not ended there", end_run)
+    _within(30.0, store, f"run {run_id} was not ended there", end_run)
 
 
-_SOURCE = {"mlflow.source.name": "deepracer-exp sweep", "mlflow.source.type": "LOCAL"}
+def _end(run: "MLflowRun", status: Status, reason: str) -> None:
+    run.set_tags({END_TAG: reason})
+    run.end(status, now_ms())
 
 
 def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLflowRun], None]") -> str | None:
@@ -305,6 +253,7 @@ def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLfl
 
         run = MLflowRun(store)
         try:
+            run.connect()
             call(run)
             done.append(run.run_id)
         except (StoreRefusedError, StoreUnavailableError) as error:
@@ -318,13 +267,6 @@ def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLfl
     reason = reasons[0] if reasons else f"no answer within {deadline_s:g} s"
     _log.warning("MLflow (%s): %s: %s", store.shown, failure, reason)
     return None
-
-
-def _tracked_study(store: Store, study: str, space: Mapping[str, str], base: Sequence[str]) -> TrackedRun:
-    params = _params(space, base)
-    search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode()).hexdigest()[:12]
-    tags = {STUDY: study, SEARCH: search, KIND: "study", **_SOURCE}
-    return TrackedRun(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
 
 
 def _params(space: Mapping[str, str], base: Sequence[str]) -> dict[str, str]:

@@ -11,7 +11,6 @@ from typing import Any, Literal
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 
-NAME = "tracking.json"
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 _log = logging.getLogger(__name__)
@@ -53,9 +52,6 @@ class TrackingFile:
         """Read an earlier run's file, to continue recording in `store` (without password).
 
         For another store the id is dropped, because the run may have another one there, or none yet.
-
-        Raises:
-            BadInput: it is missing or invalid.
         """
         run = read_tracked_run(path)
         return cls(path, run if run.store == store else replace(run, run_id=None, store=store))
@@ -120,15 +116,7 @@ def read_tracked_run(path: Path) -> TrackedRun:
 
 
 def begin_again(path: Path, run_dir: Path) -> None:
-    """Turn a copied `tracking.json` into that of a new run.
-
-    Args:
-        path: the copy.
-        run_dir: the new run's folder.
-
-    Raises:
-        BadInput: as for `read_tracked_run`.
-    """
+    """Turn a copied `tracking.json` into that of the new run in `run_dir`."""
     run = read_tracked_run(path)
     tags = {**run.tags, "run_dir": str(run_dir.resolve())}
     atomic_write(path, json.dumps(asdict(replace(run, run_id=None, tags=tags)), indent=1) + "\n")

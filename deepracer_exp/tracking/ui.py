@@ -53,11 +53,7 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
 
 
 def existing_store(runs_dir: Path, uri: str | None) -> Store:
-    """Return the store if it exists.
-
-    Raises:
-        BadInput: `uri` is unusable, or names an SQLite file that does not exist.
-    """
+    """Return the store; refuse an SQLite file that does not exist."""
     default = runs_dir / MLFLOW_DB
     if uri is None and not default.exists():  # resolve_store would create runs_dir
         raise BadInput(
@@ -71,31 +67,15 @@ def existing_store(runs_dir: Path, uri: str | None) -> Store:
 
 @contextmanager
 def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Run MLflow's server on `port` of 127.0.0.1 and yield its address and process once it answers.
-
-    Raises:
-        BadInput: the port is taken.
-        RunFailed: the server did not start.
-    """
+    """Run MLflow's server on `port` of 127.0.0.1 and yield its address and process once it answers."""
     if not _is_free(port):
         free = next((other for other in range(port + 1, 65536) if _is_free(other)), None)
         raise BadInput(f"port={port}: already in use on {_HOST}" + (f"; {free} is free" if free else ""))
     with store.creation_lock():
         pass  # wait for a first training that is creating the tables
-    command = [
-        sys.executable,
-        "-m",
-        "mlflow",
-        "server",
-        "--host",
-        _HOST,
-        "--port",
-        str(port),
-        "--workers",
-        "1",
-    ]
     # Artifacts are read from where the experiment stores them; nothing is uploaded through the UI.
-    command += ["--no-serve-artifacts"]
+    options = f"--host {_HOST} --port {port} --workers 1 --no-serve-artifacts"
+    command = [sys.executable, "-m", "mlflow", "server", *options.split()]
     if store.artifact_location:
         command += ["--default-artifact-root", store.artifact_location]
     environment = {
@@ -115,16 +95,7 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
 
 
 def runs_page(url: str, uri: str | None, runs_dir: Path) -> str:
-    """Return the address of the runs table with the newest run, with its racing columns.
-
-    Args:
-        url: of the UI.
-        uri: its store, as in `tracking.uri`; None: the one in `runs_dir`.
-        runs_dir: where runs are.
-
-    Raises:
-        BadInput: the store does not answer.
-    """
+    """Return the address, in the UI at `url`, of the runs table with the newest run, with its racing columns."""
     with open_client(f"ui of {url}", uri, runs_dir) as client:
         known = {one.experiment_id: one for one in pages(client.search_experiments)}
         newest = client.search_runs(list(known), max_results=1, order_by=["attributes.start_time DESC"])

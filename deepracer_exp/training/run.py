@@ -41,9 +41,8 @@ from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.read_checkpoint import intact_checkpoint, read_training
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking import tracking_file
-from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
-from deepracer_exp.tracking.tracker import Tracker
+from deepracer_exp.tracking.tracker import Tracker, open_tracker
 
 from .budget import Budget, refuse_spent
 from .callbacks import BUDGET_REACHED, standard_callbacks

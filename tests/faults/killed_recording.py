@@ -16,8 +16,8 @@ from pathlib import Path
 
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.tracking.mlflow_run import MLflowRun
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import MLflowTracker
 
 ITERATIONS = 160
 CHECKPOINT_EVERY = 12

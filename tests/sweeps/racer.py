@@ -16,22 +16,11 @@ def _ready() -> None:
     sys.stdin.readline()
 
 
-def _engine(url: str) -> sa.Engine:
-    return sa.create_engine(url, **resolve_database(url, Path()).engine_options())
-
-
-def table(url: str, owner: str) -> None:
-    """Make the table."""
-    engine = _engine(url)
-    _ready()
-    TrialClaims(engine, "study")
-    print("made", flush=True)
-
-
 def claim(url: str, owner: str, total: str, lease_s: str) -> None:
     """Claim trials, each under another name, until there are none."""
-    claims = TrialClaims(_engine(url), "study")
+    engine = sa.create_engine(url, **resolve_database(url, Path()).engine_options())
     _ready()
+    claims = TrialClaims(engine, "study")
     count = 0
     while (claim := claims.claim(f"{owner}.{count}", int(total), float(lease_s))) is not None:
         print(claim.index, claim.attempt, claim.trial_id, flush=True)
@@ -58,4 +47,4 @@ def storage(url: str, owner: str, trials: str) -> None:
 
 
 if __name__ == "__main__":
-    {"table": table, "claim": claim, "storage": storage}[sys.argv[1]](*sys.argv[2:])
+    {"claim": claim, "storage": storage}[sys.argv[1]](*sys.argv[2:])

@@ -21,20 +21,6 @@ def test_the_fastest_complete_trial_is_the_best_and_a_pruned_one_never(tmp_path)
     assert (best_trial(study).number, best_values(study)) == (1, [9.0])
 
 
-def test_more_completion_is_better(tmp_path):
-    study = new_study(tmp_path, objectives=["completion"])
-    for completion in (80.0, 95.0, 90.0):
-        add(study, [completion])
-    assert best_trial(study).number == 1
-
-
-def test_with_lap_time_and_completion_a_fast_car_that_rarely_finishes_is_not_the_best(tmp_path):
-    study = new_study(tmp_path, objectives=["lap_time", "completion"])
-    for values in ((8.0, 40.0), (9.0, 98.0), (11.0, 100.0), (60.0, 0.0)):
-        add(study, values)
-    assert best_trial(study).number == 1
-
-
 def test_on_fresh_laps_another_trial_may_win(tmp_path):
     study = new_study(tmp_path)
     for score in (9.0, 9.1, 12.0):
@@ -110,37 +96,43 @@ def test_best_of_a_study_leads_to_the_run_of_its_best_trial(tmp_path):
     assert (best.study, best.trial, best.values) == ("lr_entropy", 0, {"race_score": 9.5})
 
 
-@pytest.mark.parametrize("name", ["../elsewhere", "/etc", "..", ".", "", "a/b", "a\\b", "seed-0\n", 3, None])
-def test_a_path_in_place_of_a_name_is_refused(tmp_path, name):
+@pytest.mark.parametrize(
+    ("objectives", "values"),
+    [
+        (["completion"], [[80.0], [95.0], [90.0]]),
+        # A fast car that rarely finishes is not the best.
+        (["lap_time", "completion"], [(8.0, 40.0), (9.0, 98.0), (11.0, 100.0), (60.0, 0.0)]),
+    ],
+)
+def test_more_completion_is_better(tmp_path, objectives, values):
+    study = new_study(tmp_path, objectives=objectives)
+    for one in values:
+        add(study, one)
+    assert best_trial(study).number == 1
+
+
+ELSEWHERE = ["../elsewhere", "/etc", "..", ".", "", "a/b", "a\\b", "seed-0\n", 3, None]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        *(
+            (json.dumps({"study": "s", "trial": 0, "run_dir": name, "values": {}}), "run_dir")
+            for name in ELSEWHERE
+        ),
+        *((text, BEST_OF_SWEEP) for text in ("", "[]", "{", '{"study": "x"}', '{"study": "x", "trial": -1}')),
+        ('{"study": "s", "trial": 7, "run_dir": "gone", "values": {}}', "run gone of trial 7 is gone"),
+        ('{"study": "s", "trial": 0, "run_dir": "link", "values": {}}', "leads out of"),
+    ],
+)
+def test_a_file_that_leads_to_no_run_of_the_sweep_is_refused_in_one_line(tmp_path, text, words):
     write_metrics(tmp_path / "elsewhere", 1)
     folder = tmp_path / "study"
     folder.mkdir()
-    stored = {"study": "study", "trial": 0, "run_dir": name, "values": {}}
-    (folder / BEST_OF_SWEEP).write_text(json.dumps(stored))
-    with pytest.raises(BadInput, match="run_dir") as refused:
+    assert best_run_of_sweep(folder) is None
+    (folder / "link").symlink_to(tmp_path / "elsewhere")
+    (folder / BEST_OF_SWEEP).write_text(text)
+    with pytest.raises(BadInput, match=words) as refused:
         best_run_of_sweep(folder)
     assert "\n" not in str(refused.value)
-
-
-def test_a_link_out_of_the_folder_is_refused(tmp_path):
-    write_metrics(tmp_path / "elsewhere", 1)
-    folder = tmp_path / "study"
-    folder.mkdir()
-    (folder / "run").symlink_to(tmp_path / "elsewhere")
-    (folder / BEST_OF_SWEEP).write_text('{"study": "study", "trial": 0, "run_dir": "run", "values": {}}')
-    with pytest.raises(BadInput, match="leads out of"):
-        best_run_of_sweep(folder)
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"study": "x"}', '{"study": "x", "trial": -1}'])
-def test_a_file_that_no_sweep_has_written_is_refused(tmp_path, text):
-    (tmp_path / BEST_OF_SWEEP).write_text(text)
-    with pytest.raises(BadInput, match=BEST_OF_SWEEP):
-        best_run_of_sweep(tmp_path)
-
-
-def test_a_best_run_that_is_gone_is_refused(tmp_path):
-    assert best_run_of_sweep(tmp_path) is None
-    (tmp_path / BEST_OF_SWEEP).write_text('{"study": "s", "trial": 7, "run_dir": "run", "values": {}}')
-    with pytest.raises(BadInput, match="run run of trial 7 is gone"):
-        best_run_of_sweep(tmp_path)

@@ -34,10 +34,6 @@ def test_an_expired_lease_is_taken_over_exactly_once(url, claims, race):
     assert taken == ["0 2 40", "1 2 41"]
 
 
-def test_processes_may_create_the_table_together(url, race):
-    assert race("table", url, THREE).lines() == [["made"]] * 3
-
-
 def test_no_write_of_a_late_owner_is_kept(claims):
     late = claims.claim("late", 1, 0.0)
     heir = claims.claim("heir", 1, HOUR_S)
@@ -63,18 +59,16 @@ def test_the_next_owner_gets_what_the_earlier_one_recorded(claims):
     assert (heir.trial_id, heir.runs) == (3, tuple(runs))
 
 
-def test_an_expired_lease_can_be_renewed_until_it_is_taken_over(claims):
-    claim = claims.claim("slow", 1, 0.0)
-    assert claims.all()[0].expired
-    assert claims.renew(claim, HOUR_S)
-    assert not claims.all()[0].expired
-    assert claims.claim("other", 1, HOUR_S) is None
-
-
 def test_a_lease_expires_by_itself_and_not_before(claims):
     lease_s = 2.0
+    late = claims.claim("late", 1, 0.0)
+    assert claims.all()[0].expired
+    assert claims.renew(late, HOUR_S, {"completion": 12.5}), "until another worker takes it over"
+    assert claims.claim("other", 1, HOUR_S) is None
     began = time.monotonic()
-    claim = claims.claim("slow", 1, lease_s)
+    assert claims.renew(late, lease_s)
+    claim = claims.all()[0]
+    assert claim.progress == {"completion": 12.5}
     until = time.monotonic() + 60.0
     while (heir := claims.claim("heir", 1, HOUR_S)) is None:
         assert time.monotonic() < until
@@ -142,13 +136,6 @@ def test_studies_of_one_database_share_no_claim(engine, claims):
     assert other.settle(its, result("FAIL"))
     assert not claims.is_done(1)
     assert claims.renew(mine, HOUR_S)
-
-
-def test_progress_stays_until_the_next_one(claims):
-    claim = claims.claim("one", 1, HOUR_S)
-    assert claims.renew(claim, HOUR_S, {"completion": 12.5})
-    assert claims.renew(claim, HOUR_S)
-    assert claims.all()[0].progress == {"completion": 12.5}
 
 
 def test_kills_in_the_middle_of_claiming_lose_and_double_no_trial(url, claims, race):

@@ -1,5 +1,4 @@
 import itertools
-import math
 import random
 
 import numpy as np
@@ -7,7 +6,7 @@ import optuna
 import pytest
 
 from deepracer_exp.errors import BadInput
-from sweeps.figures import FEWEST_COMPLETE, figures, narrowed, thinned, usual_range
+from sweeps.figures import FEWEST_COMPLETE, figures, narrowed, thinned
 from sweeps.labels import OUTCOMES, outcome_of, short_keys
 
 from .studies import DISTRIBUTIONS, add, new_study, season
@@ -65,33 +64,17 @@ def test_a_few_failures_take_no_room_from_the_others(tmp_path, objective, usual,
     assert low < min(usual) < max(usual) < high
 
 
-def test_an_axis_has_room_where_all_trials_are_equal():
-    low, high = usual_range([9.0, 9.0], minimize=True)
-    assert low < 9.0 < high
-
-
 def test_the_decisive_parameter_is_the_most_important(drawn):
     (bars,) = drawn["importance"].data
     assert bars.y[-1] == "lr"
     assert sum(bars.x) == pytest.approx(1, abs=0.001)
 
 
-def test_importance_of_a_few_trials_is_not_shown(tmp_path):
-    study, dice = new_study(tmp_path), random.Random(3)
-    for _ in range(FEWEST_COMPLETE):
-        assert "importance" not in figures(study)
-        lr = 10 ** dice.uniform(-5, -3)
-        add(
-            study,
-            [8 + abs(math.log10(lr) + 3.5)],
-            params={"algorithm.lr": lr, "algorithm.entropy_coeff": dice.uniform(0, 0.05)},
-        )
-    assert "importance" in figures(study)
-
-
 def test_several_objectives_have_a_figure_each_and_a_pareto_front(tmp_path):
     study, dice = new_study(tmp_path, objectives=["lap_time", "completion"]), random.Random(2)
-    for _ in range(30):
+    for made in range(30):
+        if made == FEWEST_COMPLETE - 1:
+            assert not [name for name in figures(study) if "importance" in name], "of so few it is chance"
         params = {
             "algorithm.lr": 10 ** dice.uniform(-5, -3),
             "algorithm.entropy_coeff": dice.uniform(0, 0.05),

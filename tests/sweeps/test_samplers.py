@@ -11,7 +11,6 @@ from optuna.trial import TrialState, create_trial
 from deepracer_exp.config.sweep import SweepConfig, compose_sweep
 from deepracer_exp.errors import BadInput
 from sweeps.samplers import build_sampler
-from sweeps.space import SearchSpace
 
 NAMES = ("tpe", "gp", "cmaes", "qmc", "random", "nsga2")
 """Every sampler that searches ranges; grid has a space of its own."""
@@ -128,28 +127,6 @@ def test_a_trial_draws_by_its_index_whatever_its_number(name):
     assert drawn(others=0) == drawn(others=3)
 
 
-def test_tpe_keeps_away_from_the_values_of_running_trials():
-    space = {one.key: one.distribution for one in Space.dimensions if one.key.startswith("algorithm")}
-    center = {"algorithm.lr": 1e-4, "algorithm.entropy_coeff": 0.01}
-
-    def next_distances(state: TrialState) -> list[float]:
-        """Return how far from the centre the next trial is, in decades of lr, for some seeds."""
-        distances = []
-        for seed in range(20):
-            study = optuna.create_study(sampler=build_sampler(settings("tpe", seed=seed), Space()))
-            for lr in np.geomspace(1e-5, 1e-3, 11):
-                params = {"algorithm.lr": lr, "algorithm.entropy_coeff": 0.01}
-                study.add_trial(create_trial(params=params, distributions=space, value=score(params)))
-            for _ in range(6):
-                study.add_trial(create_trial(params=center, distributions=space, state=state))
-            trial = study.ask(space)
-            distances.append(abs(np.log10(trial.params["algorithm.lr"]) + 4))
-        return distances
-
-    # A failed trial says nothing of its values.
-    assert np.mean(next_distances(TrialState.RUNNING)) > 1.2 * np.mean(next_distances(TrialState.FAIL))
-
-
 def test_qmc_covers_every_key_evenly_however_many_workers_ask():
     found = searched("qmc", trials=16)
     decades = Counter(int((np.log10(values["algorithm.lr"]) + 5) * 4) for values in found)
@@ -194,33 +171,6 @@ def test_cmaes_refuses_several_objectives_and_a_space_of_choices_only():
         build_sampler(settings("cmaes", objectives=("lap_time", "completion")), Space())
     with pytest.raises(BadInput, match=r"^sweep\.sampler=cmaes: searches ranges"):
         build_sampler(settings("cmaes"), Choices())
-
-
-@pytest.mark.parametrize("name", ["tpe", "cmaes"])  # gp as well, in half a minute
-def test_a_sampler_that_learns_finds_better_values_than_chance(name):
-    def mean_late(sampler: str) -> float:
-        return float(np.mean([score(values) for values in searched(sampler, trials=40)[20:]]))
-
-    assert mean_late(name) < mean_late("random")
-
-
-@pytest.mark.parametrize("name", ["tpe", "cmaes", "qmc", "nsga2"])
-def test_a_sampler_searches_the_space_of_a_sweep(name):
-    lines = ["network=mlp,mlp_small", "algorithm.lr=tag(log, interval(1e-5, 1e-3))"]
-    space = real_space(*lines)
-    study = optuna.create_study(sampler=build_sampler(settings(name), space))
-    drawn = []
-    for _ in range(6):
-        trial = study.ask()
-        drawn.append(tuple(space.suggest(trial)))
-        study.tell(trial, 1e4 * trial.params["algorithm.lr"])
-    assert len(set(drawn)) == 6
-    assert all(1e-5 <= trial.params["algorithm.lr"] <= 1e-3 for trial in study.trials)
-
-
-@functools.cache
-def real_space(*lines: str) -> SearchSpace:
-    return SearchSpace.from_request(compose_sweep(list(lines)))
 
 
 def test_gp_does_not_repeat_pruned_values():

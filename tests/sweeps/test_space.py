@@ -33,9 +33,6 @@ def drawn(searched: SearchSpace) -> list[str]:
     return searched.suggest(optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)).ask())
 
 
-# --- What is searched
-
-
 READY = [
     pytest.param(name, marks=[pytest.mark.slow] if name == "everything" else [])
     for name in options("sweep")
@@ -76,9 +73,6 @@ def test_a_space_can_be_sent_to_another_process():
     assert pickle.loads(pickle.dumps(space(*GRIDS))) == space(*GRIDS)  # noqa: S301
 
 
-# --- Conditions
-
-
 def test_a_key_of_a_searched_group_counts_only_for_the_options_that_have_it():
     searched = space(*GRIDS)
     values = {"action_space.speed_levels": 3, "algorithm.lr": 0.002}
@@ -86,11 +80,6 @@ def test_a_key_of_a_searched_group_counts_only_for_the_options_that_have_it():
     having = searched.suggest(FixedTrial({"action_space": "grid", **values}))
     assert without == ["action_space=discrete", "algorithm.lr=0.002"]
     assert set(having) - set(without) == {"action_space=grid", "action_space.speed_levels=3"}
-
-
-def test_a_key_that_all_options_have_always_counts():
-    searched = space("network=mlp,mlp_small", "network.activation=tanh,relu")
-    assert [one.options for one in searched.dimensions] == [None, None]
 
 
 def test_a_constant_counts_only_for_the_reward_functions_that_have_it():
@@ -110,9 +99,6 @@ def test_ready_made_keys_that_the_chosen_option_lacks_are_left_out():
         "reward.constants.SPEED_WEIGHT"
     ]
     assert "steering_levels" in refusal("action_space=discrete", "action_space.steering_levels=3,5")
-
-
-# --- What is refused before the first trial
 
 
 @pytest.mark.parametrize(
@@ -160,9 +146,6 @@ def test_a_base_may_be_complete_only_with_what_is_searched():
     assert "algorithm.episodes_per_iteration=0: " in message
 
 
-# --- Clones
-
-
 def test_values_are_checked_by_the_given_function():
     parent, composition = compose_experiment(["action_space=grid"])
     tried = []
@@ -184,9 +167,6 @@ def test_values_are_checked_by_the_given_function():
     assert parent.action_space.kind == "grid"
 
 
-# --- Comparison
-
-
 def test_equal_spaces_written_differently_do_not_differ():
     one = space("algorithm.lr=interval(0.1, 1)", "network=glob(mlp_sm*)", "algorithm.epochs=range(3,9,2)")
     other = space(
@@ -205,9 +185,6 @@ def test_a_difference_names_each_key_before_and_now():
         "network: mlp,mlp_small -> not searched",
         "algorithm.epochs: not searched -> 3,5",
     ]
-
-
-# --- Grids
 
 
 def test_a_grid_is_all_values():

@@ -67,13 +67,6 @@ def test_an_incomplete_file_of_a_killed_process_is_replaced(tmp_path):
     assert not list(tmp_path.glob("*.new*"))
 
 
-def test_a_file_that_optuna_made_is_taken_as_it_is(tmp_path):
-    url = f"sqlite:///{tmp_path}/mine.db"
-    optuna.create_study(study_name="mine", storage=url)
-    storage = open_storage(url, tmp_path)
-    assert [study.study_name for study in storage.optuna.get_all_studies()] == ["mine"]
-
-
 @pytest.mark.parametrize(
     ("url", "words"),
     [
@@ -231,8 +224,3 @@ def test_an_error_that_waiting_does_not_change_is_raised_at_once(tmp_path):
     for call in (claims.all, study.ask):
         with pytest.raises(RunFailed, match="cannot be used: no such table"):
             patiently(call, HOUR_S)
-
-
-def test_other_errors_are_raised_unchanged():
-    with pytest.raises(ZeroDivisionError):
-        patiently(lambda: 1 / 0, HOUR_S)

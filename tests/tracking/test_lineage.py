@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.lineage import best_members, family, generations
+from deepracer_exp.runs.lineage import best_members, family
 
 
 def rows(stdout: str, *words: str) -> list[str]:
@@ -115,16 +115,12 @@ def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
     assert rows(ended.stdout, "2", "* best by laps in training")
 
 
-def test_a_run_without_an_end_says_so(season, call):
-    season.clone("2", season.run("1"))
-    (season.runs_dir / "season" / "2" / "summary.json").unlink()
-    assert rows(call("runs", "lineage", "1").stdout, "generation 1, from 000020, running or killed")
-
-
 def test_many_changes_are_counted(season, call):
     root = season.run("1", algorithm={str(n): 0 for n in range(10)})
-    season.clone("2", root, algorithm={str(n): 1 for n in range(10)})
-    assert rows(call("runs", "lineage", "1").stdout, "algorithm.5 0 -> 1, and 4 more")
+    season.clone("2", root, algorithm={str(n): 1 for n in range(10)}, status=None)
+    ended = call("runs", "lineage", "1")
+    assert rows(ended.stdout, "algorithm.5 0 -> 1, and 4 more")
+    assert rows(ended.stdout, "generation 1, from 000020, running or killed")
 
 
 @pytest.mark.parametrize("length", [1, 2, 3])
@@ -176,15 +172,6 @@ def test_a_relatives_configuration_that_is_none_is_refused(clan, call):
     ended = call("runs", "lineage", "1-root")
     assert ended.code == 2
     assert "3-sibling/config.yaml" in ended.complaint
-
-
-def test_generations_leave_out_who_has_no_lap(clan):
-    root = family(clan.runs_dir / "season" / "1-root", clan.runs_dir)
-    assert [(generation, member.name) for generation, member, _ in generations(root)] == [
-        (0, "1-root"),
-        (1, "2-child"),
-        (2, "4-grandchild"),
-    ]
 
 
 def test_a_changed_reward_is_seen_by_its_hash(season, call):

@@ -8,6 +8,7 @@ import pytest
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.registry import promote
+from deepracer_exp.tracking.store import folder_of, is_run_id
 
 from .conftest import FEATURES
 
@@ -23,29 +24,29 @@ def best(season):
     return resolve("best:season", season.runs_dir, None).path.name
 
 
-def test_the_best_of_an_experiment_is_the_one_of_the_highest_rank(season):
-    for name, rank in (("1", (1, -11.0)), ("2", (1, -9.5)), ("3", (0, 99.0))):
-        season.result(season.run(name), rank)
+@pytest.mark.parametrize(
+    ("results", "wanted"),
+    [
+        ([{"rank": (1, -11.0)}, {"rank": (1, -9.5)}, {"rank": (0, 99.0)}], "2"),
+        # An evaluated run is better than one that was not.
+        ([{"rank": (0, 50.0)}, {"lap_share": 1.0, "best_lap_time_s": 8.0}], "1"),
+        # Without evaluations the share of laps counts before the fastest lap.
+        (
+            [
+                {"lap_share": share, "best_lap_time_s": lap_s}
+                for share, lap_s in ((0.9, 12.0), (0.9, 10.0), (0.5, 8.0), (None, 7.0))
+            ],
+            "2",
+        ),
+        # Of equals the newest is taken.
+        ([{"rank": (1, -10.0)}, {"rank": (1, -10.0)}], "2"),
+    ],
+)
+def test_the_best_of_an_experiment_is_its_run_of_the_highest_rank(season, results, wanted):
+    for number, result in enumerate(results, 1):
+        season.result(season.run(str(number)), **result)
     season.result(season.run("other", "elsewhere"), (1, -5.0))
-    assert best(season) == "2"
-
-
-def test_an_evaluated_run_is_better_than_one_that_was_not(season):
-    season.result(season.run("1"), (0, 50.0))
-    season.result(season.run("2"), lap_share=1.0, best_lap_time_s=8.0)
-    assert best(season) == "1"
-
-
-def test_without_evaluations_the_share_of_laps_counts_before_the_fastest_lap(season):
-    for name, share, lap_s in (("1", 0.9, 12.0), ("2", 0.9, 10.0), ("3", 0.5, 8.0), ("4", None, 7.0)):
-        season.result(season.run(name), lap_share=share, best_lap_time_s=lap_s)
-    assert best(season) == "2"
-
-
-def test_of_equals_the_newest_is_taken(season):
-    for name in ("1", "3", "2"):
-        season.result(season.run(name), (1, -10.0))
-    assert best(season) == "3"
+    assert best(season) == wanted
 
 
 @pytest.mark.parametrize(
@@ -187,3 +188,27 @@ def test_without_a_store_a_word_is_no_alias(season):
     assert "no such run" in refusal("champion", season)
     assert "mlflow.db" in refusal("season@champion", season)
     assert not (season.runs_dir / "mlflow.db").exists()
+
+
+def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client):
+    run = season.run("one")
+    run_id = season.recorded(run, client)
+    assert is_run_id(run_id)
+    assert folder_of(run_id, None, season.runs_dir) == run
+    with pytest.raises(BadInput, match=r"Run with id=0+ not found"):
+        folder_of("0" * 32, None, season.runs_dir)
+    client.delete_run(run_id)
+    with pytest.raises(BadInput, match="was deleted in MLflow"):
+        folder_of(run_id, None, season.runs_dir)
+
+
+def test_a_foreign_run_is_refused(season, client):
+    run_id = client.create_run("0").info.run_id
+    with pytest.raises(BadInput, match="not a run of deepracer-exp"):
+        folder_of(run_id, None, season.runs_dir)
+
+
+def test_without_a_store_there_is_nothing_to_look_up(tmp_path):
+    with pytest.raises(BadInput, match=r"no mlflow\.db"):
+        folder_of("0" * 32, None, tmp_path)
+    assert not list(tmp_path.iterdir())

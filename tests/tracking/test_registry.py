@@ -7,7 +7,6 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.models import Model
 
-from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.tracking.registry import is_alias, look_up, promote
 
@@ -172,9 +171,3 @@ def test_mlflow_would_take_every_alias_that_we_do():
         assert is_alias(alias)
         _validate_model_alias_name(alias)
         _validate_model_alias_name_reserved(alias)
-
-
-def test_a_look_up_without_a_registry_is_refused(season):
-    season.runs_dir.mkdir()
-    with pytest.raises(BadInput, match=r"has no mlflow\.db"):
-        look_up("champion", None, season.runs_dir)

@@ -1,4 +1,4 @@
-"""Runs that are gone on with by another process: one MLflow run, each point once."""
+"""Runs that are continued by another process: one MLflow run, each point once."""
 
 import json
 import shutil
@@ -8,8 +8,8 @@ from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.metrics import metric_name
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.tracking_file import read_tracked_run
 
 
@@ -22,7 +22,7 @@ def row(iteration: int, completion: float | None = None) -> dict[str, float]:
     }
 
 
-def tell(tracker, rows, safe: bool = True):
+def log(tracker, rows, safe: bool = True):
     for one in rows:
         tracker.log(one, one["env_steps"])
         if safe:
@@ -40,7 +40,7 @@ def killed(store, identity, wait_until):
     tracker = MLflowTracker(store)
     params, tags = {"seed": 1}, {"track": "oval", "mlflow.note.content": "as it began"}
     tracker.start("run", "race", params, tags, identity)
-    tell(tracker, [row(iteration) for iteration in range(1, 11)])
+    log(tracker, [row(iteration) for iteration in range(1, 11)])
     wait_until(lambda: tracker.waiting == 0 and read_tracked_run(identity).run_id is not None)
     return tracker
 
@@ -57,26 +57,23 @@ def test_a_resumed_run_continues_the_same_mlflow_run(store, client, identity, ki
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     rows = [row(iteration) for iteration in range(1, 21)]
-    tell(tracker, rows)
+    log(tracker, rows)
     assert tracker.finish("FINISHED") == 0
     (run,) = runs(client)
     assert run.info.run_id == tracker.run_id == killed.run_id
     assert run.info.status == "FINISHED"
     for key in ("completion", "iteration"):
         assert points(client, run.info.run_id, key) == [(one["env_steps"], one[key]) for one in rows]
-    assert "env_steps" not in run.data.metrics
-
-
-def test_the_times_of_points_are_those_of_the_training(client, identity, killed):
-    history = client.get_metric_history(killed.run_id, "train/completion")
+    history = client.get_metric_history(run.info.run_id, "train/completion")
     start_ms = read_tracked_run(identity).start_ms
-    assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 11)]
+    assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 21)]
+    assert "env_steps" not in run.data.metrics
 
 
 def test_points_wait_for_a_checkpoint_and_block_nothing_else(store, client, identity, wait_until, caplog):
     tracker = MLflowTracker(store)
     tracker.start("run", "race", {}, {}, identity)
-    tell(tracker, [row(iteration) for iteration in range(1, 11)], safe=False)
+    log(tracker, [row(iteration) for iteration in range(1, 11)], safe=False)
     tracker.set_tag("budget", "50 %")
     wait_until(lambda: bool(tracker.run_id) and "budget" in client.get_run(tracker.run_id).data.tags)
     assert points(client, tracker.run_id) == []
@@ -94,7 +91,7 @@ def test_two_processes_that_log_the_same_rows_record_them_once(store, client, id
     for tracker in both:
         tracker.reopen(identity)
     for tracker in both:
-        tell(tracker, [row(iteration) for iteration in range(1, 101)])
+        log(tracker, [row(iteration) for iteration in range(1, 101)])
     assert [tracker.finish("FINISHED") for tracker in both] == [0, 0]
     assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 101)]
 
@@ -111,12 +108,12 @@ def test_a_run_whose_id_was_never_heard_is_found_again(store, client, identity, 
 def test_a_run_that_was_never_created_begins_when_it_began(store, client, identity, free_port, tmp_path):
     away = MLflowTracker(type(store)(f"http://127.0.0.1:{free_port}", None))
     away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
-    tell(away, [row(1)])
+    log(away, [row(1)])
     away.finish("KILLED", deadline_s=0)
     told = read_tracked_run(identity)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    tell(tracker, [row(1), row(2)])
+    log(tracker, [row(1), row(2)])
     assert tracker.finish("FINISHED") == 0
     (run,) = runs(client)
     assert (told.run_id, run.info.start_time, run.info.run_name) == (None, told.start_ms, "run")
@@ -132,7 +129,7 @@ def test_a_run_resumed_with_another_store_is_complete_there(
     other = resolve_store(None, tmp_path / "other")
     tracker = MLflowTracker(other)
     tracker.reopen(identity)
-    tell(tracker, [row(iteration) for iteration in range(1, 13)])
+    log(tracker, [row(iteration) for iteration in range(1, 13)])
     assert tracker.finish("FINISHED") == 0
     there = MlflowClient(tracking_uri=other.uri)
     assert [run.info.run_id for run in runs(there)] == [tracker.run_id]
@@ -165,7 +162,7 @@ def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
     client.delete_run(killed.run_id)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    tell(tracker, [row(iteration) for iteration in range(1, 21)])
+    log(tracker, [row(iteration) for iteration in range(1, 21)])
     assert tracker.finish("FINISHED") > 0
     (record,) = caplog.records
     assert f"run {killed.run_id} was deleted in MLflow; restore it there" in record.message
@@ -177,39 +174,10 @@ def test_a_repeated_iteration_that_differs_is_reported_and_not_doubled(
 ):
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    tell(tracker, [row(iteration) for iteration in range(1, 10)] + [row(10, completion=99.0)])
+    log(tracker, [row(iteration) for iteration in range(1, 10)] + [row(10, completion=99.0)])
     assert tracker.finish("FINISHED") == 0
     assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 11)]
     assert "1 points of repeated iterations keep their first values there" in caplog.text
-
-
-def test_thousands_of_points_are_read_back(store, client, identity):
-    keys = [f"metric_{number}" for number in range(20)]
-    rows = [{**row(n), **{key: n / 7 for key in keys}} for n in range(1, 251)]
-    first = MLflowTracker(store)
-    first.start("run", "race", {}, {}, identity)
-    tell(first, rows)
-    assert first.finish("KILLED") == 0
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
-    tell(tracker, [*rows, {**row(251), "metric_3": 0.5}])
-    assert tracker.finish("FINISHED") == 0
-    assert points(client, tracker.run_id, "metric_3") == [(100 * n, n / 7) for n in range(1, 251)] + [
-        (25100, 0.5)
-    ]
-    assert len(points(client, tracker.run_id, "metric_19")) == 250
-
-
-def test_a_clone_is_nested_under_its_parent(store, client, identity, killed, tmp_path):
-    tracker = MLflowTracker(store)
-    lineage = {"mlflow.parentRunId": killed.run_id, "generation": "1"}
-    tracker.start("clone", "race", {}, lineage, tmp_path / "clone.json")
-    assert tracker.finish("FINISHED") == 0
-    experiment = client.get_experiment_by_name("race").experiment_id
-    (child,) = client.search_runs([experiment], f"tags.`mlflow.parentRunId` = '{killed.run_id}'")
-    assert child.info.run_id == tracker.run_id
-    # What the UI asks for the row of a child.
-    assert client.get_parent_run(tracker.run_id).info.run_id == killed.run_id
 
 
 @pytest.mark.parametrize(
@@ -232,18 +200,6 @@ def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
     with pytest.raises(BadInput, match=says) as refused:
         MLflowTracker(store).reopen(identity)
     assert str(identity) in str(refused.value)
-
-
-def test_a_run_begun_under_other_names_has_all_its_points_under_those_of_today(
-    store, client, identity, killed
-):
-    client.log_metric(killed.run_id, "completion", 1 / 3, 125, 100)
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
-    rows = [row(iteration) for iteration in range(1, 21)]
-    tell(tracker, rows)
-    assert tracker.finish("FINISHED") == 0
-    assert points(client, killed.run_id) == [(one["env_steps"], one["completion"]) for one in rows]
 
 
 def test_what_came_of_a_run_heads_its_description_and_that_of_its_experiment(store, client, tmp_path):

@@ -14,8 +14,8 @@ from mlflow import MlflowClient
 
 from deepracer_exp.tracking.delivery import deliver
 from deepracer_exp.tracking.metrics import metric_name
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import MLflowTracker
 
 pytestmark = pytest.mark.slow
 

@@ -5,8 +5,8 @@ import pytest
 
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import open_tracker
 
 
 @pytest.mark.parametrize(
@@ -33,12 +33,6 @@ def test_a_uri_that_can_never_work_is_one_line_before_anything_starts(uri, said,
     assert "\n" not in str(error.value)
 
 
-def test_a_runs_dir_that_is_a_file_is_bad_input(tmp_path):
-    (tmp_path / "runs").write_text("")
-    with pytest.raises(BadInput, match="runs_dir"):
-        resolve_store(None, tmp_path / "runs")
-
-
 def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match=r"path with '\?'"):
         resolve_store(None, tmp_path / "why?")
@@ -46,7 +40,7 @@ def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
 
 def test_checking_a_uri_does_not_import_mlflow(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from deepracer_exp.tracking.mlflow_tracker import *\n"
+        "import sys; from pathlib import Path; from deepracer_exp.tracking.tracker import *\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
         f"resolve_store(None, Path({str(tmp_path)!r}))\n"
         "assert not {name for name in sys.modules if name.startswith(('mlflow', 'torch'))}"

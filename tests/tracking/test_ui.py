@@ -12,7 +12,7 @@ from mlflow import MlflowClient
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.metadata import VIEW, run_params, run_tags
 from deepracer_exp.tracking.metrics import METRICS
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
+from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.ui import existing_store, running_ui, runs_page, serve_ui
 
 NAMES = {
