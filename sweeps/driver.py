@@ -17,7 +17,6 @@ from .storage import Storage, patiently
 from .view import SweepView
 from .worker_config import WorkerConfig, is_gone
 
-OnEnded = Callable[[Sequence[Claim]], None]
 _LOOK_S = 0.5
 _LEAVE_S = 6.0
 """For a worker that was asked to end, to write a checkpoint and to log to MLflow. What it has not done by then is done
@@ -35,7 +34,7 @@ class Driver:
         storage: Storage,
         launcher: LocalLauncher | RayLauncher,
         view: SweepView,
-        on_ended: OnEnded,
+        on_ended: Callable[[Sequence[Claim]], None],
     ):
         """Start nothing yet; `on_ended` is called with all claims whenever trials have ended."""
         self._config, self._launcher, self._view, self._on_ended = config, launcher, view, on_ended

@@ -1,7 +1,7 @@
 """Re-ranking: the best trials of a sweep raced again, on laps that did not choose them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
-from deepracer_exp.evaluation.result import USUAL, Evaluation, Group
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
 from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
@@ -27,21 +27,6 @@ _RESAMPLES = 2000
 _CONFIDENCE = 0.95
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reranked:
-    """A trial's result on fresh laps."""
-
-    trial: int
-    """Its number in the study."""
-    values: list[float]
-    """Of the objectives, means over the trial's runs."""
-    interval: tuple[float, float]
-    """95 per cent interval of the first value, by bootstrap over laps: of these policies, not of further trainings."""
-    lap_time_s: float | None
-    completion: float
-    held_out_completion: float | None
-
-
 def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
     """Return a protocol with starting positions and random draws that no evaluation of the sweep had."""
     starts = tuple((place + _SHIFT) / trials for place in range(trials))
@@ -50,10 +35,12 @@ def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
 
 def rerank(
     worker_config: WorkerConfig, study: optuna.Study, on_next: Callable[[FrozenTrial], None], on_step: OnStep
-) -> list[Reranked]:
-    """Race the best checkpoints of the best trials on fresh laps; return the trials in the new order.
+) -> list[dict[str, Any]]:
+    """Race the best checkpoints of the best trials on fresh laps; return their results, the best first.
 
-    `on_next` is called with each trial before its laps, `on_step` after each control step; what they raise ends it.
+    `values` are means over a trial's runs. `interval` is the 95 per cent interval of the first of them, by bootstrap
+    over laps: of these policies, not of further trainings. `on_next` is called with each trial before its laps,
+    `on_step` after each control step; what they raise ends it.
     """
     config = worker_config.config
     protocol = fresh(worker_config.protocol, config.rerank_laps)
@@ -62,12 +49,10 @@ def rerank(
         on_next(trial)
         driven = [_driven(Path(run["run_dir"]), protocol, on_step) for run in trial.user_attrs["runs"]]
         found.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
-    return sorted(found, key=lambda one: cost(config.objectives, one.values))
+    return sorted(found, key=lambda one: cost(config.objectives, one["values"]))
 
 
-def interval_of(
-    evaluations: Sequence[Evaluation], objective: str, trial_time_s: float
-) -> tuple[float, float]:
+def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s: float) -> list[float]:
     """Return the bootstrap interval of an objective; trials are resampled within each track and each evaluation.
 
     `trial_time_s` is the longest that a trial of an evaluation may take.
@@ -76,8 +61,7 @@ def interval_of(
     rng = np.random.default_rng(0)
     draws = np.mean([_draws(group, objective, trial_time_s, rng) for group in groups], axis=0)
     tail = 100 * (1 - _CONFIDENCE) / 2
-    low, high = np.percentile(draws, [tail, 100 - tail])
-    return float(low), float(high)
+    return np.percentile(draws, [tail, 100 - tail]).tolist()
 
 
 def _draws(
@@ -106,15 +90,14 @@ def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evalu
 
 def _reranked(
     number: int, driven: Sequence[Evaluation], objectives: Sequence[str], trial_time_s: float
-) -> Reranked:
-    values = np.mean([values_of(one, objectives, trial_time_s) for one in driven], axis=0)
+) -> dict[str, Any]:
     times = [time for one in driven if (time := one.on(USUAL).mean_lap_time_s) is not None]
-    held_out = [one.on("held_out").completion for one in driven if "held_out" in one.conditions]
-    return Reranked(
-        trial=number,
-        values=[float(value) for value in values],
-        interval=interval_of(driven, objectives[0], trial_time_s),
-        lap_time_s=float(np.mean(times)) if times else None,
-        completion=float(np.mean([one.on(USUAL).completion for one in driven])),
-        held_out_completion=float(np.mean(held_out)) if held_out else None,
-    )
+    held_out = [one.on(HELD_OUT).completion for one in driven if HELD_OUT in one.conditions]
+    return {
+        "trial": number,
+        "values": np.mean([values_of(one, objectives, trial_time_s) for one in driven], axis=0).tolist(),
+        "interval": interval_of(driven, objectives[0], trial_time_s),
+        "lap_time_s": float(np.mean(times)) if times else None,
+        "completion": float(np.mean([one.on(USUAL).completion for one in driven])),
+        "held_out_completion": float(np.mean(held_out)) if held_out else None,
+    }

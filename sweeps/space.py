@@ -56,9 +56,7 @@ class SearchSpace:
     def from_request(cls, request: SweepRequest, check: Check | None = None) -> "SearchSpace":
         """Build the space of a request; every choice and both ends of every range are checked, each alone.
 
-        Args:
-            request: of the sweep.
-            check: how overrides are checked; None: as by a training from scratch.
+        Without `check` overrides are checked as by a training from scratch.
 
         Raises:
             BadInput: there is nothing to search, a key does not exist, or no run accepts one of its values.
@@ -97,11 +95,7 @@ class SearchSpace:
         return {one.key: one.expression for one in self.dimensions}
 
     def difference(self, other: Mapping[str, str]) -> list[str]:
-        """Return a line for each key that another space searches differently.
-
-        Args:
-            other: expressions by key, from its `as_text`.
-        """
+        """Return a line for each key that another space, from its `as_text`, searches differently."""
         own, lines = self.as_text(), []
         for key in dict.fromkeys([*other, *own]):
             before, now = other.get(key), own.get(key)
@@ -185,10 +179,11 @@ class _Trials:
     def _check_line(self, context: Mapping[str, str], one: Dimension, line: str) -> None:
         try:
             values = self._values(context)
-            if self._from_scratch and one.key not in groups() and _holder(values, one.key) is not None:
+            changed = copy.deepcopy(dict(values))
+            holder = _holder(changed, one.key)
+            if self._from_scratch and one.key not in groups() and holder is not None:
                 # Composing takes a hundred times as long as setting a value.
-                changed = copy.deepcopy(dict(values))
-                _set(changed, one.key, override_value(line))
+                holder[one.key.rpartition(".")[2]] = override_value(line)
                 _read(parse_experiment(changed))
             else:
                 self._values({**context, one.key: line})
@@ -201,11 +196,7 @@ class _Trials:
             raise BadInput(message) from None
 
     def _values(self, lines: Mapping[str, str]) -> Mapping[str, Any]:
-        """Return all values of the base with these overrides by key.
-
-        Raises:
-            BadInput: no run accepts them.
-        """
+        """Return all values of the base with these overrides by key; refuse what no run accepts."""
         overrides = (*self._base, *{**self._context, **lines}.values())
         if overrides not in self._composed:
             self._composed[overrides] = self._check(list(overrides))
@@ -248,12 +239,6 @@ def _holder(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:
     for part in parent.split(".") if parent else ():
         node = node.get(part) if isinstance(node, dict) else None
     return node if isinstance(node, dict) and (leaf in node or parent in OPEN_MAPPINGS) else None
-
-
-def _set(values: dict[str, Any], key: str, value: Any) -> None:
-    holder = _holder(values, key)
-    assert holder is not None
-    holder[key.rpartition(".")[2]] = value
 
 
 def _lines(key: str, what: Choices | Range) -> list[str]:

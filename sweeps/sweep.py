@@ -3,7 +3,7 @@
 import collections
 import contextlib
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ from rich.console import Console
 from deepracer_exp.config.compose import Composition, compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
-from deepracer_exp.config.running import MLflowTracking, TrackingConfig
+from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.study_run import Progress, StudyRun, open_study_run
+from deepracer_exp.tracking.store import Store, resolve_store
+from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
@@ -79,7 +79,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     with contextlib.closing(launcher):
         storage = open_storage(config.storage, runs_dir)
         study = open_study(request, overrides, space, parent, storage, runs_dir)
-        study_run, study_run_id = begin_study_run(request, space, tracking, storage, runs_dir)
+        study_run, study_run_id = begin_study_run(request, space, store, storage, runs_dir)
         worker_config = WorkerConfig(
             study=request.study,
             runs_dir=launcher.folder(runs_dir),
@@ -108,17 +108,16 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
 
 
 def begin_study_run(
-    request: SweepRequest, space: SearchSpace, tracking: TrackingConfig, storage: Storage, runs_dir: Path
+    request: SweepRequest, space: SearchSpace, store: Store | None, storage: Storage, runs_dir: Path
 ) -> tuple[StudyRun | None, str | None]:
-    """Begin or continue the run of a study in MLflow; return it with its id.
-
-    None, None with `tracking=off`; no id if the store does not answer.
-    """
+    """Begin or continue the run of a study in MLflow; return it with its id, None if the store does not answer."""
+    if store is None:
+        return None, None
     # MLflow cannot create a run only if there is none: one driver at a time looks and creates it.
     with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
         objectives = request.entry.sweep.objectives
-        run = open_study_run(tracking, runs_dir, request.study, objectives, space.as_text(), request.base)
-        return run, None if run is None else run.wait_for_id()
+        run = StudyRun(store, request.study, objectives, space.as_text(), request.base)
+        return run, run.wait_for_id()
 
 
 def _run(
@@ -211,10 +210,7 @@ def _conclude(
             view.stage = f"trial {trial.number} drives {worker_config.config.rerank_laps} fresh laps"
             view.show(claims.all())
 
-        again = [
-            {**asdict(one), "interval": list(one.interval)}
-            for one in rerank(worker_config, study, show, check)
-        ]
+        again = rerank(worker_config, study, show, check)
         study.set_user_attr("reranked_of", len(complete_trials(study)))
         study.set_user_attr("reranked", again)
         view.stage = ""

@@ -87,20 +87,17 @@ class SweepView:
         running = [one for one in claims if one.result is None]
         if running:
             parts += [Text(), self._running(running)]
-        elif not claims and not self.stage:
-            parts += [Text(), Text("workers start", style="dim")]
-        if self.stage:
-            parts += [Text(), Text(self.stage, style="dim")]
+        if self.stage or not claims:
+            parts += [Text(), Text(self.stage or "workers start", style="dim")]
         return Panel(Group(*parts), title=self._study, title_align="left", border_style="dim")
 
     def _summary(self, claims: Sequence[Claim]) -> Table:
         total = self._sweep.trials
         counts = collections.Counter(one.result.state for one in claims if one.result is not None)
-        ended = counts.total()
         words = ", ".join(f"{counts[one]} {word}" for one, word in _STATES.items())
-        grid = Table.grid(padding=(0, 2))
-        grid.add_row("trials", ProgressBar(total, min(ended, total), width=40))
-        grid.add_row("", f"{ended} of {total}: {words}")
+        grid = Table.grid("", "", padding=(0, 2))
+        grid.add_row("trials", ProgressBar(total, min(counts.total(), total), width=40))
+        grid.add_row("", f"{counts.total()} of {total}: {words}")
         grid.add_row("time", f"{duration(time.monotonic() - self._began)}, {self._left(claims)}")
         grid.add_row("best", _best(claims, self._sweep.objectives))
         return grid
@@ -120,19 +117,18 @@ class SweepView:
             table.add_column(name, justify="left" if name in ("", "evaluated") else "right", no_wrap=True)
         table.add_column("values", ratio=1)
         for claim in running:
-            table.add_row(*self._cells(claim))
+            table.add_row(*self._cells(claim), _params(claim))
         return table
 
     def _cells(self, claim: Claim) -> tuple[str, ...]:
         row: Mapping[str, Any] = claim.progress
         name = f"{_number(claim)}" + (f" (attempt {claim.attempt})" if claim.attempt > 1 else "")
         if claim.expired or "env_steps" not in row:
-            stage = "waits for a worker" if claim.expired else "starts"
-            return name, NONE, NONE, "", NONE, stage, _params(claim)
-        lap_s, completion = row.get("eval_lap_time_s"), row.get("eval_completion")
-        if completion is not None:
+            return name, NONE, NONE, "", NONE, "waits for a worker" if claim.expired else "starts"
+        lap_s, evaluated = row.get("eval_lap_time_s"), row.get("eval_completion")
+        if evaluated is not None:
             lap = "no lap" if lap_s is None else f"{lap_s:.2f} s"
-            self._evaluated[claim.index] = f"{lap}, {completion:.0f} %"
+            self._evaluated[claim.index] = f"{lap}, {evaluated:.0f} %"
         return (
             name,
             f"{row['env_steps']:,}",
@@ -140,7 +136,6 @@ class SweepView:
             sparkline(list(self._completions.get(claim.index, ())), _POINTS),
             f"{row['entropy']:.2f}",
             self._evaluated.get(claim.index, NONE),
-            _params(claim),
         )
 
 
@@ -161,14 +156,14 @@ def _number(claim: Claim) -> object:
 
 
 def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
-    done = [
-        (cost(objectives, one.result.values), one.index, one, one.result)
+    done = {
+        (cost(objectives, one.result.values), one.index): (one, one.result)
         for one in claims
-        if one.result is not None and one.result.state == "COMPLETE" and one.result.values
-    ]
+        if one.result is not None and one.result.values
+    }
     if not done:
         return NONE
-    *_, best, result = min(done, key=lambda one: one[:2])
+    best, result = done[min(done)]
     return f"trial {_number(best)}, {_values(result, objectives)}"
 
 

@@ -21,8 +21,8 @@ from mlflow.utils.validation import (
     MAX_TAG_VAL_LENGTH,
 )
 
-from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, OURS, PARENT, experiment_note, result_note
-from .metrics import BEST, Point, best_metrics, points_at
+from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, PARENT, result_note
+from .metrics import Point, best_metrics, points_at
 from .store import Store, StoreRefusedError, client_of, pages, silence_mlflow, store_errors
 from .tracking_file import TrackedRun
 
@@ -41,13 +41,7 @@ class MLflowRun:
         self._client: MlflowClient
         self._params: Mapping[str, str] = {}
         self._is_reopened = False
-        self._there: dict[str, dict[int, float]] = {}
-        self._contradicted: set[tuple[str, int]] = set()
-
-    @property
-    def contradicted(self) -> int:
-        """Number of points that the store already had with another value, which is kept."""
-        return len(self._contradicted)
+        self._there: dict[str, set[int]] = {}
 
     def connect(self) -> None:
         """Open the store, creating it if necessary."""
@@ -148,10 +142,7 @@ class MLflowRun:
                     self._client.set_tag(run.info.run_id, PARENT, self.run_id)
 
     def conclude(self, tracked: TrackedRun, summary: Mapping[str, Any]) -> None:
-        """Record the best checkpoint, in the metrics and the descriptions of the run and of its experiment.
-
-        An edited description is kept.
-        """
+        """Record the best checkpoint, in the metrics and the description of the run; an edited description is kept."""
         if best := summary.get("best"):
             self.log_metrics(
                 points_at(best_metrics(summary), best["env_steps"], tracked.end_ms or tracked.start_ms)
@@ -162,19 +153,6 @@ class MLflowRun:
             if now.endswith(begun):
                 note = result_note(summary, run.info.run_id, tracked.files)
                 self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
-            self._describe_experiment(run.info.experiment_id)
-
-    def _describe_experiment(self, experiment_id: str) -> None:
-        tags = self._client.get_experiment(experiment_id).tags
-        score = f"metrics.`{BEST}score_s`"
-        found = self._client.search_runs(
-            [experiment_id], f"{score} > 0", max_results=1, order_by=[f"{score} ASC"]
-        )
-        if found and tags.get(NOTE, OURS).startswith(OURS):
-            (run,) = found
-            best = {key: value for key, value in run.data.metrics.items() if key.startswith(BEST)}
-            note = experiment_note(run.info.run_name, run.info.run_id, experiment_id, best)
-            self._client.set_experiment_tag(experiment_id, NOTE, note)
 
     def log_artifact(self, path: Path, folder: str | None) -> None:
         """Copy a file, or all files of a folder, to the run's artifacts under `folder`."""
@@ -207,13 +185,10 @@ class MLflowRun:
         return found.experiment_id
 
     def _find(self, experiment_id: str, tracked: TrackedRun) -> str | None:
-        runs = self._client.search_runs(
-            [experiment_id], f"attributes.start_time = {tracked.start_ms}", ViewType.ALL
-        )
-        for run in runs:
-            if run.info.run_name == tracked.run_name and run.data.tags.get("run_dir") == tracked.tags.get(
-                "run_dir"
-            ):
+        began = f"attributes.start_time = {tracked.start_ms}"
+        wanted = (tracked.run_name, tracked.tags.get("run_dir"))
+        for run in self._client.search_runs([experiment_id], began, ViewType.ALL):
+            if (run.info.run_name, run.data.tags.get("run_dir")) == wanted:
                 return run.info.run_id
         return None
 
@@ -223,14 +198,10 @@ class MLflowRun:
 
     def _has(self, point: Point) -> bool:
         """Return whether the store has a point of this key and step; each key is looked up once."""
-        key, value, _, step = point
+        key, _, _, step = point
         if key not in self._there:
-            history = self._client.get_metric_history(self.run_id, key)
-            self._there[key] = {found.step: found.value for found in history}
-        there = self._there[key].get(step)
-        if there is not None and there != value:
-            self._contradicted.add((key, step))
-        return there is not None
+            self._there[key] = {found.step for found in self._client.get_metric_history(self.run_id, key)}
+        return step in self._there[key]
 
 
 def _with(tags: Mapping[str, str]) -> str:

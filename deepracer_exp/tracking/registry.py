@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, find_checkpoint, pin, verify
 from deepracer_exp.runs.clean import StoreOverview
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, read_metrics, read_run_id
 
@@ -27,7 +27,7 @@ _RUN_DIR, _CHECKPOINT, _SHA256 = "run_dir", "checkpoint", "sha256"
 """Tags of a version."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Registered:
     """A version of a registered model: a checkpoint of a run."""
 
@@ -82,9 +82,8 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
     if at:
         check_model(reference, model)
     with open_client(reference, uri, runs_dir) as client:
-        known = [
-            (found.name, name) for found in pages(client.search_registered_models) for name in found.aliases
-        ]
+        models = pages(client.search_registered_models)
+        known = [(found.name, name) for found in models for name in found.aliases]
         matches = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
         if len(matches) == 1:
             version = client.get_model_version_by_alias(*matches[0])
@@ -124,7 +123,7 @@ def promote(
     """
     check_model("--model", model)
     check_alias("--alias", alias)
-    folder = _folder(run, name)
+    folder = find_checkpoint(run / CHECKPOINTS, name).resolve()
     verify(folder)
     run_id = read_run_id(run)
     if run_id is None:
@@ -253,21 +252,4 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
         raise BadInput(
             f"{what}: version {version.version} of {version.name} was not registered by deepracer-exp runs promote"
         )
-    return Registered(
-        model=version.name,
-        alias=alias,
-        version=str(version.version),
-        run_dir=Path(run_dir),
-        checkpoint=checkpoint,
-        sha256=sha256,
-    )
-
-
-def _folder(run: Path, name: str) -> Path:
-    """Return a checkpoint's own folder."""
-    folder = run / CHECKPOINTS / (f"{int(name):06d}" if name.isdigit() else name)
-    if not folder.is_dir():
-        raise BadInput(
-            f"checkpoint={name}: {folder} does not exist; accepted: best, last or the iteration of a checkpoint"
-        )
-    return folder.resolve()
+    return Registered(version.name, alias, str(version.version), Path(run_dir), checkpoint, sha256)

@@ -11,11 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.config.running import MLflowTracking, TrackingConfig
-
 from .metadata import END_TAG, NOTE, PARENT, param_text, study_view
 from .metrics import now_ms, points_at, trial_metrics
-from .store import Store, StoreRefusedError, StoreUnavailableError, one_line, resolve_store
+from .store import Store, StoreRefusedError, StoreUnavailableError, one_line
 from .store_thread import StoreThread
 from .tracking_file import Status, TrackedRun
 
@@ -184,20 +182,6 @@ class StudyRun:
                 lines.append("\n".join([f"{title}:", "", *listed]))
         lines.append("Pictures: `sweep.html` among the artifacts.")
         return "\n\n".join(lines)
-
-
-def open_study_run(
-    config: TrackingConfig,
-    runs_dir: Path,
-    study: str,
-    objectives: Sequence[str],
-    space: Mapping[str, str],
-    base: Sequence[str],
-) -> StudyRun | None:
-    """Start the run of a study; None unless `tracking=mlflow`."""
-    if not isinstance(config, MLflowTracking):
-        return None
-    return StudyRun(resolve_store(config.uri, runs_dir), study, objectives, space, base)
 
 
 def open_trial_run(

@@ -199,13 +199,6 @@ class MLflowTracker(Tracker):
                 " `deepracer-exp resume %s` records them",
                 self._store.shown, lost, self._logged, self._file.folder,
             )  # fmt: skip
-        run = self._thread.run
-        if run is not None and run.contradicted:
-            _log.warning(
-                "MLflow (%s): %d points of repeated iterations keep their first values there;"
-                " metrics.jsonl has the new ones",
-                self._store.shown, run.contradicted,
-            )  # fmt: skip
         if not is_ended:
             _log.warning("MLflow (%s): the run could not be marked %s", self._store.shown, status)
         return lost

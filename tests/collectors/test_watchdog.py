@@ -105,14 +105,6 @@ def test_nobody_is_ended_while_nothing_is_waited_for(watch, beats, processes):
     assert all(process.is_alive() for process in processes)
 
 
-def test_workers_that_never_begin_are_ended_though_nobody_knows_them_yet(watch, processes):
-    dog = watch(lockstep=True)
-    _wait_until(lambda: dog.verdict)
-    for process in processes:
-        process.join(60)
-        assert process.exitcode == -signal.SIGKILL
-
-
 def test_the_first_to_die_is_remembered(watch, processes):
     dog = watch(lockstep=True, timeout_s=600)
     dog.workers_started(processes)
@@ -121,10 +113,3 @@ def test_the_first_to_die_is_remembered(watch, processes):
     processes[0].kill()
     processes[0].join()
     assert dog.first_dead == 1
-
-
-def test_the_counters_are_gone_afterwards(watch, tmp_path):
-    dog = watch(lockstep=True)
-    assert (tmp_path / "beats").exists()
-    dog.close()
-    assert not (tmp_path / "beats").exists()

@@ -1,9 +1,11 @@
 """Studies as a sweep leaves them, in memory, with run folders that hold metrics.jsonl alone."""
 
+import functools
 import json
 import math
 import random
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
 
+from deepracer_exp.config.sweep import SweepConfig, compose_sweep
+
 DISTRIBUTIONS: Mapping[str, BaseDistribution] = {
     "algorithm.lr": FloatDistribution(1e-5, 1e-3, log=True),
     "algorithm.entropy_coeff": FloatDistribution(0.0, 0.05),
@@ -19,6 +23,16 @@ DISTRIBUTIONS: Mapping[str, BaseDistribution] = {
     "network.hidden": CategoricalDistribution(["[64,64]", "[256,256]"]),
 }
 SPACE = {"algorithm.lr": "tag(log, interval(1e-5, 1e-3))", "algorithm.entropy_coeff": "interval(0, 0.05)"}
+
+
+@functools.cache
+def _standard() -> SweepConfig:
+    return compose_sweep([]).entry.sweep
+
+
+def settings(**changes) -> SweepConfig:
+    """Return the configuration of a sweep with four startup trials."""
+    return replace(_standard(), **{"startup_trials": 4, **changes})
 
 
 def new_study(

@@ -1,28 +1,22 @@
 """Pruners that compare trials, and the comparison of seeds."""
 
-import functools
 from collections.abc import Sequence
-from dataclasses import replace
 
 import optuna
 import pytest
 from optuna.trial import TrialState, create_trial
 
-from deepracer_exp.config.sweep import SweepConfig, compose_sweep
+from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
 from sweeps.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
+
+from . import studies
 
 pytestmark = pytest.mark.filterwarnings("error")
 
 
 def settings(*pruners: str, **changes) -> SweepConfig:
-    given = {"pruners": pruners, "startup_trials": 4, "warmup_evaluations": 1, "patience": None}
-    return replace(standard(), **{**given, **changes})
-
-
-@functools.cache
-def standard() -> SweepConfig:
-    return compose_sweep([]).entry.sweep
+    return studies.settings(pruners=pruners, **{"warmup_evaluations": 1, **changes})
 
 
 def study_of(curves: Sequence[Sequence[float]], direction: str = "minimize") -> optuna.Study:

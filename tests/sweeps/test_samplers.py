@@ -1,6 +1,5 @@
-import functools
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import optuna
@@ -8,9 +7,11 @@ import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState, create_trial
 
-from deepracer_exp.config.sweep import SweepConfig, compose_sweep
+from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
 from sweeps.samplers import build_sampler
+
+from . import studies
 
 NAMES = ("tpe", "gp", "cmaes", "qmc", "random", "nsga2")
 """Every sampler that searches ranges; grid has a space of its own."""
@@ -51,13 +52,7 @@ class Choices(Space):
 
 
 def settings(sampler: str, **changes) -> SweepConfig:
-    given = {"sampler": sampler, "seed": 5, "startup_trials": 4, "trials": 6}
-    return replace(standard(), **{**given, **changes})
-
-
-@functools.cache
-def standard() -> SweepConfig:
-    return compose_sweep([]).entry.sweep
+    return studies.settings(sampler=sampler, **{"seed": 5, "trials": 6, **changes})
 
 
 def score(values: dict) -> float:

@@ -33,10 +33,7 @@ def assert_nothing_begun(ended):
     [
         ((), ("nothing to search", "KEY='interval(LOW,HIGH)'")),
         (("algorithm.lrr=interval(0,1)",), ("algorithm.lrr: no such key", "did you mean lr?")),
-        (("algorithm.lr=interval(-1,1)",), ("algorithm.lr=-1", "greater than 0")),
-        (("network=mlp,mlp_smal",), ("network=mlp_smal: no such network", "did you mean mlp_small?")),
         ((LR, "sweep.workers=0"), ("sweep.workers=0",)),
-        ((LR, "sweep.trials=0"), ("sweep.trials=0",)),
         ((LR, "sweep.sampler=tpee"), ("sweep.sampler", "tpe")),
         ((LR, "sweep.pruners=[median]", "sweep.objectives=[lap_time,completion]"), ("median", "several")),
         ((LR, "sweep.protocol=three_trial"), ("three_trials",)),
@@ -49,7 +46,6 @@ def assert_nothing_begun(ended):
             (LR, "sweep.storage=postgresql+psycopg://me:secret@127.0.0.1:1/none"),
             ("sweep.storage=postgresql+psycopg://", "127.0.0.1"),
         ),
-        ((LR, "sweep.storage=oracle://x"), ("sweep.storage",)),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )

@@ -170,6 +170,8 @@ def test_apply_removes_what_was_listed_and_nothing_else(season, call):
     }
     assert not tree(season.runs_dir) - before
     assert "nothing to remove" in call("runs", "clean").stdout
+    missing = call("runs", "clean", "runs_dir=nowhere")
+    assert (missing.code, "is not a folder" in missing.complaint) == (2, True)
 
 
 def test_the_sums_are_those_of_the_files(season, call):

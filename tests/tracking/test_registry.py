@@ -100,7 +100,7 @@ def spoil(checkpoint: Path) -> None:
             "not found",
         ),
         (lambda run, client, run_id: client.delete_run(run_id), (), "was deleted in MLflow"),
-        (None, ("checkpoint=77",), "000077 does not exist"),
+        (None, ("checkpoint=77",), "000077 is not there"),
         (None, ("checkpoint=../x",), "best, last or the number"),
         (None, ("tracking.uri=ftp://x",), "tracking.uri=ftp://x"),
     ],
