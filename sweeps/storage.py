@@ -2,7 +2,6 @@
 
 import glob
 import logging
-import os
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,7 +27,7 @@ from tenacity.wait import wait_exponential_jitter
 
 from deepracer_exp.addresses import redact, with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
-from deepracer_exp.tracking.store import one_line
+from deepracer_exp.tracking.store import check_database_file, one_line
 
 Result = TypeVar("Result")
 
@@ -160,15 +159,7 @@ def _check_driver(url: sa.URL, shown: str) -> None:
 def _of_file(file: Path, shown: str) -> Database:
     # The workers may have another working folder.
     file = file.absolute()
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"{shown}: folder {file.parent} cannot be created: {error.strerror}") from None
-    if file.is_dir():
-        raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
-    # SQLite keeps two files beside it, so the folder must be writable, too.
-    if not all(os.access(path, os.W_OK) for path in (file, file.parent) if path.exists()):
-        raise BadInput(f"{shown}: {file} cannot be written; choose a writable place")
+    check_database_file(file, shown)
     return Database(sa.URL.create("sqlite", database=str(file)), shown)
 
 

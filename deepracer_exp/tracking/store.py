@@ -139,14 +139,20 @@ def _check_sqlite_file(file: Path, shown: str) -> None:
     # SQLAlchemy splits the uri at the first "?" and does not unquote the path, so no escape exists.
     if "?" in str(file):
         raise BadInput(f"{shown}: MLflow's SQLite store cannot lie under a path with '?' ({file}); rename it")
+    check_database_file(file, shown)
+
+
+def check_database_file(file: Path, shown: str) -> None:
+    """Refuse a file that SQLite cannot write, or create; its folder is created. `shown` begins the message."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BadInput(f"{shown}: folder {file.parent} cannot be made: {error.strerror}") from None
+        raise BadInput(f"{shown}: folder {file.parent} cannot be created: {error.strerror}") from None
     if file.is_dir():
         raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
-    if not os.access(file if file.exists() else file.parent, os.W_OK):
-        raise BadInput(f"{shown}: {file} cannot be written; choose a writable place or tracking=off")
+    # SQLite keeps two files beside it, so the folder must be writable, too.
+    if not all(os.access(path, os.W_OK) for path in (file, file.parent) if path.exists()):
+        raise BadInput(f"{shown}: {file} cannot be written; choose a writable place")
 
 
 def silence_mlflow() -> None:

@@ -3,13 +3,14 @@
 import json
 import logging
 import threading
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import TypeAdapter
+
 from deepracer_exp.errors import BadInput
-from deepracer_exp.files import atomic_write
+from deepracer_exp.files import atomic_write, read_json_as
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
@@ -87,31 +88,18 @@ class TrackingFile:
             _log.warning("%s: cannot be written: %s", self._path, error.strerror)
 
 
+_TRACKED_RUN = TypeAdapter(TrackedRun)
+
+
 def read_tracked_run(path: Path) -> TrackedRun:
     """Read a `tracking.json`.
 
     Raises:
         BadInput: it is missing or invalid.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadInput(
-            f"{path}: cannot be read: {error.strerror}; the run was not recorded in MLflow, or restore the file"
-        ) from error
-    except ValueError as error:
-        raise BadInput(f"{path}: is not valid JSON: {error}") from error
-    try:
-        run = TrackedRun(**data)
-    except TypeError as error:
-        raise BadInput(f"{path}: has unexpected keys: {error}") from error
-    kinds: Mapping[str, type | tuple[type, ...]] = {
-        "run_id": (str, type(None)), "run_name": str, "experiment": str, "start_ms": int, "store": str,
-        "params": dict, "tags": dict, "files": dict,
-    }  # fmt: skip
-    for key, kind in kinds.items():
-        if not isinstance(getattr(run, key), kind):
-            raise BadInput(f"{path}: {key}: {getattr(run, key)!r} is not valid")
+    run = read_json_as(path, _TRACKED_RUN, "a tracker")
+    if run is None:
+        raise BadInput(f"{path}: cannot be read; the run was not recorded in MLflow, or restore the file")
     return run
 
 

@@ -12,7 +12,6 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import IO
 
 from deepracer_exp.addresses import redact
@@ -43,7 +42,9 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
     if store.is_server:
         announce(runs_page(store.shown, uri, runs_dir))
         return
-    with _ending_by_exception(), running_ui(store, port) as (url, server):
+    for signum in (signal.SIGTERM, signal.SIGHUP):  # which end Python without cleaning up
+        signal.signal(signum, lambda signum, _: sys.exit(128 + signum))
+    with running_ui(store, port) as (url, server):
         try:
             announce(runs_page(url, uri, runs_dir))
             code = server.wait()
@@ -128,18 +129,3 @@ def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO
     output.seek(0)
     lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]
     raise RunFailed(f"MLflow's server did not start at {url}: {redact(lines[-1])}")
-
-
-@contextmanager
-def _ending_by_exception() -> Iterator[None]:
-    """Turn SIGTERM and SIGHUP, which end Python without cleaning up, into SystemExit(128 + signal)."""
-
-    def leave(signum: int, _: FrameType | None) -> None:
-        raise SystemExit(128 + signum)
-
-    before = {signum: signal.signal(signum, leave) for signum in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for signum, handler in before.items():
-            signal.signal(signum, handler)

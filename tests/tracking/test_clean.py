@@ -21,13 +21,15 @@ def tree(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
-def listed(season, overview=None) -> list[tuple[str, str, list[str]]]:
-    found = survey(season.runs_dir, overview)
+def listed(season, *, asked: bool = False) -> list[tuple[str, str, list[str]]]:
+    """Return what may go; `asked`: MLflow was read."""
+    found = survey(season.runs_dir, read_overview(None, season.runs_dir) if asked else None)
     return [(item.run.name, item.what, [path.name for path in item.paths]) for item in found.removable]
 
 
-def kept(season, overview=None) -> dict[str, str]:
-    return {run.name: reason for run, reason in survey(season.runs_dir, overview).kept}
+def kept(season, *, asked: bool = False) -> dict[str, str]:
+    found = survey(season.runs_dir, read_overview(None, season.runs_dir) if asked else None)
+    return {run.name: reason for run, reason in found.kept}
 
 
 def age(run: Path, seconds: float) -> None:
@@ -36,18 +38,13 @@ def age(run: Path, seconds: float) -> None:
         os.utime(path, (then, then), follow_symlinks=False)
 
 
-def test_pinned_and_cloned_from_checkpoints_stay(season):
-    first, second = season.run("1"), season.run("2")
-    pin(first / "checkpoints", "000010", "cloned into season")
-    shutil.rmtree(season.clone("3", second, checkpoint="000010") / "checkpoints")
-    assert listed(season) == []
-
-
 def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp_path):
     season.clone("2", season.run("1"), checkpoint="000010")
     season.runs_dir.rename(tmp_path / "moved")
     season.runs_dir = tmp_path / "moved"
     assert listed(season) == [("2", SPARE_CHECKPOINTS, ["000010"])]
+    pin(season.runs_dir / "season" / "2" / "checkpoints", "000010", "cloned into season")
+    assert listed(season) == []
 
 
 def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
@@ -56,7 +53,7 @@ def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, clien
     promote(run, "10", "model", "champion", FEATURES, None, season.runs_dir)
     (run / "checkpoints" / "pinned.json").unlink()
     client.delete_registered_model_alias("model", "champion")
-    assert listed(season, read_overview(None, season.runs_dir)) == []
+    assert listed(season, asked=True) == []
 
 
 def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(season, client):
@@ -64,9 +61,9 @@ def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(seas
     season.run("2")
     assert listed(season) == [("2", SPARE_CHECKPOINTS, ["000010"])]
     assert "tracking.uri" in kept(season)["1"]
-    assert len(listed(season, read_overview(None, season.runs_dir))) == 2
+    assert len(listed(season, asked=True)) == 2
     (season.runs_dir / "season" / "1" / "tracking.json").write_text(json.dumps({"run_id": "0" * 32}))
-    assert len(listed(season, read_overview(None, season.runs_dir))) == 1
+    assert len(listed(season, asked=True)) == 1
 
 
 def test_traces_of_failed_runs_can_go_and_of_no_others(season):
@@ -78,13 +75,10 @@ def test_traces_of_failed_runs_can_go_and_of_no_others(season):
 def test_a_run_deleted_in_mlflow_can_go_whole_and_an_active_one_cannot(season, client):
     ids = [season.recorded(season.run(name), client) for name in ("1", "2")]
     client.delete_run(ids[0])
-    assert listed(season, read_overview(None, season.runs_dir)) == [
-        ("1", DELETED, ["1"]),
-        ("2", SPARE_CHECKPOINTS, ["000010"]),
-    ]
+    first = ("1", DELETED, ["1"])
+    assert listed(season, asked=True) == [first, ("2", SPARE_CHECKPOINTS, ["000010"])]
     client.delete_experiment(client.get_experiment_by_name("season").experiment_id)
-    found = listed(season, read_overview(None, season.runs_dir))
-    assert found == [("1", DELETED, ["1"]), ("2", DELETED, ["2"])]
+    assert listed(season, asked=True) == [first, ("2", DELETED, ["2"])]
 
 
 def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
@@ -94,10 +88,10 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
     promote(registered, "best", "model", "champion", FEATURES, None, season.runs_dir)
     for run_id in ids:
         client.delete_run(run_id)
-    overview = read_overview(None, season.runs_dir)
-    assert [item for item in listed(season, overview) if item[1] == DELETED] == []
-    assert kept(season, overview)["1"] == "deleted in MLflow, but needed: 000020 cloned to 3"
-    assert kept(season, overview)["2"] == "deleted in MLflow, but needed: 000020 registered as model"
+    assert DELETED not in [what for _, what, _ in listed(season, asked=True)]
+    reasons = kept(season, asked=True)
+    assert reasons["1"] == "deleted in MLflow, but needed: 000020 cloned to 3"
+    assert reasons["2"] == "deleted in MLflow, but needed: 000020 registered as model"
 
 
 def test_a_run_that_a_training_holds_stays_until_it_lets_go(season):
@@ -140,9 +134,8 @@ def test_what_is_no_run_of_ours_is_left_alone(season, tmp_path):
     foreign = season.run("3", status="failed")
     (foreign / "provenance.json").unlink()
     inner = season.run("4", status="failed")
-    shutil.rmtree(inner / "checkpoints")
-    shutil.rmtree(inner / "trace")
     for name in ("checkpoints", "trace"):
+        shutil.rmtree(inner / name)
         (inner / name).symlink_to(outside / name)
     odd = season.run("5")
     shutil.rmtree(odd / "checkpoints" / "000010")
@@ -153,39 +146,27 @@ def test_what_is_no_run_of_ours_is_left_alone(season, tmp_path):
 
 
 def test_apply_removes_what_was_listed_and_nothing_else(season, call):
-    first, failed = season.run("1"), season.run("2", status="failed")
+    season.run("1")
+    failed = season.run("2", status="failed")
+    gone = ("season/1/checkpoints/000010", "season/2/checkpoints/000010", "season/2/trace")
+    spare = [path for path in (failed / "checkpoints" / "000010").rglob("*") if path.is_file()]
+    size = sum(path.stat().st_size for path in spare)
     before = tree(season.runs_dir)
     shown = call("runs", "clean")
     assert shown.code == 0, shown.stderr
-    assert "--apply removes it" in shown.stdout
+    words = " ".join(shown.stdout.split())
+    assert "--apply removes it" in words
+    assert f"{size} bytes checkpoints neither best nor last: 000010" in words
+    assert "1.0 kB trace of a failed run season/2" in words
+    assert f"{(2 * size + 1000) / 1000:.1f} kB in all" in words
     assert tree(season.runs_dir) == before
-    ended = call("runs", "clean", "--apply")
-    assert ended.code == 0, ended.stderr
-    gone = before - tree(season.runs_dir)
-    assert gone == {
-        path
-        for path in before
-        for run, part in ((first, "checkpoints/000010"), (failed, "checkpoints/000010"), (failed, "trace"))
-        if f"{path}/".startswith(f"{(run / part).relative_to(season.runs_dir).as_posix()}/")
+    assert call("runs", "clean", "--apply").code == 0
+    assert tree(season.runs_dir) == {
+        path for path in before if not any(f"{path}/".startswith(f"{part}/") for part in gone)
     }
-    assert not tree(season.runs_dir) - before
     assert "nothing to remove" in call("runs", "clean").stdout
     missing = call("runs", "clean", "runs_dir=nowhere")
     assert (missing.code, "is not a folder" in missing.complaint) == (2, True)
-
-
-def test_the_sums_are_those_of_the_files(season, call):
-    run = season.run("1", status="failed")
-    wanted = sum(
-        path.stat().st_size for path in (run / "checkpoints" / "000010").rglob("*") if path.is_file()
-    )
-    ended = call("runs", "clean")
-    lines = [line.split() for line in ended.stdout.splitlines()]
-    assert [*str(wanted).split(), "bytes", "checkpoints", "neither", "best", "nor", "last:", "000010"] in [
-        line[:8] for line in lines
-    ]
-    assert ["1.0", "kB", "trace", "of", "a", "failed", "run", "season/1"] in lines
-    assert f"{(wanted + 1000) / 1000:.1f} kB in all" in " ".join(ended.stdout.split())
 
 
 def test_what_a_link_inside_leads_to_outlives_it(season, client, call, tmp_path):
@@ -209,8 +190,8 @@ def test_an_unavailable_store_is_reported_and_its_part_skipped(season, client, c
     assert ended.code == 0
     assert "runs deleted there, and checkpoints of runs recorded there, are left out" in ended.stderr
     assert len(ended.stderr.splitlines()) == 1
-    assert not (season.runs_dir / "season" / "2" / "checkpoints" / "000010").exists()
-    assert (season.runs_dir / "season" / "1" / "checkpoints" / "000010").exists()
+    spare = [(season.runs_dir / "season" / name / "checkpoints" / "000010").exists() for name in "12"]
+    assert spare == [True, False]
 
 
 def test_a_training_or_a_pin_that_came_after_the_survey_is_heeded(season):

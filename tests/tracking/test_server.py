@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from deepracer_exp.tracking.delivery import deliver
 from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracker import MLflowTracker
@@ -44,19 +43,6 @@ def test_a_server_killed_and_restarted_mid_run_has_every_point_once(server, tmp_
     ]
 
 
-def test_a_server_down_at_the_start_gets_one_whole_run_when_it_comes(server, tmp_path, identity):
-    server.kill()
-    tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
-    tracker.start("run", "race", {"seed": 1}, {}, identity)
-    tracker.log({"kl": 1.0}, 1)
-    server.start()
-    assert tracker.finish("FINISHED", deadline_s=60) == 0
-    client = MlflowClient(tracking_uri=server.uri)
-    experiment = client.get_experiment_by_name("race")
-    (run,) = client.search_runs([experiment.experiment_id])
-    assert (run.data.params, run.data.metrics) == ({"seed": "1"}, {"update/kl": 1.0})
-
-
 def test_a_hanging_server_blocks_nothing_and_gets_every_point_later(server, tmp_path, wait_until, identity):
     tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
     tracker.start("run", "race", {}, {}, identity)
@@ -73,28 +59,6 @@ def test_a_hanging_server_blocks_nothing_and_gets_every_point_later(server, tmp_
     assert tracker.finish("FINISHED", deadline_s=60) == 0
     points = MlflowClient(tracking_uri=server.uri).get_metric_history(tracker.run_id, "update/kl")
     assert sorted(point.step for point in points) == list(range(201))
-
-
-def test_a_run_that_ends_while_the_server_is_down_is_delivered_when_it_is_back(server, tmp_path, wait_until):
-    tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
-    tracker.start("run", "race", {"seed": 1}, {}, tmp_path / "tracking.json")
-    rows = [{"env_steps": n, "wall_clock_s": n / 8, "kl": n / 3} for n in range(100)]
-    tracker.safe_until(100)
-    for row in rows:
-        if row["env_steps"] == 50:
-            wait_until(lambda: tracker.waiting == 0)
-            server.kill()
-        tracker.log(row, row["env_steps"])
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    (tmp_path / "summary.json").write_text(json.dumps({"status": "finished", "reason": "converged"}))
-    assert tracker.finish("FINISHED", deadline_s=0.5) == 100  # kl and wall_clock_s
-    server.start()
-    assert deliver(tmp_path, server.uri, tmp_path) == 100
-    assert deliver(tmp_path, server.uri, tmp_path) == 0
-    client = MlflowClient(tracking_uri=server.uri)
-    points = client.get_metric_history(tracker.run_id, "update/kl")
-    assert [(point.step, point.value) for point in points] == [(row["env_steps"], row["kl"]) for row in rows]
-    assert client.get_run(tracker.run_id).info.status == "FINISHED"
 
 
 @pytest.mark.timeout(600)

@@ -21,7 +21,7 @@ from deepracer_exp.tracking.tracker import open_tracker
         ("sqlite://", "names no file"),
         ("sqlite:///", "names no file"),
         ("sqlite:///:memory:", "names no file"),
-        ("sqlite:////proc/none/mlflow.db", "folder /proc/none cannot be made"),
+        ("sqlite:////proc/none/mlflow.db", "folder /proc/none cannot be created"),
         ("sqlite:////proc", "is a folder"),
     ],
 )
