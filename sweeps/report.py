@@ -27,19 +27,6 @@ _MOST_PARAMETERS = 12
 _LONGEST_REASON = 140
 _LONGEST_TRACEBACK = 4000
 _ORDER = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED, TrialState.FAIL, TrialState.WAITING)
-_NOTES = {
-    "history": "Complete trials only. Trials far worse than the better half, such as those without a complete lap, lie "
-    "outside the axis: double-click to see them all.",
-    "pareto": "Complete trials only. Trials far worse than the better half lie outside the axes: double-click to see "
-    "them all.",
-    "importance": "PED-ANOVA over the complete trials: how much the values of the best quarter differ from those of "
-    "all. A parameter that only some trials have is measured among those.",
-    "slice": "Complete trials, coloured by their number. A slope or a cloud at one end shows where to search next.",
-    "parallel": "Drag along an axis to see only the trials in that part, drag a name to move its axis. A dash is a "
-    "trial without this parameter. Trials far worse than the better half are at the end of the objective's axis.",
-    "entropy": "Policies begin near the top (all actions alike) and come down as they settle. Click a word of the "
-    "legend to hide its trials, twice to see them alone.",
-}
 
 
 def write_study_page(study: optuna.Study, path: Path) -> Path:
@@ -73,7 +60,6 @@ def study_page(study: optuna.Study) -> str:
         picture=_picture(study) if complete else None,
         best=best_trial(study).number if complete else None,
         winners=_winners(study, objectives, keys),
-        notes={one.name: _NOTES[one.name.partition("-")[0]] for one in plots},
         too_few=FEWEST_COMPLETE if len(complete) < FEWEST_COMPLETE else None,
         trials=_table(study, objectives, keys),
         failures=_failures(trials),
