@@ -24,8 +24,6 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.dialects import mysql
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
-from deepracer_exp.training.trainer import TakenOver
-
 from .storage import DOWN, patiently
 
 Value = TypeVar("Value")
@@ -325,6 +323,8 @@ class Lease:
         if not self._lost and time.monotonic() > self._renewed_at + self._lease_s / 2:
             self._lost = not patiently(self._renew, self._patience_s)
         if self._lost:
+            from deepracer_exp.training.trainer import TakenOver  # which imports torch
+
             raise TakenOver(f"trial {self.claim.index} was taken over")
 
     def held(self, write: Callable[[], bool]) -> None:
