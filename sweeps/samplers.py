@@ -47,10 +47,10 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
             warnings.simplefilter("ignore", ExperimentalWarning)
             return _SAMPLERS[config.sampler](config, space, index, seed)
 
-    return PerTrialSampler(make)
+    return _PerTrialSampler(make)
 
 
-class PerTrialSampler(BaseSampler):
+class _PerTrialSampler(BaseSampler):
     """A fresh sampler for each trial, seeded by the trial's index.
 
     A sampler draws from its seed on. Workers share the study's seed, so each of them, and each start of a study, would
@@ -64,29 +64,24 @@ class PerTrialSampler(BaseSampler):
         self._open: dict[int, BaseSampler] = {}
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        """Begin a trial."""
         self._of(trial).before_trial(study, trial)
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        """Return what is sampled together."""
         return self._of(trial).infer_relative_search_space(study, trial)
 
     def sample_relative(
         self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Return the values that are sampled together."""
         return self._of(trial).sample_relative(study, trial, search_space)
 
     def sample_independent(
         self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """Return one value that is sampled by itself."""
         return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
         self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
     ) -> None:
-        """End a trial."""
         self._of(trial).after_trial(study, trial, state, values)
         del self._open[trial.number]
 

@@ -7,21 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 METRICS: Mapping[str, tuple[str, str]] = {
-    "eval_race_score_s": (
-        "race/score_s",
-        "seconds per complete lap of the evaluation on all conditions, including failed laps",
-    ),
+    "eval_race_score_s": ("race/score_s", "seconds per complete lap on all conditions, failed laps included"),
     "eval_lap_time_s": ("race/lap_time_s", "mean time of the evaluation's complete laps"),
     "eval_completion": ("race/completion", "mean progress of the evaluation's laps in per cent"),
-    "held_out_completion": (
-        "race/held_out_completion",
-        "the same on held-out conditions",
-    ),
+    "held_out_completion": ("race/held_out_completion", "the same on held-out conditions"),
     "eval_lap_share": ("race/lap_share", "share of the evaluation's laps that were completed (0 to 1)"),
     "completion": ("train/completion", "mean progress of finished episodes in per cent"),
     "lap_share": (
         "train/lap_share",
-        "share of recent episodes that completed the lap (0 to 1), the lowest of several tracks",
+        "share of recent episodes with a lap (0 to 1), the lowest of all tracks",
     ),
     "best_lap_time_s": ("train/best_lap_time_s", "fastest lap so far, with sampled actions"),
     "mean_lap_time_s": ("train/mean_lap_time_s", "mean time of the iteration's completed laps"),
@@ -37,7 +31,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "clip_fraction": ("update/clip_fraction", "share of samples whose policy ratio was clipped"),
     "explained_variance": (
         "update/explained_variance",
-        "variance of the returns explained by the value network",
+        "share of the returns' variance that the critic explains",
     ),
     "grad_norm": ("update/grad_norm", "norm of the gradient before clipping"),
     "env_steps_per_s": ("time/env_steps_per_s", "control steps per second of wall time"),
