@@ -76,7 +76,7 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
         try:
             found = check(candidate, resumable=resumable)
         except BadInput as error:
-            if not others:
+            if name.isdecimal():
                 raise
             reasons.append(str(error))
             continue
@@ -110,7 +110,7 @@ def check(path: Path, *, resumable: bool = False) -> Path:
         )
     for name in (_MANIFEST, HASHES):
         if name not in files:
-            raise BadInput(f"{path}: incomplete: has no {name}")
+            raise BadInput(f"{path}: has no {name}: incomplete, or written by an older version")
     verify(path)
     try:
         components = Checkpoint.manifest(path)["components"]
