@@ -10,28 +10,12 @@ from typing import NoReturn
 
 from deepracer_exp import __version__
 from deepracer_exp.addresses import redact, without_passwords
-from deepracer_exp.commands.analyze import add_analyze
+from deepracer_exp.commands import analyze, evaluate, files, runs, sweep, tracks, train, validate
 from deepracer_exp.commands.arguments import refuse_old_spellings
-from deepracer_exp.commands.checkpoints import add_checkpoints
-from deepracer_exp.commands.clone import add_clone
-from deepracer_exp.commands.evaluate import add_evaluate
-from deepracer_exp.commands.export import add_export
-from deepracer_exp.commands.import_files import add_import
-from deepracer_exp.commands.resume import add_resume
-from deepracer_exp.commands.runs import add_runs, with_default_action
-from deepracer_exp.commands.stopping import add_stopping
 from deepracer_exp.commands.supervised import supervised
-from deepracer_exp.commands.sweep import add_sweep
-from deepracer_exp.commands.tracks import add_tracks
-from deepracer_exp.commands.train import add_train
-from deepracer_exp.commands.ui import add_ui
-from deepracer_exp.commands.validate import add_validate
 from deepracer_exp.errors import BadInput, RunFailed, nearest
 
-_COMMANDS = (
-    *(add_train, add_resume, add_clone, add_sweep, add_runs, add_evaluate, add_checkpoints, add_analyze),
-    *(add_validate, add_import, add_export, add_tracks, add_stopping, add_ui),
-)
+_COMMANDS = (train, sweep, runs, evaluate, analyze, validate, files, tracks)
 """In the order of `--help`."""
 _EPILOG = """\
 `deepracer-exp COMMAND --help` explains a command. Results are written to runs/ in the current folder.
@@ -72,7 +56,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         argcomplete.autocomplete(parser)
     given = without_passwords(list(arguments))
     refuse_old_spellings(given)
-    args, rest = parser.parse_known_args(with_default_action(given))
+    args, rest = parser.parse_known_args(runs.with_default_action(given))
     if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:  # argparse accepts no positional arguments after an option between them
@@ -90,8 +74,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"deepracer-exp {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add_command in _COMMANDS:
-        add_command(commands)
+    for family in _COMMANDS:
+        family.add_commands(commands)
     return parser
 
 

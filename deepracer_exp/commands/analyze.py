@@ -8,14 +8,14 @@ from deepracer_exp.errors import BadInput, reading
 from deepracer_exp.files import LOG_BYTES, open_user_file
 from deepracer_exp.runs.files import REPORT
 
-from .arguments import RUN, Stores, add_overrides, complete_runs, is_override, read_stores
+from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
+    from deepracer_exp.config.car import CarConfig
 
-_EPILOG = f"""\
-  deepracer-exp analyze RUN                                 RUN: {RUN[: RUN.index("MLflow")].strip()}
-                                                            {RUN[RUN.index("MLflow") :]}
+_EPILOG = """\
+  deepracer-exp analyze RUN                                 one of our runs
   deepracer-exp analyze ~/Downloads/training.tar.gz         logs of the service, the console or deepracer-for-cloud:
                                                             a folder, an archive or a file of any layout
   deepracer-exp analyze RUN --compare RUN logs/             others beside it: how each of them learned
@@ -26,15 +26,17 @@ The page needs no network: findings in words first, then figures and tables, the
 """
 
 
-def add_analyze(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "analyze",
+        _analyze,
         help="find out from logs how a training went",
         description="Read the logs of a training, ours or the service's of any year, print the findings, and write a "
         "page of figures.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        runs_rewards=True,
     )
     what = parser.add_argument("what", metavar="RUN | LOGS", help="a run, or logs of the service")
     what.completer = complete_runs  # type: ignore[attr-defined]
@@ -57,7 +59,6 @@ def add_analyze(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         metavar="FILE",
         help="page to write (default: report.html of a run, else NAME-analysis.html)",
     )
-    parser.set_defaults(command=_analyze, runs_rewards=True)
 
 
 def _analyze(args: argparse.Namespace) -> int:
@@ -73,10 +74,11 @@ def _analyze(args: argparse.Namespace) -> int:
     beside = [_place(what, stores) for what in args.compare if not is_override(what)]
     if args.output is not None and not Path(args.output).absolute().parent.is_dir():
         raise BadInput(f"--output {args.output}: its folder does not exist; accepted: a file in a folder")
+    reward = None
     if args.reward is not None:
         from deepracer_exp.rewards.source import named_reward_source
 
-        named_reward_source(args.reward)
+        reward = named_reward_source(args.reward)
 
     from deepracer_exp.analysis.findings import findings
     from deepracer_exp.analysis.log_report import LogPage, write_page
@@ -88,9 +90,10 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.runs.own_recording import read_log
 
     recording = read_log(place)
-    view, terms = run_terms(prepare(recording, args.track))
+    car = _car(place)
+    view, terms = run_terms(prepare(recording, args.track), car)
     others = [_light(prepare(read_log(other))) for other in beside]
-    replay = None if args.reward is None else compare_rewards(view, replay_reward(recording, args.reward))
+    replay = None if reward is None else compare_rewards(view, replay_reward(view, reward, car))
     out = Path(args.output) if args.output else _default_out(place, recording.name)
     found = findings(view, target_s)
     try:
@@ -134,6 +137,21 @@ def _place(what: str, stores: Stores) -> Path:
     except BadInput as error:
         why = str(error).removeprefix(f"{what}: ")
         raise BadInput(f"{what}: no such file or folder, and no run: {why}") from None
+
+
+def _car(place: Path) -> "CarConfig":
+    """Return the car of a run of ours; the service's has the dimensions of the default one."""
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.config.parse import parse_experiment
+    from deepracer_exp.runs.files import read_config
+    from deepracer_exp.runs.own_recording import is_own_run
+
+    try:
+        if is_own_run(place):
+            return parse_experiment(read_config(place)).car
+    except BadInput:  # another version, whose cars had the same dimensions
+        pass
+    return compose_experiment([])[0].car
 
 
 def _light(view: "LogView") -> "LogView":

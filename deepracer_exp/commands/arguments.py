@@ -44,6 +44,28 @@ def refuse_old_spellings(arguments: Sequence[str]) -> None:
             )
 
 
+def add_command(
+    commands: "argparse._SubParsersAction[argparse.ArgumentParser]",
+    name: str,
+    call: Callable[[argparse.Namespace], int],
+    *,
+    help: str,
+    description: str,
+    epilog: str | None = None,
+    **defaults: object,
+) -> argparse.ArgumentParser:
+    """Add a command and return its parser; `call` runs it, and `defaults` are attributes of its arguments."""
+    parser = commands.add_parser(
+        name,
+        help=help,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter if epilog else argparse.HelpFormatter,
+    )
+    parser.set_defaults(command=call, **defaults)
+    return parser
+
+
 def add_run(parser: argparse.ArgumentParser, overrides: str | None = "KEY=VALUE", many: bool = False) -> None:
     """Give a command the arguments `RUN [overrides]`, which `run_and_overrides` returns.
 

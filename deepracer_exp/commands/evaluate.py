@@ -1,16 +1,19 @@
-"""`deepracer-exp evaluate`: how good a trained policy is."""
+"""`deepracer-exp evaluate`, `checkpoints` and `stopping`: how good a run is, and where it could have ended."""
 
 import argparse
+import ctypes.util
+import os
 import sys
 from pathlib import Path
 
-from .arguments import RUN, add_run, run_and_overrides, runs_and_overrides
-from .output import warnings_on_stderr
+from deepracer_exp.errors import BadInput
+
+from .arguments import add_command, add_run, run_and_overrides, runs_and_overrides, split_stores
+from .output import table_console, warnings_on_stderr
 from .startup import check_run
 
-_EPILOG = f"""\
-  deepracer-exp evaluate RUN                                RUN: {RUN[: RUN.index("MLflow")].strip()}
-                                                            {RUN[RUN.index("MLflow") :]}
+_EVALUATE_EPILOG = """\
+  deepracer-exp evaluate RUN                                its best checkpoint
   deepracer-exp evaluate RUN evaluation=summit              three_trials, four_minutes, summit or aws_virtual
   deepracer-exp evaluate RUN checkpoint=last evaluation.trials=20
   deepracer-exp evaluate RUN evaluation.tracks=[Oval_track,Bowtie_track]
@@ -21,17 +24,20 @@ The results are also written to evaluations/TIME.json in the run's folder.
 """
 
 
-def add_evaluate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    parser = commands.add_parser(
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the commands."""
+    parser = add_command(
+        commands,
         "evaluate",
+        _evaluate,
         help="measure how good a trained car is",
         description=(
             "Race a run's best policy: several trials at once, on the conditions of its training and on conditions it "
             "was not trained on, on any tracks."
         ),
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_EVALUATE_EPILOG,
+        runs_rewards=True,
+        entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
     parser.add_argument("--video", metavar="FILE", help="film the fastest lap (.mp4)")
@@ -39,7 +45,36 @@ def add_evaluate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--cfg", action="store_true", help="print the composed configuration as YAML and stop"
     )
-    parser.set_defaults(command=_evaluate, runs_rewards=True, entry="evaluate")
+
+    parser = add_command(
+        commands,
+        "checkpoints",
+        _checkpoints,
+        help="compare a run's checkpoints and recommend one",
+        description="Race every kept checkpoint of a run, show how fast it is and how often it completes a lap, and "
+        "recommend one.",
+        epilog=_CHECKPOINTS_EPILOG,
+        entry="evaluate",
+    )
+    add_run(parser, "evaluation=NAME | KEY=VALUE")
+    parser.add_argument("-o", "--output", metavar="FILE", help="page with the figure to write (.html)")
+
+    parser = commands.add_parser(
+        "stopping",
+        help="try a stopping rule on finished runs",
+        description="Try stopping rules on finished runs.",
+    )
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    replay = add_command(
+        actions,
+        "replay",
+        _replay,
+        help="show where a rule would have ended runs, what it saves and what it loses",
+        description="Apply a stopping rule to the metrics of runs: where would it have ended them, what would that "
+        "have saved, and how much better did they still become?",
+        epilog=_STOPPING_EPILOG,
+    )
+    add_run(replay, "stopping=NAME | stopping.KEY=VALUE", many=True)
 
 
 def _evaluate(args: argparse.Namespace) -> int:
@@ -55,10 +90,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     config, _ = compose_evaluation([*overrides, override_line("run", run)])
     args.debug = config.debug
     if args.video is not None:
-        # MuJoCo looks at this once, when it is imported.
-        from deepracer_exp.evaluation.graphics import choose_graphics
-
-        choose_graphics()
+        _choose_graphics()
     check_run(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
 
     from rich.console import Console
@@ -70,3 +102,94 @@ def _evaluate(args: argparse.Namespace) -> int:
     with warnings_on_stderr():
         evaluate(config, video, out, Console(stderr=True))
     return 0
+
+
+_CHECKPOINTS_EPILOG = """\
+  deepracer-exp checkpoints RUN                             the trials by which the training chose its best one
+  deepracer-exp checkpoints RUN evaluation=summit evaluation.trials=40
+  deepracer-exp checkpoints RUN evaluation.tracks=[Oval_track,Bowtie_track]
+  deepracer-exp checkpoints RUN -o checkpoints.html         also draw speed against stability
+
+Every checkpoint drives the same trials, on the conditions of its training and on conditions it was not trained on.
+"""
+
+
+def _choose_graphics() -> None:
+    """Set MUJOCO_GL, which MuJoCo reads when it is imported, to a library that this machine has, unless it is set.
+
+    Raises:
+        BadInput: the machine has no such library.
+    """
+    if os.environ.get("MUJOCO_GL") or sys.platform != "linux":
+        return
+    for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+        if ctypes.util.find_library(library):
+            os.environ["MUJOCO_GL"] = name
+            return
+    raise BadInput(
+        "--video: this machine has neither EGL nor OSMesa to draw with; install libegl1 (with libgl1-mesa-dri) or "
+        "libosmesa6, or set MUJOCO_GL"
+    )
+
+
+def _checkpoints(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_evaluation
+    from deepracer_exp.config.overrides import group_of, override_line
+
+    run, overrides = run_and_overrides(args)
+    chosen = [given for given in overrides if given.startswith("checkpoint=")]
+    if chosen:
+        raise BadInput(f"{chosen[0]}: all kept checkpoints are raced; `deepracer-exp evaluate` races one")
+    if args.output is not None:
+        page = Path(args.output)
+        if page.suffix != ".html" or not page.absolute().parent.is_dir():
+            raise BadInput(f"--output {page}: accepted: the name of a page (.html) in a folder")
+    config, _ = compose_evaluation([*overrides, override_line("run", run)])
+    own_trials = not any(group_of(given) == "evaluation" for given in overrides)
+    args.debug = config.debug
+    check_run(config.run, config.runs_dir, config.tracking.uri, None)
+
+    from rich.console import Console
+
+    from deepracer_exp.evaluation.checkpoint_comparison import show_checkpoints
+
+    progress = Console(stderr=True, highlight=False, markup=False)
+    with warnings_on_stderr():
+        show_checkpoints(config, own_trials, args.output, table_console(160), progress)
+    return 0
+
+
+_STOPPING_EPILOG = """\
+  deepracer-exp stopping replay RUN                           the rule `entropy` with its default values
+  deepracer-exp stopping replay RUN RUN stopping=plateau      another rule
+  deepracer-exp stopping replay RUN stopping.converged.patience=40,80
+                                                              other values, one after the other
+"""
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_experiment, expand_grid
+    from deepracer_exp.runs.files import read_run
+    from deepracer_exp.runs.resolve import resolve
+
+    runs, given = runs_and_overrides(args)
+    stores, overrides = split_stores(given)
+    for override in overrides:
+        if not override.startswith(("stopping=", "stopping.")):
+            raise BadInput(f"{override}: accepted: stopping=NAME and stopping.KEY=VALUE")
+    if not runs:
+        raise BadInput("RUN: missing; accepted: a run's folder, or its name in runs/EXPERIMENT/")
+    if not any(override.startswith("stopping=") for override in overrides):
+        overrides.insert(0, "stopping=entropy")
+    records = [read_run(resolve(run, stores.runs_dir, stores.uri).path) for run in runs]
+
+    from deepracer_exp.training.stopping_replay import replay, table
+
+    rules = [(_shown(lines), compose_experiment(lines)[0].stopping) for lines in expand_grid(overrides)]
+    replays = [replay(record, config, rule) for record in records for rule, config in rules]
+    table_console().print(table(replays))
+    return 0
+
+
+def _shown(overrides: list[str]) -> str:
+    return " ".join(override.removeprefix("stopping").lstrip(".=") for override in overrides)

@@ -1,17 +1,21 @@
-"""`deepracer-exp runs`: list runs, compare them, show their lineage, promote and clean them."""
+"""`deepracer-exp runs`: list runs, compare them, show their lineage, promote and clean them; and `ui`."""
 
 import argparse
+import datetime
+import math
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from string import ascii_uppercase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import METRICS
+from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY
 
 from .arguments import (
     STORES,
+    add_command,
     add_overrides,
     add_run,
     is_override,
@@ -20,16 +24,19 @@ from .arguments import (
     runs_and_overrides,
 )
 from .output import table_console
-from .runs_lineage import show_lineage
-from .runs_list import list_runs
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     from deepracer_exp.runs.clean import Removable, StoreOverview
     from deepracer_exp.runs.files import RunRecord
+    from deepracer_exp.runs.lineage import Member
 
+_NONE = "\N{EN DASH}"
+_MOST_CHANGES = 6
+"""Changes of a clone that its lineage shows."""
 _LIST = "list"
 _EPILOG = """\
   deepracer-exp runs                                        list the runs, newest first
@@ -55,8 +62,8 @@ that have one; runs in progress; files and folders that no training wrote, and w
 """
 
 
-def add_runs(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the family of commands."""
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the family of commands, and `ui`."""
     family = commands.add_parser(
         "runs",
         help="list, compare, promote and clean runs",
@@ -68,12 +75,19 @@ def add_runs(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     actions = family.add_subparsers(metavar="ACTION", required=True)
     where = " | ".join(f"{key}=..." for key in STORES)
 
-    listing = actions.add_parser(_LIST, help="list the runs, newest first (the default)")
+    listing = add_command(
+        actions,
+        _LIST,
+        _list,
+        help="list the runs, newest first (the default)",
+        description="List the runs of a folder, newest first.",
+    )
     add_overrides(listing, "runs_dir=DIR")
-    listing.set_defaults(command=list_runs)
 
-    compare = actions.add_parser(
+    compare = add_command(
+        actions,
         "compare",
+        _compare,
         help="show runs side by side",
         description="Show how runs differ and what they achieved, and draw their learning curves and lap times.",
     )
@@ -81,19 +95,21 @@ def add_runs(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     compare.add_argument(
         "-o", "--output", default="compare.html", help="page of the figure (default: compare.html)"
     )
-    compare.set_defaults(command=_compare)
 
-    lineage = actions.add_parser(
+    lineage = add_command(
+        actions,
         "lineage",
+        _lineage,
         help="show a run's family tree",
         description="Show what a run was cloned from and its clones, what each clone changed and achieved, and the "
         "best of each generation. Reads only the folders of the runs.",
     )
     add_run(lineage, where)
-    lineage.set_defaults(command=show_lineage)
 
-    promote = actions.add_parser(
+    promote = add_command(
+        actions,
         "promote",
+        _promote,
         help="register a checkpoint under an alias",
         description="Register a checkpoint as a version of a model in MLflow and give it an alias, by which evaluate, "
         "export and clone find it. From then on nothing removes it from the run's folder.",
@@ -103,18 +119,27 @@ def add_runs(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     promote.add_argument(
         "--alias", default="champion", help="moves here from the version that has it (default: champion)"
     )
-    promote.set_defaults(command=_promote)
 
-    clean = actions.add_parser(
+    clean = add_command(
+        actions,
         "clean",
+        _clean,
         help="list what can be removed, or remove it",
         description="List what can be removed from the folders of the runs, with sizes; with --apply, remove it.",
         epilog=_CLEAN_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_overrides(clean, where)
     clean.add_argument("--apply", action="store_true", help="remove what is listed")
-    clean.set_defaults(command=_clean)
+
+    ui = add_command(
+        commands,
+        "ui",
+        _ui,
+        help="open the MLflow pages of the recorded runs",
+        description="Serve the MLflow pages of the project's runs on 127.0.0.1 until Ctrl-C.",
+    )
+    add_overrides(ui, "runs_dir=DIR | tracking.uri=URI")
+    ui.add_argument("--port", type=int, default=5000)
 
 
 def with_default_action(arguments: list[str]) -> list[str]:
@@ -122,6 +147,69 @@ def with_default_action(arguments: list[str]) -> list[str]:
     if arguments[:1] == ["runs"] and (len(arguments) == 1 or is_override(arguments[1])):
         return ["runs", _LIST, *arguments[1:]]
     return arguments
+
+
+def _list(args: argparse.Namespace) -> int:
+    from rich.table import Table
+
+    from deepracer_exp.runs.files import read_object
+
+    runs_dir = read_stores(args.overrides).runs_dir
+    if not runs_dir.is_dir():
+        raise BadInput(f"runs_dir={runs_dir}: is not a folder; `deepracer-exp train` creates it")
+    folders = {file.parent: _began_s(file.parent) for file in runs_dir.glob(f"*/*/{CONFIG}")}
+    if not folders:
+        print(f"no runs in {runs_dir}")
+        return 0
+    table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
+    table.columns[0].overflow = "fold"
+    for name in ("score (s)", "laps", "best lap (s)", "age"):
+        table.add_column(name, justify="right")
+    now_s = time.time()
+    for folder in sorted(folders, key=lambda one: (folders[one], one), reverse=True):
+        try:
+            summary = read_object(folder / SUMMARY)
+            state = str(summary["status"]) if "status" in summary else _state_without_end(folder)
+        except BadInput:  # one damaged run does not hide the others
+            summary, state = {}, "unreadable"
+        best = summary.get("best") or {}
+        table.add_row(
+            f"{folder.parent.name}/{folder.name}",
+            state,
+            _number(best.get("eval_race_score_s"), ".2f"),
+            _number(summary.get("laps"), ",.0f"),
+            _number(summary.get("best_lap_time_s"), ".2f"),
+            _age(now_s - folders[folder]),
+        )
+    table_console().print(table)
+    return 0
+
+
+def _state_without_end(folder: Path) -> str:
+    from deepracer_exp.runs.folder import is_held
+
+    return "running" if is_held(folder) else "killed"
+
+
+def _began_s(folder: Path) -> float:
+    """Return when a run began, Unix time: its folder's name says so, unless it was renamed."""
+    try:
+        return datetime.datetime.strptime(folder.name[: len("20260101-120000")], "%Y%m%d-%H%M%S").timestamp()
+    except ValueError:
+        return (folder / CONFIG).stat().st_mtime
+
+
+def _number(value: Any, form: str) -> str:
+    known = isinstance(value, int | float) and math.isfinite(value)
+    return format(value, form) if known else _NONE
+
+
+def _age(seconds: float) -> str:
+    """Return an age in its largest unit: ``40 s``, ``12 min``, ``5 h``, ``3 d``."""
+    for unit, length_s in (("d", 86_400), ("h", 3_600), ("min", 60)):
+        if seconds >= length_s:
+            return f"{seconds // length_s:.0f} {unit}"
+    return f"{max(seconds, 0):.0f} s"
 
 
 def _compare(args: argparse.Namespace) -> int:
@@ -180,6 +268,82 @@ def _tables(records: "Sequence[RunRecord]") -> "list[Table]":
             name, *(Text(text, style="bold green" if n == best else "") for n, text in enumerate(texts))
         )
     return [chosen, achieved]
+
+
+def _lineage(args: argparse.Namespace) -> int:
+    from rich.table import Table
+    from rich.tree import Tree
+
+    from deepracer_exp.runs.lineage import best_members, family, generations
+    from deepracer_exp.runs.resolve import resolve
+
+    name, overrides = run_and_overrides(args)
+    stores = read_stores(overrides)
+    run = resolve(name, stores.runs_dir, stores.uri).path
+    root = family(run, stores.runs_dir)
+    best = best_members(root)
+
+    def grow(member: "Member", tree: Tree) -> Tree:
+        for child in member.children:
+            grow(child, tree.add(_label(child, run, best)))
+        return tree
+
+    console = table_console()
+    table = Table(box=None, show_header=False, pad_edge=False)
+    fastest = generations(root)
+    courses = len({member.course for _, member, _ in fastest}) > 1
+    for generation, member, result in fastest:
+        course = [member.course] if courses else []
+        table.add_row(f"generation {generation}", *course, result.words(), member.name)
+    with console.capture() as drawn:
+        console.print(grow(root, Tree(_label(root, run, best))))
+        if fastest:
+            table.columns[-1].overflow = "fold"
+            console.print("", table, sep="\n")
+    # Rich fills lines up to the width.
+    print("\n".join(line.rstrip() for line in drawn.get().splitlines()))
+    return 0
+
+
+def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
+    """Return two lines: what the run is and achieved, and what it changed."""
+    from rich.text import Text
+
+    asked_for = member.path == run.resolve()
+    label = Text(member.name, style="bold reverse" if asked_for else "bold" if member.record else "dim")
+    if asked_for:
+        label.append("  <- this run", style="not reverse bold")
+    if id(member) in best:
+        label.append(f"  * {best[id(member)]}", style="not reverse bold green")
+    facts = [f"generation {member.generation}"]
+    if member.lineage is not None:
+        facts.append(f"from {member.lineage.checkpoint}")
+    if member.lineage is not None and member.lineage.registered is not None:
+        facts.append(member.lineage.registered)
+    facts += _result(member)
+    label.append("\n" + ", ".join(facts), style="not reverse not bold")
+    changes = [f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in member.changes.items()]
+    if len(changes) > _MOST_CHANGES:
+        changes[_MOST_CHANGES:] = [f"and {len(changes) - _MOST_CHANGES} more"]
+    if changes:
+        label.append("\n" + ", ".join(changes), style="not reverse not bold dim")
+    return label
+
+
+def _result(member: "Member") -> list[str]:
+    if member.record is None:
+        return ["missing: its folder was removed"]
+    status = member.record.summary.get("status", "running or killed")
+    facts = [] if status == "finished" else [str(status)]
+    if member.result is not None:
+        facts.append(member.result.words())
+    return facts
+
+
+def _value(value: object) -> str:
+    from deepracer_exp.analysis.comparison import value_text
+
+    return f"{value:g}" if isinstance(value, float) else value_text(value, 32)
 
 
 def _promote(args: argparse.Namespace) -> int:
@@ -268,7 +432,7 @@ def _overview(uri: str | None, runs_dir: Path) -> "tuple[StoreOverview | None, s
 def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Console") -> None:
     from rich.table import Table
 
-    from deepracer_exp.runs.clean import DELETED, FAILED_TRACE, SPARE_CHECKPOINTS, total
+    from deepracer_exp.runs.clean import SPARE_CHECKPOINTS, total
 
     if not items:
         return
@@ -278,12 +442,6 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
         what = f"{item.what}: {_names(item)}" if item.what == SPARE_CHECKPOINTS else item.what
         table.add_row(_bytes(item.size), what, str(item.run.relative_to(runs_dir)))
     table.add_row()
-    for kind in (SPARE_CHECKPOINTS, FAILED_TRACE, DELETED):
-        of_kind = [item for item in items if item.what == kind]
-        if of_kind:
-            table.add_row(
-                _bytes(total(of_kind)), kind, f"{len(of_kind)} runs" if len(of_kind) > 1 else "1 run"
-            )
     table.add_row(_bytes(total(items)), "in all", "")
     console.print(table)
     console.print()
@@ -298,3 +456,12 @@ def _bytes(size: int) -> str:
     from rich.filesize import decimal
 
     return decimal(size)
+
+
+def _ui(args: argparse.Namespace) -> int:
+    stores = read_stores(args.overrides)
+
+    from deepracer_exp.tracking.ui import serve_ui
+
+    serve_ui(stores.runs_dir, stores.uri, args.port, lambda line: print(line, flush=True))
+    return 0

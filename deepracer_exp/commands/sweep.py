@@ -6,7 +6,7 @@ import sys
 
 from deepracer_exp.errors import BadInput, reading
 
-from .arguments import add_overrides, is_override, read_stores
+from .arguments import add_command, add_overrides, is_override, read_stores
 from .output import print_start, warnings_on_stderr
 from .startup import check_sweep, start_workers_early
 
@@ -41,18 +41,20 @@ _PRELOADED = "sweeps.worker"
 """What a fork server imports once for all workers."""
 
 
-def add_sweep(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "sweep",
+        _sweep,
         help="search for the values that race best",
         description="Train many cars, each with other values, and find the best.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        runs_rewards=True,
+        entry="sweep",
     )
     add_overrides(parser, "KEY=EXPRESSION | GROUP=OPTION | KEY=VALUE | report NAME | best NAME")
     parser.add_argument("--cfg", action="store_true", help="print the composed sweep as YAML and stop")
-    parser.set_defaults(command=_sweep, runs_rewards=True, entry="sweep")
 
 
 def _sweep(args: argparse.Namespace) -> int:

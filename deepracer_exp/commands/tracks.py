@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
 
+from .arguments import add_command
 from .output import table_console
 
 if TYPE_CHECKING:
@@ -17,17 +18,18 @@ COLUMNS, ROWS = 100, 32
 """Largest size of a drawing, in characters and lines."""
 
 
-def add_tracks(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "tracks",
+        _tracks,
         help="list the tracks, or draw one",
         description="List the tracks with length, width and variants; with a name, draw that track.",
     )
     name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
     name.completer = _names  # type: ignore[attr-defined]
     parser.add_argument("-o", "--output", metavar="FILE", help="also write a picture of it")
-    parser.set_defaults(command=_tracks)
 
 
 def _names(**_: object) -> list[str]:

@@ -1,13 +1,24 @@
-"""`deepracer-exp train`: compose an experiment and run it."""
+"""`deepracer-exp train`, `resume` and `clone`: the commands that train a car."""
 
 import argparse
+import sys
 import traceback
+from pathlib import Path
 
-from .arguments import add_overrides, complete_groups
-from .output import print_notes, print_result, print_results, print_start
-from .startup import check_files, start_workers_early
+from deepracer_exp.runs.files import TRACKING, read_config
 
-_EPILOG = """\
+from .arguments import (
+    add_command,
+    add_overrides,
+    add_run,
+    complete_groups,
+    run_and_overrides,
+    split_stores,
+)
+from .output import print_notes, print_result, print_results, print_start, warnings_on_stderr
+from .startup import check_changes, check_files, check_run, has_workers, start_workers_early
+
+_TRAIN_EPILOG = """\
 An experiment is one option of each group, and any value in it can be set:
 
   deepracer-exp train                                       the default: re:Invent 2018, PPO, stops when the
@@ -29,14 +40,16 @@ groups: track car action_space observation randomization episode reward network 
 """
 
 
-def add_train(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    parser = commands.add_parser(
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the commands."""
+    parser = add_command(
+        commands,
         "train",
+        _train,
         help="train a car",
         description="Train a car: compose an experiment from overrides and run it.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_TRAIN_EPILOG,
+        runs_rewards=True,
     )
     add_overrides(parser, "GROUP=OPTION | KEY=VALUE")
     parser.add_argument("--cfg", action="store_true", help="print the composed experiment as YAML and stop")
@@ -45,7 +58,28 @@ def add_train(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
     parser.add_argument(
         "-m", "--multirun", action="store_true", help="run every combination of values given as lists"
     )
-    parser.set_defaults(command=_train, runs_rewards=True)
+
+    parser = add_command(
+        commands,
+        "resume",
+        _resume,
+        help="continue a run that was killed, interrupted or failed",
+        description="Continue a run from its last checkpoint.",
+        epilog=_RESUME_EPILOG,
+        runs_rewards=True,
+    )
+    add_run(parser)
+
+    parser = add_command(
+        commands,
+        "clone",
+        _clone,
+        help="start a new run from another run's policy",
+        description="Train on from another run's checkpoint, at a tenth of its learning rate unless another is given.",
+        epilog=_CLONE_EPILOG,
+        runs_rewards=True,
+    )
+    add_run(parser, "checkpoint=NAME | GROUP=OPTION | KEY=VALUE")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -89,3 +123,95 @@ def _train(args: argparse.Namespace) -> int:
     if args.multirun:
         print_results(outcomes)
     return max(outcome.exit_code for outcome in outcomes)
+
+
+_RESUME_EPILOG = """\
+  deepracer-exp resume RUN
+  deepracer-exp resume RUN budget.env_steps=5000000         values that do not affect learning may be changed:
+                                                            budget, stopping, tracking, checkpoints.keep and time
+                                                            limits
+  deepracer-exp resume RUN stopping=none                    a run that was ended by its stopping rule uses up its
+                                                            budget
+
+The run continues from its last checkpoint, in its own folder and in the same MLflow run; whatever it wrote after that
+checkpoint is overwritten. With collector=sync and collector=in_process the result equals that of an uninterrupted
+run, bit for bit. With collector=async, or a budget in minutes or money, it cannot. A reward function that keeps
+state between calls starts without it.
+
+If a finished run was recorded while MLflow did not answer, resume delivers the missing points.
+"""
+
+
+def _resume(args: argparse.Namespace) -> int:
+    from deepracer_exp.runs.resolve import resolve
+
+    name, given = run_and_overrides(args)
+    stores, changes = split_stores(given)
+    run_dir = resolve(name, stores.runs_dir, stores.uri).path
+    # The folder says where the run is, but MLflow may have moved.
+    overrides = [*changes, *(one for one in given if one.startswith("tracking.uri="))]
+    check_changes(run_dir, overrides)
+    print_start()
+    start_workers_early(has_workers(run_dir))
+
+    from rich.console import Console
+
+    from deepracer_exp.training.run import RunEnded, resume
+
+    try:
+        with warnings_on_stderr():
+            outcome = resume(run_dir, overrides, Console(stderr=True))
+    except RunEnded as error:
+        return _deliver(run_dir, stores.uri, error)
+    print_result(outcome, str(stores.runs_dir))
+    return outcome.exit_code
+
+
+def _deliver(run_dir: Path, uri: str | None, ended: Exception) -> int:
+    """Deliver the points of an ended run that MLflow lacks; if there are none, raise that the run has ended."""
+    from deepracer_exp.tracking.delivery import deliver
+
+    if not (run_dir / TRACKING).exists():
+        raise ended
+    points = deliver(run_dir, uri or read_config(run_dir)["tracking"].get("uri"), run_dir.parent.parent)
+    if not points:
+        raise ended
+    print(f"{ended}\n  delivered {points:,} points that MLflow lacked")
+    return 0
+
+
+_CLONE_EPILOG = """\
+  deepracer-exp clone RUN                                   from its best checkpoint
+  deepracer-exp clone RUN checkpoint=last                   from a checkpoint other than the best
+  deepracer-exp clone RUN algorithm.lr=1e-5                 a learning rate other than a tenth of the parent's
+  deepracer-exp clone RUN reward=racing_line track=Oval_track
+                                                            another reward function, another track
+
+The clone has the parent's configuration, its networks and a fresh optimizer. Action space, observation and network
+cannot be changed. `deepracer-exp runs lineage RUN` draws the family tree.
+"""
+
+
+def _clone(args: argparse.Namespace) -> int:
+    run, given = run_and_overrides(args)
+    checkpoints = [one.partition("=")[2] for one in given if one.startswith("checkpoint=")]
+    changes = [one for one in given if not one.startswith("checkpoint=")]
+    stores, _ = split_stores(given)
+    parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None).path
+    check_files(check_changes(parent, changes))
+    print_start()
+    start_workers_early(has_workers(parent))
+
+    from rich.console import Console
+
+    from deepracer_exp.training.clone import prepare_clone
+    from deepracer_exp.training.run import train
+
+    with warnings_on_stderr():
+        clone = prepare_clone([f"run={run}", *given], stores.runs_dir, stores.uri)
+    args.debug = clone.experiment.debug
+    for line in clone.told:
+        print(line, file=sys.stderr)
+    outcome = train(clone.experiment, clone.composition, Console(stderr=True), clone.start)
+    print_result(outcome, clone.experiment.runs_dir if clone.experiment.tracking.kind == "mlflow" else None)
+    return outcome.exit_code

@@ -2,8 +2,11 @@
 
 import argparse
 import os
+import re
 
-from .arguments import add_overrides
+from deepracer_exp.errors import BadInput
+
+from .arguments import add_command, add_overrides
 from .output import print_notes
 from .startup import check_files, start_workers_early
 
@@ -16,22 +19,23 @@ exit code: 0 it can be trained, even if there are warnings; 2 it cannot, or with
 """
 
 
-def add_validate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command."""
-    parser = commands.add_parser(
+    parser = add_command(
+        commands,
         "validate",
+        _validate,
         help="find out what a reward function pays for",
         description=(
             "Check a reward function as the AWS console does, call it in many situations on the track, draw what it "
             "pays for, and warn of common mistakes."
         ),
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        runs_rewards=True,
     )
     add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
     parser.add_argument("-o", "--output", help="picture to write (default: runs/validate/REWARD-TRACK.png)")
     parser.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
-    parser.set_defaults(command=_validate, runs_rewards=True)
 
 
 def _validate(args: argparse.Namespace) -> int:
@@ -40,15 +44,14 @@ def _validate(args: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
     from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.validation.short_training import short_training_overrides, trial_seconds
 
     trials = [override.removeprefix("trial=") for override in args.overrides if override.startswith("trial=")]
     overrides = [override for override in args.overrides if not override.startswith("trial=")]
-    seconds = trial_seconds(trials[-1]) if trials else None
+    seconds = _trial_seconds(trials[-1]) if trials else None
     experiment, composition = compose_experiment(overrides)
     args.debug = experiment.debug
     print_notes(composition.notes)
-    trial = None if seconds is None else compose_experiment([*overrides, *short_training_overrides(seconds)])
+    trial = None if seconds is None else compose_experiment([*overrides, *_trial_overrides(seconds)])
     check_files(experiment)
     if trial is not None:
         start_workers_early(experiment.collector.forks)
@@ -58,3 +61,26 @@ def _validate(args: argparse.Namespace) -> int:
     from deepracer_exp.validation.validate import validate_reward
 
     return validate_reward(experiment, trial, args.output, args.strict, Console(), Console(stderr=True))
+
+
+def _trial_seconds(text: str) -> float:
+    """Return the seconds of `60s`, `2min` or `90`.
+
+    Raises:
+        BadInput: it is none of them.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min)?", text)
+    seconds = float(match[1]) * (60 if match[2] == "min" else 1) if match else 0.0
+    if not seconds:
+        raise BadInput(
+            f"trial={text}: not a time; accepted: seconds or minutes above 0, e.g. trial=60s, trial=2min"
+        )
+    return seconds
+
+
+def _trial_overrides(seconds: float) -> list[str]:
+    """Return the overrides for a short training; its run goes to `runs/validate/`."""
+    return [
+        *("name=validate", "tracking=off", "stopping=none", "checkpoints.every=null"),
+        *("budget=default", "budget.env_steps=null", "budget.alerts=[]", f"budget.minutes={seconds / 60!r}"),
+    ]
