@@ -10,7 +10,6 @@ from deepracer_exp.config.driving import (
     ActionSpaceConfig,
     ContinuousActionSpace,
     DiscreteActionSpace,
-    GridActionSpace,
     SpeedRange,
     SteeringRange,
 )
@@ -85,7 +84,10 @@ def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
         BadInput: contradictory values, an empty list, or a bad model_metadata.json.
     """
     if config.file is not None:
-        return _from_file(config.file)
+        metadata = read_model_metadata(config.file)
+        if metadata.low is not None and metadata.high is not None:
+            return ContinuousActions(np.array(metadata.low), np.array(metadata.high))
+        return _discrete(*zip(*metadata.actions, strict=True))
     if isinstance(config, DiscreteActionSpace):
         if not config.actions:
             raise BadInput(
@@ -94,51 +96,32 @@ def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
         return _discrete(
             [action.steering_angle for action in config.actions], [action.speed for action in config.actions]
         )
-    _check_order("steering_angle", config.steering_angle)
-    _check_order("speed", config.speed)
-    low = np.array([config.steering_angle.low, config.speed.low], dtype=np.float64)
-    high = np.array([config.steering_angle.high, config.speed.high], dtype=np.float64)
+    steering, speed = config.steering_angle, config.speed
+    for key, bounds in (("steering_angle", steering), ("speed", speed)):
+        if bounds.low > bounds.high:
+            raise BadInput(
+                f"action_space.{key}: low {bounds.low:g} is above high {bounds.high:g}; accepted: low <= high"
+            )
     if isinstance(config, ContinuousActionSpace):
-        return ContinuousActions(low, high)
-    return _grid(config)
-
-
-def _from_file(path: str) -> ActionSpace:
-    metadata = read_model_metadata(path)
-    if metadata.low is not None and metadata.high is not None:
-        return ContinuousActions(np.array(metadata.low), np.array(metadata.high))
-    return _discrete(
-        [action.steering_deg for action in metadata.actions],
-        [action.speed_mps for action in metadata.actions],
-    )
-
-
-def _grid(config: GridActionSpace) -> DiscreteActions:
-    """Cross every steering level with every speed level, steering in the outer loop as the console does."""
-    _check_levels("steering", config.steering_angle, config.steering_levels)
-    _check_levels("speed", config.speed, config.speed_levels)
-    steering = np.linspace(config.steering_angle.low, config.steering_angle.high, config.steering_levels)
-    speed = np.linspace(config.speed.low, config.speed.high, config.speed_levels)
-    return _discrete(np.repeat(steering, len(speed)), np.tile(speed, len(steering)))
+        low, high = (np.array([getattr(one, end) for one in (steering, speed)]) for end in ("low", "high"))
+        return ContinuousActions(low.astype(np.float64), high.astype(np.float64))
+    angles = _levels("steering", steering, config.steering_levels)
+    speeds = _levels("speed", speed, config.speed_levels)
+    # Steering in the outer loop, as the console has it.
+    return _discrete(np.repeat(angles, len(speeds)), np.tile(speeds, len(angles)))
 
 
 def _discrete(steering_deg: ArrayLike, speed_mps: ArrayLike) -> DiscreteActions:
     return DiscreteActions(np.array(steering_deg, dtype=np.float64), np.array(speed_mps, dtype=np.float64))
 
 
-def _check_order(key: str, bounds: SteeringRange | SpeedRange) -> None:
-    if bounds.low > bounds.high:
-        raise BadInput(
-            f"action_space.{key}: low {bounds.low:g} is above high {bounds.high:g}; accepted: low <= high"
-        )
-
-
-def _check_levels(name: str, bounds: SteeringRange | SpeedRange, levels: int) -> None:
+def _levels(name: str, bounds: SteeringRange | SpeedRange, levels: int) -> NDArray[np.float64]:
     if (levels == 1) != (bounds.low == bounds.high):
         raise BadInput(
             f"action_space.{name}_levels: {levels} from low {bounds.low:g} to high {bounds.high:g};"
             " accepted: 1 level with low = high, or at least 2 with low < high"
         )
+    return np.linspace(bounds.low, bounds.high, levels)
 
 
 def metadata_of(actions: ActionSpace) -> ModelMetadata:

@@ -19,12 +19,6 @@ from .state import Floats, Measures, checked_array
 Ids = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
-PENALTY_S = {"off_track": 2.0, "crashed": 5.0, "reversed": 2.0, "immobilized": 0.0}
-"""Seconds a car waits where an evaluation resets it; in training each of these ends the episode instead.
-
-The service's own figures (deepracer-simapp, rollout_agent_ctrl.py): OFF_TRACK_PENALTY 2 s and COLLISION_PENALTY 5 s;
-REVERSE_PENALTY is that of leaving the track and IMMOBILIZED_PENALTY nothing where a job does not set them.
-"""
 _KEPT = {
     **{name: name for name in ("episode", "steps", "clock_steps", "start_ndist", "course")},
     **{f"_{name}": name for name in ("driven", "previous", "last_progress", "last_front")},
@@ -78,11 +72,7 @@ class EpisodeRules:
         return {"still": self._still.copy(), "falling": self._falling.copy()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the counters of a `state_dict`.
-
-        Raises:
-            BadInput: it is of another number of cars.
-        """
+        """Restore the counters of a `state_dict`."""
         self._still = checked_array(state, "still", self._still.shape)
         self._falling = checked_array(state, "falling", self._falling.shape)
 
@@ -162,13 +152,7 @@ class RaceRules:
     """
 
     def __init__(self, setup: RaceSetup, n_cars: int, first_car: int = 0):
-        """Set up the cars; `reset` begins their episodes.
-
-        Args:
-            setup: track, dimensions of the car and rules.
-            n_cars: number of cars.
-            first_car: number of the first car over all processes; starts depend on it.
-        """
+        """Set up the cars, the first of which has a number over all processes; `reset` begins their episodes."""
         self.n_cars = n_cars
         self.cars = np.arange(first_car, first_car + n_cars)
         tracks = [track for course in setup.courses for track in course.tracks]
@@ -255,12 +239,7 @@ class RaceRules:
         return self.tracks.start_pose(self.start_ndist[ids] + ahead_m / length_m, self.track_index[ids])
 
     def start_midway(self, steps: np.ndarray, progress: np.ndarray) -> None:
-        """Put all cars in the middle of their episodes.
-
-        Args:
-            steps: control steps they have taken, (N,).
-            progress: per cent, at the last of these, (N,).
-        """
+        """Put all cars in the middle of their episodes, after so many steps, at so many per cent, each (N,)."""
         self.steps[:] = steps
         self._previous[:] = progress
         self._last_progress[:] = progress

@@ -7,10 +7,9 @@ iterations, for reports: of a run of ours with the values of its own rule, of ot
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
@@ -25,6 +24,9 @@ from deepracer_exp.config.stopping import (
     ReliableStopping,
     StoppingConfig,
 )
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Row = Mapping[str, Any]
 """One line of metrics.jsonl."""
@@ -403,7 +405,7 @@ class Convergence:
 
 
 def convergence(
-    iterations: pd.DataFrame, action_count: int | None, stopping: Mapping[str, Any] | None = None
+    iterations: "pd.DataFrame", action_count: int | None, stopping: Mapping[str, Any] | None = None
 ) -> Convergence | None:
     """Find the iteration from which on a training no longer grew, None where it is too short to say.
 
@@ -477,7 +479,7 @@ class Overfitting:
     rule: OverfittingRule
 
 
-def overfitting(iterations: pd.DataFrame, stopping: Mapping[str, Any] | None = None) -> Overfitting | None:
+def overfitting(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None = None) -> Overfitting | None:
     """Apply the stopping rule of overfitting to a table of iterations; None with fewer than six evaluations.
 
     Evaluations on held-out conditions count; in logs without them the others do.

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from deepracer_exp.errors import BadInput
 
@@ -34,6 +33,8 @@ def rows_from_knots(knots: ArrayLike, width_m: ArrayLike, closed: bool) -> np.nd
         BadInput: Too few knots, repeated knots, another number of widths than of knots, or a road so
             wide that its border crosses itself.
     """
+    from scipy.interpolate import CubicSpline  # takes half a second, and few tracks have knots
+
     knots, width_m = np.asarray(knots, np.float64).reshape(-1, 2), np.atleast_1d(width_m)
     _check(knots, width_m, closed)
     width_m = np.broadcast_to(width_m, len(knots))

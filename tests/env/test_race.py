@@ -6,7 +6,6 @@ import shapely
 
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.race import NonFinite, Race
-from deepracer_exp.errors import BadInput
 
 REFERENCE = Path(__file__).parents[2] / "../shared/reference"
 NOISY = ("randomization=aws", "action_space=continuous", "episode.max_steps=40")
@@ -129,16 +128,6 @@ def test_a_row_belongs_to_the_pose_its_action_was_chosen_at(race_of, column):
         )
         np.testing.assert_allclose(column(race, "steer"), 30 * action[:, 0])
     assert (race.observation[:, 3] != seen[:, 3]).all()
-
-
-def test_an_observation_that_was_handed_out_stays_as_it_was(race_of):
-    race = race_of(n_cars=3)
-    for _ in range(5):
-        race.step(np.full(3, 2))
-    terminal, copy = race.observation, race.observation.copy()
-    race.reset(np.array([0]))
-    race.step(np.full(3, 2))
-    np.testing.assert_array_equal(terminal, copy)
 
 
 def test_the_return_sums_the_rewards_of_the_episode(race_of, column):
@@ -277,17 +266,6 @@ def test_a_car_that_hardly_moves_is_immobilized(race_of, column):
         race.step(np.array([2]))
     assert race.terminated[0]
     assert column(race, "episode_status")[0] == STATUS_CODE["immobilized"]
-
-
-def test_every_episode_of_an_open_course_begins_at_its_start(race_of):
-    race = race_of("track=Straight_track", n_cars=3)
-    race.reset()
-    np.testing.assert_array_equal(race.rules.start_ndist, 0.0)
-
-
-def test_a_start_inside_an_open_course_is_refused(setup_of):
-    with pytest.raises(BadInput, match=r"episode.start_offset=0.5: the open course Straight_track"):
-        setup_of("track=Straight_track", "episode.start_offset=0.5")
 
 
 # --- Faults

@@ -11,8 +11,8 @@ from deepracer_exp.config.driving import OFF, QUANTITIES
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.deepracer.trace import PACKED, RANDOMIZED
 from deepracer_exp.env.race import Race
+from deepracer_exp.env.randomization import CarStreams
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.env.streams import CarStreams
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarBatch
 
