@@ -1,6 +1,7 @@
 """The same driving paid by another reward function, in sentences, a table and figures."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -46,12 +47,9 @@ def compare_rewards(view: LogView, replayed: "ReplayedRewards") -> RewardCompari
 
     Args:
         view: the recording on one course.
-        replayed: of the whole recording.
+        replayed: its steps under another reward function.
     """
-    laps, places, correlations = (
-        table[table["track"].astype(str) == view.track_name]
-        for table in (replayed.laps, replayed.waypoints, replayed.correlations)
-    )
+    laps, places = replayed.laps, replayed.waypoints
     if len(places):  # one direction: the one driven most
         places = places[places["reversed"] == places.groupby("reversed")["visits"].sum().idxmax()]
     places = places.assign(change=places["new_share"] - places["share"])
@@ -62,13 +60,15 @@ def compare_rewards(view: LogView, replayed: "ReplayedRewards") -> RewardCompari
         charts.append(_places_chart(view, places, replayed.reward))
     return RewardComparison(
         replayed.reward,
-        tuple(_sentences(laps, correlations, places, replayed.reward)),
+        tuple(_sentences(laps, replayed.correlations, places, replayed.reward)),
         table_of(laps.head(MOST_LAPS), _LAP_COLUMNS, max(0, len(laps) - MOST_LAPS)),
         tuple(charts),
     )
 
 
-def _sentences(laps: pd.DataFrame, correlations: pd.DataFrame, places: pd.DataFrame, name: str) -> list[str]:
+def _sentences(
+    laps: pd.DataFrame, correlations: Mapping[str, float], places: pd.DataFrame, name: str
+) -> list[str]:
     found = [f"There is no complete lap that {name} could rank."]
     if len(laps):
         evaluated = ", evaluations included," if laps["stream"].nunique() > 1 else ""
@@ -79,10 +79,11 @@ def _sentences(laps: pd.DataFrame, correlations: pd.DataFrame, places: pd.DataFr
             f"{best['episode']} ({best['time_s']:.2f} s, {ranks}); the fastest lap ({fastest['time_s']:.2f} s) is "
             f"{_place(fastest['new_rank'])} instead of {_place(fastest['rank'])}."
         ]
-    if len(correlations):
-        one = correlations.iloc[0]
+    if correlations:
         new, old, both = (
-            f"{one[column]:.2f}" if math.isfinite(one[column]) else "not defined (all equal)"
+            f"{correlations[column]:.2f}"
+            if math.isfinite(correlations[column])
+            else "not defined (all equal)"
             for column in ("new_time", "old_time", "old_new")
         )
         found.append(

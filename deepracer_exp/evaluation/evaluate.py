@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -109,24 +110,25 @@ def _cells(found: Mapping[str, Any], intervals: bool) -> dict[str, str]:
         "laps": f"{found['laps']} of {found['laps_tried']}",
         "done %": _mean(found["completion"], 1, intervals),
         "lap s": _mean(times, 2, intervals),
-        "median": _number(times["median"], 2),
-        "best": _number(times["best"], 2),
-        "std": _number(times["std"], 2),
+        "median": number(times["median"], 2),
+        "best": number(times["best"], 2),
+        "std": number(times["std"], 2),
         "resets": _mean(found["resets"], 1, intervals),
         "penalty s": _mean(found["penalty_s"], 1, intervals),
-        "score s": _number(found["race_score_s"], 2),
+        "score s": number(found["race_score_s"], 2),
     }
 
 
-def _number(value: float | None, digits: int) -> str:
-    return NOTHING if value is None else f"{value:.{digits}f}"
+def number(value: float | None, digits: int) -> str:
+    """Return a number with so many digits, a dash for None and NaN."""
+    return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:
-    mean = _number(found["mean"], digits)
+    mean = number(found["mean"], digits)
     if found["interval"] is None or not intervals:
         return mean
-    low, high = (_number(bound, digits) for bound in found["interval"])
+    low, high = (number(bound, digits) for bound in found["interval"])
     return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 

@@ -1,17 +1,20 @@
 """Rebuild the params of a reward function from recorded control steps."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.rewards.params import TrackParams
+from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.tracks.track import Track, Tracks
 
 Ids = NDArray[np.intp]
 
+UNPAID = ("prepare", "pause", "park")
+"""Statuses at which the service gives no reward and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
 _DIRECTION_ROWS = 60
 """Rows of an episode from which its driving direction is determined: 4 s."""
 _JUMP = 20.0
@@ -27,44 +30,40 @@ class RecordedParams:
     Objects on the track are missing, because a trace does not record them.
 
     Attributes:
-        known: whether a row's params can be rebuilt: its course is known and its numbers are finite, (n,).
-        track_params: params of a reward function that are constant on each course.
-        track_index: index of each row's course in `track_params`, (n,); -1 if unknown.
+        known: whether a row's params can be rebuilt: its numbers are finite, (n,).
+        paid: known rows at which the service calls the reward function, (n,).
+        track_params: params of a reward function that are constant, of the course and of its other direction.
+        track_index: index of each row's direction in `track_params`, (n,).
     """
 
     def __init__(
-        self, steps: pd.DataFrame, episode: NDArray[np.int64], courses: Mapping[str, Track], car: CarConfig
+        self, steps: pd.DataFrame, episode: NDArray[np.int64], course: Track, car: CarConfig
     ) -> None:
-        """Find the course and the direction of each row.
+        """Find the direction of each episode.
 
         Args:
             steps: `deepracer.recording.STEP_COLUMNS`, grouped by episode and in the order of time.
             episode: number of each row's episode, non-decreasing, (n,).
-            courses: by name in `steps.track`.
+            course: on which all of them were driven.
             car: with the positions of its wheels and front.
         """
         self._steps = steps
         self._car = car
-        names = list(courses)
-        pairs = [(track, _other_way(track)) for track in courses.values()]
-        tracks = [track for pair in pairs for track in pair]
-        self.track_params: Sequence[TrackParams] = tuple(map(TrackParams.of, tracks))
-        self.track_index: Ids = _place_of(steps["track"], names)
-        finite = np.isfinite(steps[["X", "Y", "yaw", "progress"]].to_numpy()).all(axis=1)
-        self.known = (self.track_index >= 0) & finite
-        self._tracks = Tracks(tracks) if tracks else None
-        if self._tracks is not None:
-            self.track_index = np.where(self.known, 2 * self.track_index + self._against(episode), -1)
+        tracks = [course, _other_way(course)]
+        self.track_params = tuple(map(TrackParams.of, tracks))
+        self._tracks = Tracks(tracks)
+        self.known = np.isfinite(steps[["X", "Y", "yaw", "progress"]].to_numpy()).all(axis=1)
+        self.paid = self.known & ~steps["episode_status"].isin(UNPAID).to_numpy()
+        self.track_index: Ids = self._against(episode)
 
     @property
     def is_reversed(self) -> NDArray[np.bool_]:
         """Whether each row was driven against the order of its course's waypoints, (n,)."""
-        return np.array([road.is_reversed for road in self.track_params] + [False])[self.track_index]
+        return np.array([road.is_reversed for road in self.track_params])[self.track_index]
 
-    def columns(self, rows: Ids) -> dict[str, np.ndarray]:
+    def columns(self, chosen: Ids) -> dict[str, np.ndarray]:
         """Return the columns `rewards.params.COLUMNS` of some rows, which must be known."""
-        assert self._tracks is not None
-        part, track_index = self._steps.iloc[rows], self.track_index[rows]
+        part, track_index = self._steps.iloc[chosen], self.track_index[chosen]
         front = part[["X", "Y"]].to_numpy(np.float64)
         at = self._tracks.project(front, track_index)
         width_m, is_left = self._tracks.border_distances(front, at.center, track_index)
@@ -86,6 +85,12 @@ class RecordedParams:
             "sim_time": part["tstamp"].to_numpy(np.float64),
         }
 
+    def dicts(self, chosen: Ids) -> Iterator[dict[str, Any]]:
+        """Yield the params of some rows one by one."""
+        columns = rows(select(self.columns(chosen), None))
+        for row, index in zip(columns, self.track_index[chosen].tolist(), strict=True):
+            yield scalar_params(row, *self.track_params[index])
+
     def _off_track(
         self, part: pd.DataFrame, front: NDArray[np.float64], track_index: Ids
     ) -> NDArray[np.bool_]:
@@ -93,7 +98,6 @@ class RecordedParams:
         off = np.array([_DECIDED.get(word, -1) for word in status.cat.categories] + [-1])[status.cat.codes]
         open_ = np.flatnonzero(off < 0)
         if len(open_):
-            assert self._tracks is not None
             yaw = np.radians(part["yaw"].to_numpy(np.float64)[open_])[:, None]
             # Recorded poses are of the front point; wheels are measured from the chassis origin.
             ahead, aside = np.array(self._car.wheel_points_m).T
@@ -109,17 +113,17 @@ class RecordedParams:
             off[open_] = ~on_road.any(axis=1)
         return off.astype(bool)
 
-    def _against(self, episode: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _against(self, episode: NDArray[np.int64]) -> Ids:
         """Return 1 for the rows of episodes driven against the course's own direction, (n,)."""
-        assert self._tracks is not None
         steps, count = self._steps, len(self._steps)
         begins = np.flatnonzero(np.diff(episode, prepend=-1) != 0)
         within = np.arange(count) - np.repeat(begins, np.diff(np.r_[begins, count]))
         rows = np.flatnonzero(self.known & (within < _DIRECTION_ROWS))
-        track_index = 2 * self.track_index[rows]
-        ndist = self._tracks.project(steps[["X", "Y"]].to_numpy(np.float64)[rows], track_index).ndist
+        forward = np.zeros(len(rows), np.intp)
+        ndist = self._tracks.project(steps[["X", "Y"]].to_numpy(np.float64)[rows], forward).ndist
         moved = np.diff(ndist, prepend=np.nan)
-        moved = np.where(self._tracks.closed[track_index], (moved + 0.5) % 1.0 - 0.5, moved)
+        if self._tracks.closed[0]:
+            moved = (moved + 0.5) % 1.0 - 0.5
         gained = np.diff(steps["progress"].to_numpy(np.float64)[rows], prepend=np.nan)
         counted = np.diff(episode[rows], prepend=-1) == 0
         counted &= np.abs(gained) < _JUMP
@@ -127,13 +131,7 @@ class RecordedParams:
         along = np.bincount(
             episode[rows[counted]], (moved * gained)[counted], minlength=int(episode.max(initial=0)) + 1
         )
-        return (along < 0).astype(np.int64)[episode]
-
-
-def _place_of(track: pd.Series, names: Sequence[str]) -> Ids:
-    words = track.astype("category")
-    place = [names.index(str(word)) if str(word) in names else -1 for word in words.cat.categories]
-    return np.array([*place, -1], np.intp)[words.cat.codes]
+        return (along < 0).astype(np.intp)[episode]
 
 
 def _other_way(track: Track) -> Track:

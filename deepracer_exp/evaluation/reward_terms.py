@@ -4,7 +4,6 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,33 +11,52 @@ import pandas as pd
 
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.recording import LogProblem, Recording
+from deepracer_exp.deepracer.recording import LogProblem
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.guard import CtrlC, Guard
-from deepracer_exp.rewards.params import rows, scalar_params, select
 from deepracer_exp.rewards.reward import RewardFunction, Unusable
 from deepracer_exp.rewards.source import RewardSource, is_of_zoo
 
 from .recorded_params import RecordedParams
-from .reward_replay import TIME_LIMIT_S, UNPAID
+from .reward_replay import TIME_LIMIT_S
 
 MOST_STEPS = 20_000
 """Number of steps above which only some episodes, evenly spaced over the training, are evaluated."""
 Terms = Callable[[dict[str, Any]], object]
 
 
-def recorded_source(recording: Recording) -> RewardSource | None:
-    """Return the reward function stored with a recording, or None."""
-    text = recording.reward_source
-    if text is None:
-        return None
+def run_terms(
+    view: LogView, car: CarConfig, just_trained: bool = False
+) -> tuple[LogView, pd.DataFrame | None]:
+    """Return a recorded training's view and the terms of its stored reward function, if it may be run.
+
+    A reward function is a program and a recording may come from anywhere, so only those of the reward zoo are run.
+
+    Args:
+        view: the training.
+        car: that drove; the service's has the dimensions of the default one.
+        just_trained: the training in this process has run the function already.
+
+    Returns:
+        The view, with another problem if the terms could not be computed; the terms as from `reward_terms`.
+    """
+    text = view.recording.reward_source
+    if text is None or not (just_trained or is_of_zoo(text)):
+        return view, None
     sha256 = hashlib.sha256(text.encode()).hexdigest()
-    return RewardSource(recording.name, f"{recording.name}: reward function", text, sha256, {}, {})
+    source = RewardSource(view.name, f"{view.name}: reward function", text, sha256, {}, {})
+    try:
+        return view, reward_terms(view, source, car)
+    except BadInput as error:
+        return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), None
 
 
 def reward_terms(
-    view: LogView, source: RewardSource, most: int = MOST_STEPS, time_limit_s: float = TIME_LIMIT_S
+    view: LogView,
+    source: RewardSource,
+    car: CarConfig,
+    most: int = MOST_STEPS,
+    time_limit_s: float = TIME_LIMIT_S,
 ) -> pd.DataFrame | None:
     """Compute the terms of a module's reward at the steps of a training.
 
@@ -48,6 +66,7 @@ def reward_terms(
     Args:
         view: the training, on a known course.
         source: the module.
+        car: that drove.
         most: approximate number of steps to evaluate.
         time_limit_s: CPU seconds per call.
 
@@ -69,17 +88,15 @@ def reward_terms(
         return None
     steps = _some_episodes(view.steps, most)
     number = np.cumsum(np.diff(steps["episode"].to_numpy(np.int64), prepend=-1) != 0) - 1
-    courses = {str(steps["track"].iloc[0]): view.course}
-    params = RecordedParams(steps, number, courses, _car())
-    evaluated = np.flatnonzero(params.known & ~steps["episode_status"].isin(UNPAID).to_numpy())
+    params = RecordedParams(steps, number, view.course, car)
+    evaluated = np.flatnonzero(params.paid)
     if not len(evaluated):
         return None
-    track_params = [params.track_params[index] for index in params.track_index[evaluated].tolist()]
     found: list[dict[str, float]] = []
     try:
         with Guard(time_limit_s) as guard:
-            for row, road in zip(rows(select(params.columns(evaluated), None)), track_params, strict=True):
-                found.append(_checked(terms, scalar_params(row, *road)))
+            for given in params.dicts(evaluated):
+                found.append(_checked(terms, given))
                 guard.restart()
     except CtrlC:
         raise
@@ -89,12 +106,6 @@ def reward_terms(
         place = f"episode {at['episode']}, step {at['steps']}"
         raise BadInput(f"{source.path}: terms {what} ({place})") from cause
     return pd.DataFrame(found, index=steps.index[evaluated]).fillna(0.0)
-
-
-@cache
-def _car() -> CarConfig:
-    """Return the default car, whose wheel positions are the service's."""
-    return compose_experiment([])[0].car
 
 
 def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
@@ -114,24 +125,3 @@ def _some_episodes(steps: pd.DataFrame, most: int) -> pd.DataFrame:
     chosen = np.arange(len(begin)) % every == every - 1 if len(begin) >= every else np.ones(len(begin), bool)
     lengths = np.diff(np.r_[begin, len(steps)])
     return steps[np.repeat(chosen, lengths)]
-
-
-def run_terms(view: LogView, just_trained: bool = False) -> tuple[LogView, pd.DataFrame | None]:
-    """Return a recorded training's view and its reward terms, if its function may be run.
-
-    A reward function is a program and a recording may come from anywhere, so only those of the reward zoo are run.
-
-    Args:
-        view: the training.
-        just_trained: the training in this process has run the function already.
-
-    Returns:
-        The view, with another problem if the terms could not be computed; the terms as from `reward_terms`.
-    """
-    source = recorded_source(view.recording)
-    if source is None or not (just_trained or is_of_zoo(source.text)):
-        return view, None
-    try:
-        return view, reward_terms(view, source)
-    except BadInput as error:
-        return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), None

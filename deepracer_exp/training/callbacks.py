@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.env.setup import Course, RaceSetup
@@ -227,7 +228,7 @@ class ReportCallback(Callback):
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Write report.html, unless the run may be resumed."""
         if trainer.experiment.report and result.status in (FINISHED, STOPPED_EARLY):
-            result.note = _write_page(trainer.folder.path)
+            result.note = _write_page(trainer.folder.path, trainer.experiment.car)
 
 
 class TrackingCallback(Callback):
@@ -389,7 +390,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     learning_curves(pd.read_json(metrics_file, lines=True)).savefig(run_dir / LEARNING, dpi=120)
 
 
-def _write_page(run_dir: Path) -> str | None:
+def _write_page(run_dir: Path, car: CarConfig) -> str | None:
     """Write `report.html`; return a line where there is none: nothing that happens here spoils a training."""
     try:
         from deepracer_exp.analysis.findings import findings
@@ -398,7 +399,7 @@ def _write_page(run_dir: Path) -> str | None:
         from deepracer_exp.evaluation.reward_terms import run_terms
         from deepracer_exp.runs.own_recording import read_own_recording
 
-        view, terms = run_terms(prepare(read_own_recording(run_dir)), just_trained=True)
+        view, terms = run_terms(prepare(read_own_recording(run_dir)), car, just_trained=True)
         write_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms))
     except KeyboardInterrupt:
         return f"{REPORT} was left off; `deepracer-exp analyze {run_dir.name}` writes it"

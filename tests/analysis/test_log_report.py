@@ -203,7 +203,6 @@ class Replayed:
     laps = pd.DataFrame(
         {
             "stream": "training",
-            "track": "reinvent_base",
             "iteration": [0, 1, 2],
             "episode": [0, 4, 8],
             "time_s": [10.0, 11.0, 12.0],
@@ -214,12 +213,9 @@ class Replayed:
             "time_rank": [1, 2, 3],
         }
     )
-    correlations = pd.DataFrame(
-        {"track": ["reinvent_base"], "laps": [3], "old_new": [-1.0], "old_time": [1.0], "new_time": [-1.0]}
-    )
+    correlations = {"old_new": -1.0, "old_time": 1.0, "new_time": -1.0}  # noqa: RUF012
     waypoints = pd.DataFrame(
         {
-            "track": "reinvent_base",
             "reversed": False,
             "closest_waypoint": [0, 10, 20],
             "visits": [9, 9, 9],

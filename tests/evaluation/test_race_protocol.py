@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from deepracer_exp.deepracer.trace import STATUS_CODE
-from deepracer_exp.env.rules import PENALTY_S
 from deepracer_exp.evaluation.race_protocol import RaceProtocol
 
 STEP_S = 0.5
+PENALTY_S = {"off_track": 2.0, "reversed": 2.0, "immobilized": 0.0}
+"""The service's own (deepracer-simapp, rollout_agent_ctrl.py), where a job sets no REVERSE_ or IMMOBILIZED_PENALTY."""
 
 
 def drive(config, story, closed=True):
@@ -106,6 +107,4 @@ def test_after_a_lap_of_an_open_course_the_car_is_put_at_its_start(protocol):
 
 def test_the_penalties_of_the_virtual_race_are_those_of_the_service(protocol):
     penalty = protocol("aws_virtual").penalty_s
-    assert {name: getattr(penalty, name) for name in ("off_track", "reversed", "immobilized")} == {
-        name: seconds for name, seconds in PENALTY_S.items() if name != "crashed"
-    }
+    assert {name: getattr(penalty, name) for name in PENALTY_S} == PENALTY_S

@@ -7,10 +7,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.deepracer.recording import STEP_COLUMNS, Recording
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.deepracer.recording import (
+    METRICS_COLUMNS,
+    STEP_COLUMNS,
+    UPDATE_COLUMNS,
+    Recording,
+    typed_table,
+)
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.reward_replay import replay_reward
+from deepracer_exp.evaluation import reward_replay
+from deepracer_exp.evaluation.reward_replay import ReplayedRewards
+from deepracer_exp.rewards.source import named_reward_source
+from deepracer_exp.runs.files import read_config
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.tracks.track import Track
 
@@ -22,29 +34,23 @@ def reward_function(params):
 """
 
 
-@pytest.fixture(scope="module")
-def console() -> tuple[Recording, dict[str, Track]]:
-    """Return the training and the evaluations of the service, and its course."""
-    folder = REFERENCE / "console_training/sim-trace"
-    if not folder.is_dir() or not (REFERENCE / "routes").is_dir():
-        pytest.skip("the recordings of the real service are not on this machine")
-    recording = read_recording(folder.parent)
-    route = np.load(REFERENCE / "routes/reinvent_base.npy")
-    course = Track.from_route(route, "reinvent_base")
-    return recording, dict.fromkeys(map(str, recording.steps["track"].unique()), course)
+def replay_reward(view: LogView, reward: str, **more) -> ReplayedRewards:
+    car = compose_experiment([])[0].car
+    return reward_replay.replay_reward(view, named_reward_source(reward), car, **more)
 
 
 @pytest.fixture(scope="module")
-def own(trained) -> Recording:
-    return read_own_recording(trained("algorithm.frames_per_iteration=2048", "budget.env_steps=8192").folder)
+def own(trained) -> LogView:
+    run = trained("algorithm.frames_per_iteration=2048", "budget.env_steps=8192").folder
+    return prepare(read_own_recording(run))
 
 
-def made(steps: pd.DataFrame) -> Recording:
-    return Recording(
+def made(steps: pd.DataFrame, course: Track) -> LogView:
+    recording = Recording(
         name="made up",
         steps=steps,
-        updates=pd.DataFrame(),
-        metrics=pd.DataFrame(),
+        updates=typed_table(UPDATE_COLUMNS),
+        metrics=typed_table(METRICS_COLUMNS),
         metadata=None,
         hyperparameters=None,
         reward_source=None,
@@ -52,6 +58,7 @@ def made(steps: pd.DataFrame) -> Recording:
         problems=(),
         files=(),
     )
+    return replace(prepare(recording), course=course)
 
 
 @pytest.fixture
@@ -66,12 +73,16 @@ def reward(tmp_path):
     return write
 
 
-def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_evaluations(console, reward):
-    recording, courses = console
-    replayed = replay_reward(recording, reward(FOLLOW), courses)
-    assert (recording.steps["stream"] == "training").sum() == 44_247
-    np.testing.assert_array_equal(replayed.steps["new_reward"], recording.steps["reward"])
-    assert replayed.problems == ()
+def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_evaluations(reward):
+    folder = REFERENCE / "console_training"
+    if not folder.is_dir():
+        pytest.skip("the recordings of the real service are not on this machine")
+    course = Track.from_route(np.load(REFERENCE / "routes/reinvent_base.npy"), "reinvent_base")
+    view = replace(prepare(read_recording(folder)), course=course)
+    replayed = replay_reward(view, reward(FOLLOW))
+    assert (replayed.steps["stream"] == "training").sum() == 44_247
+    np.testing.assert_array_equal(replayed.steps["new_reward"], replayed.steps["reward"])
+    assert len(replayed.steps) > len(view.steps)
     assert len(replayed.laps) > 47
     assert replayed.laps["rank"].tolist() == replayed.laps["new_rank"].tolist()
 
@@ -80,11 +91,11 @@ def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_eval
     "overrides", [(), ("track=Bowtie_track", "track.direction=alternate"), ("reward=progress_delta",)]
 )
 def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
-    run = trained(*overrides)
-    recording = read_own_recording(run.folder)
-    replayed = replay_reward(recording, str(run.folder / "reward_function.py"))
-    np.testing.assert_allclose(replayed.steps["new_reward"], recording.steps["reward"], rtol=0, atol=1e-9)
-    assert replayed.steps["X"].tolist() == recording.steps["X"].tolist()
+    run = trained(*overrides).folder
+    source = named_reward_source(str(run / "reward_function.py"))
+    car = parse_experiment(read_config(run)).car
+    replayed = reward_replay.replay_reward(prepare(read_own_recording(run)), source, car)
+    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=1e-9)
     both = {False, True} if "track.direction=alternate" in overrides else {False}
     assert set(replayed.waypoints["reversed"]) == both
 
@@ -131,15 +142,23 @@ def test_an_off_track_step_is_told_to_the_function(own, reward):
     assert ((steps["new_reward"] == 1.0) == (steps["episode_status"] == "off_track")).all()
 
 
-def laps_of(times: dict[int, int], reward: float) -> Recording:
-    """Make laps of so many steps around a circle of 10 m radius."""
+def circle() -> Track:
+    angle = np.linspace(0.0, 2 * np.pi, 101)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    ring[-1] = ring[0]
+    return Track.from_route(np.hstack([10 * ring, 9.5 * ring, 10.5 * ring]), "circle")
+
+
+def laps_of(times: dict[int, int], back: tuple[int, ...] = ()) -> LogView:
+    """Make laps of so many steps around a circle of 10 m radius, some of them driven the other way."""
     parts = []
     for episode, count in times.items():
         angle = np.linspace(0.0, 2 * np.pi, count + 1) + 1e-6
         angle[-1] = 2 * np.pi - 1e-6
         part = pd.DataFrame({"steps": np.arange(1, count + 2), "progress": 100 * angle / (2 * np.pi)})
         part["X"], part["Y"], part["yaw"] = 10 * np.cos(angle), 10 * np.sin(angle), 0.0
-        part["tstamp"], part["reward"], part["episode"] = part["steps"] / 15, reward, episode
+        part["Y"] *= -1 if episode in back else 1
+        part["tstamp"], part["reward"], part["episode"] = part["steps"] / 15, 1.0, episode
         part["closest_waypoint"] = np.round(part["progress"]).astype(int)
         part.loc[count, "progress"] = 100.0
         part["episode_status"] = ["prepare", *["in_progress"] * (count - 1), "lap_complete"]
@@ -149,74 +168,46 @@ def laps_of(times: dict[int, int], reward: float) -> Recording:
         stream="training", track="circle", all_wheels_on_track=True
     )
     missing = {name: 0 for name in STEP_COLUMNS if name not in steps}
-    return made(
-        steps.assign(**missing)[list(STEP_COLUMNS)].astype(
-            {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
-        )
-    )
+    kinds = {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
+    return made(steps.assign(**missing)[list(STEP_COLUMNS)].astype(kinds), circle())
 
 
-@pytest.fixture
-def circle() -> dict[str, Track]:
-    angle = np.linspace(0.0, 2 * np.pi, 101)
-    ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    ring[-1] = ring[0]
-    return {"circle": Track.from_route(np.hstack([10 * ring, 9.5 * ring, 10.5 * ring]), "circle")}
-
-
-def test_laps_are_ranked_anew(circle, reward):
-    recording = laps_of({0: 100, 1: 80, 2: 120, 3: 90}, reward=1.0)
+def test_laps_are_ranked_by_the_new_reward(reward):
     # Paid a lap, not a step: the fastest ranks first.
-    replayed = replay_reward(
-        recording,
-        reward(
-            "def reward_function(p):\n    return 10000 / p['steps'] ** 2 if p['progress'] == 100 else 0\n"
-        ),
-        circle,
-    )
+    once = "def reward_function(p):\n    return 10000 / p['steps'] ** 2 if p['progress'] == 100 else 0\n"
+    replayed = replay_reward(laps_of({0: 100, 1: 80, 2: 120, 3: 90}), reward(once))
     assert replayed.laps["episode"].tolist() == [1, 3, 0, 2]
     assert replayed.laps["new_rank"].tolist() == [1, 2, 3, 4]
     assert replayed.laps["time_rank"].tolist() == [1, 2, 3, 4]
     assert replayed.laps["rank"].tolist() == [4, 3, 2, 1]
-    (found,) = replayed.correlations.to_dict("records")
-    assert found == {"track": "circle", "laps": 4, "old_new": -1.0, "old_time": 1.0, "new_time": -1.0}
-    assert replayed.episodes["complete"].all()
-    np.testing.assert_allclose(replayed.episodes["time_s"], np.array([100, 80, 120, 90]) / 15)
+    assert replayed.correlations == pytest.approx({"old_new": -1.0, "old_time": 1.0, "new_time": -1.0})
+    np.testing.assert_allclose(replayed.laps["time_s"], np.array([80, 90, 100, 120]) / 15)
 
 
-def test_places_are_compared_between_0_and_1(circle, reward):
-    replayed = replay_reward(
-        laps_of({0: 400}, 1.0),
-        reward("def reward_function(p):\n    return 3 * p['closest_waypoints'][0]\n"),
-        circle,
-    )
+def test_places_are_compared_between_0_and_1(reward):
+    by_place = "def reward_function(p):\n    return 3 * p['closest_waypoints'][0]\n"
+    waypoints = replay_reward(laps_of({0: 400}), reward(by_place)).waypoints
     # The recorded reward is the same everywhere, and says nothing of places.
-    assert set(replayed.waypoints["share"]) == {0.5}
-    assert replayed.waypoints["new_share"].min() == 0.0
-    assert replayed.waypoints["new_share"].max() == 1.0
+    assert set(waypoints["share"]) == {0.5}
+    assert (waypoints["new_share"].min(), waypoints["new_share"].max()) == (0.0, 1.0)
 
 
-def test_laps_driven_the_other_way_are_seen(circle, reward):
-    recording = laps_of({0: 100}, 1.0)
-    there = recording.steps
-    back = there.assign(Y=-there["Y"], episode=np.int32(1))
-    both = replace(recording, steps=pd.concat([there, back], ignore_index=True))
+def test_laps_driven_the_other_way_are_reversed(reward):
     text = "def reward_function(p):\n    return 2.0 if p['is_reversed'] else 1.0\n"
-    replayed = replay_reward(both, reward(text), circle)
-    assert replayed.episodes["new_reward"].tolist() == [100.0, 200.0]
+    laps = replay_reward(laps_of({0: 100, 1: 100}, back=(1,)), reward(text)).laps
+    assert laps.set_index("episode")["new_reward"].to_dict() == {0: 100.0, 1: 200.0}
 
 
-def test_rows_on_an_unknown_course_have_no_reward_and_a_problem(circle, reward):
-    steps = laps_of({0: 50, 1: 60}, 1.0).steps
-    steps["track"] = pd.Categorical(np.where(steps["episode"] == 1, "elsewhere", "circle"))
-    replayed = replay_reward(made(steps), reward("def reward_function(p):\n    return 1\n"), circle)
-    assert replayed.steps["new_reward"].isna().tolist() == (steps["episode"] == 1).tolist()
-    assert [str(problem) for problem in replayed.problems] == [
-        "made up: 61 of 112 steps have no new reward: their course or position is unknown"
-    ]
+def test_rows_without_a_position_have_no_reward_and_those_without_a_course_are_refused(reward):
+    one = reward("def reward_function(p):\n    return 1\n")
+    view = laps_of({0: 50, 1: 60})
+    lost = view.steps["episode"] == 1
+    view.steps.loc[lost, "X"] = np.nan
+    replayed = replay_reward(view, one)
+    assert replayed.steps["new_reward"].isna().tolist() == lost.tolist()
     assert replayed.laps["episode"].tolist() == [0]
     with pytest.raises(BadInput, match="no step is on a known course"):
-        replay_reward(made(steps), reward("def reward_function(p):\n    return 1\n"), {})
+        replay_reward(replace(view, course=None), one)
 
 
 @pytest.mark.parametrize(
@@ -242,28 +233,18 @@ def test_rows_on_an_unknown_course_have_no_reward_and_a_problem(circle, reward):
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero")
-def test_a_function_that_fails_is_told_with_episode_and_step(circle, reward, text, words):
+def test_a_function_that_fails_is_reported_with_episode_and_step(reward, text, words):
     with pytest.raises(BadInput, match=words) as error:
-        replay_reward(laps_of({0: 50}, 1.0), reward(text), circle, time_limit_s=0.5)
+        replay_reward(laps_of({0: 50}), reward(text), time_limit_s=0.5)
     assert "\n" not in str(error.value)
 
 
-def test_steps_are_paid_at_once_without_sharing_one_limit(circle, reward):
+def test_steps_are_paid_at_once_without_sharing_one_limit(reward):
     """All steps together use more CPU than the limit, 0.1 ms each."""
     text = (
         "import time\ndef reward_function(p):\n    return 0.0\ndef reward_batch(p):\n"
         "    until = time.thread_time() + 1e-4 * len(p['x'])\n"
         "    while time.thread_time() < until: pass\n    return p['x'] * 0.0 + 1.0\n"
     )
-    recording = laps_of({0: 10_000}, 1.0)
-    replayed = replay_reward(recording, reward(text), circle, time_limit_s=0.8)
+    replayed = replay_reward(laps_of({0: 10_000}), reward(text), time_limit_s=0.8)
     assert replayed.steps["new_reward"].sum() > 9_000
-
-
-def test_an_unknown_reward_is_refused(own):
-    with pytest.raises(
-        BadInput, match=r"'progres_gain' is not in the reward zoo \(did you mean progress_gain\?\)"
-    ):
-        replay_reward(own, "progres_gain")
-    with pytest.raises(BadInput, match=r"nowhere.py: cannot be read"):
-        replay_reward(own, "nowhere.py")
