@@ -18,7 +18,7 @@ from . import pitfalls
 from .console import ConsoleFinding, console_findings
 from .pitfalls import action_space_laps
 from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
-from .reward_grid import RewardGrid, RewardSampler, State, sample_reward_grid, state_of
+from .reward_grid import RewardGrid, Sampler, State, reward_sampler, sample_reward_grid, state_of
 from .situations import NamedSituation, Situations, named_situations, sample, seam, situations
 
 _WARM = 25
@@ -31,22 +31,14 @@ _SLOW_S = 1e-3
 """Without the reward, a step of the default 64 cars per process takes 5 ms."""
 
 
-@dataclass(frozen=True)
-class SituationResult:
-    """A named situation and the reward it gets."""
-
-    name: str
-    answer: Answer
-    microseconds: float | None
-
-
 @dataclass(kw_only=True)
 class Check:
     """Findings about one reward function."""
 
     setup: RaceSetup
     console: list[ConsoleFinding]
-    tried: list[SituationResult] = field(default_factory=list)
+    tried: dict[str, Answer] = field(default_factory=dict)
+    """The answers in the named situations."""
     failures: list[str] = field(default_factory=list)
     """Reasons why a training cannot use the function."""
     warnings: list[str] = field(default_factory=list)
@@ -57,7 +49,7 @@ class Check:
     state: State = "none"
     detail: float | None = None
     """Resolution of the map; None: no map, because a call takes too long."""
-    sampler: RewardSampler | None = None
+    sampler: Sampler | None = None
     grid: RewardGrid | None = None
 
 
@@ -91,16 +83,15 @@ def try_named_situations(check: Check, against: Track) -> None:
     setup = check.setup
     hangs = False
     for case in named_situations(setup, against):
-        probe = Probe(setup.reward, setup.reward_time_limit_s)
+        probe = Probe(setup)
         answer = Answer(float("nan"), NOT_CALLED) if hangs else _act(probe, case)
         if probe.failures:
             answer = replace(answer, failure=_with_line(setup, *probe.failures[0]))
         hangs = hangs or probe.hangs
-        taken = None if answer.failure else probe.median_s(next(case.now.params()))
-        check.tried.append(SituationResult(case.name, answer, None if taken is None else taken * 1e6))
-    failed = {tried.answer.failure for tried in check.tried} - {None, NOT_CALLED}
+        check.tried[case.name] = answer
+    failed = {answer.failure for answer in check.tried.values()} - {None, NOT_CALLED}
     for what in sorted(map(str, failed)):
-        names = [tried.name for tried in check.tried if tried.answer.failure == what]
+        names = [name for name, answer in check.tried.items() if answer.failure == what]
         check.failures.append(f"{what}, at {', '.join(names)}")
 
 
@@ -115,19 +106,19 @@ def _act(probe: Probe, case: NamedSituation) -> Answer:
 
 def look_closer(check: Check, against: Track) -> None:
     """Call the function in many situations and add failures, warnings and the reward grid to `check`."""
-    setup, source = check.setup, check.setup.reward
-    probe = Probe(source, setup.reward_time_limit_s)
+    setup = check.setup
+    probe = Probe(setup)
     plain_s = _cpu_s_per_call(probe, setup)
     check.detail = next((detail for limit_s, detail in _DETAILS if plain_s < limit_s), None)
     if not probe.hangs:
-        check.state = state_of(setup, Probe(source, setup.reward_time_limit_s), 40 if check.detail else 5)
+        check.state = state_of(setup, Probe(setup), 40 if check.detail else 5)
         executed, n = _execute_scenes(probe, setup, against) if check.detail else (None, _SAMPLES[-1][1])
         sampled, rewards = _sample(check, probe, executed, n)
     check.failures += _failures(setup, probe, check.situations)
     if check.failures:
         return
 
-    last_point = Probe(source, setup.reward_time_limit_s).call(next(seam(setup).params()))
+    last_point = Probe(setup).call(next(seam(setup).params()))
     if last_point.failure:
         check.warnings.append(f"at the finish, between the last waypoint and the first: {last_point.failure}")
     if plain_s > _SLOW_S:
@@ -146,10 +137,10 @@ def look_closer(check: Check, against: Track) -> None:
     constant = list(pitfalls.constant_reward(rewards))
     check.warnings += constant
     if executed is not None:
-        check.warnings += _unreached(source.text, executed.lines, check.situations)
+        check.warnings += _unreached(setup.reward.text, executed.lines, check.situations)
     if check.detail is None:
         return
-    check.sampler = RewardSampler(setup, check.state)
+    check.sampler = reward_sampler(setup, check.state)
     check.grid = sample_reward_grid(setup, check.sampler, check.detail)
     if constant:  # the other warnings would only repeat it
         return
@@ -164,7 +155,7 @@ def _execute_scenes(probe: Probe, setup: RaceSetup, against: Track) -> tuple[Cov
     with Coverage(setup.reward.path) as executed:
         for case in named_situations(setup, against):
             _act(probe, case)
-        Probe(setup.reward, setup.reward_time_limit_s).call(next(seam(setup).params()))
+        Probe(setup).call(next(seam(setup).params()))
         traced_s = _cpu_s_per_call(probe, setup)
     return executed, next(n for limit_s, n in _SAMPLES if traced_s < limit_s)
 
@@ -209,7 +200,7 @@ def _with_line(setup: RaceSetup, what: str, params: dict[str, Any]) -> str:
     if not what.startswith("returned"):
         return what
     with Coverage(setup.reward.path) as coverage:
-        again = Probe(setup.reward, setup.reward_time_limit_s).call(params)
+        again = Probe(setup).call(params)
     return f"line {coverage.returned_at} {what}" if again.failure == what else what
 
 

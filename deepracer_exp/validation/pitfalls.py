@@ -177,7 +177,7 @@ def pays_for_standing(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
     if not laps:
         return
     lap = laps[len(laps) // 2].paid
-    probe = Probe(setup.reward, setup.reward_time_limit_s)
+    probe = Probe(setup)
     standing, driving = [], []
     for place in np.linspace(0.15, 0.75, 4):
         i = max(1, int(place * (len(lap) - _HELD)))
@@ -206,10 +206,7 @@ def pays_for_slowness(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
     """Warn if a slow lap earns more reward in total than a fast one."""
     if not laps or laps[0].time_s < _FASTER * laps[-1].time_s:
         return
-    slow, fast = (
-        float(Probe(setup.reward, setup.reward_time_limit_s).rewards(lap.paid).sum())
-        for lap in (laps[0], laps[-1])
-    )
+    slow, fast = (float(Probe(setup).rewards(lap.paid).sum()) for lap in (laps[0], laps[-1]))
     if slow > fast + _MARGIN * max(abs(slow), abs(fast)):
         yield (
             f"pays more for a slow lap than for a fast one: {slow:.4g} in {laps[0].time_s:.1f} s, "

@@ -2,20 +2,18 @@
 
 import ast
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from statistics import median
 from types import FrameType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.rewards.guard import CtrlC, Guard, Misconduct
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.rewards.guard import Guard, Misconduct
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
-from deepracer_exp.rewards.source import RewardSource
 
 from .situations import Situations
 
@@ -45,14 +43,9 @@ class Probe:
         BadInput: the module cannot be loaded.
     """
 
-    def __init__(self, source: RewardSource, time_limit_s: float):
-        """Load the module.
-
-        Args:
-            source: the module.
-            time_limit_s: CPU seconds of a single call.
-        """
-        self._function = RewardFunction(source, 1, time_limit_s, None, scalar=True)
+    def __init__(self, setup: RaceSetup):
+        """Load the module of a race."""
+        self._function = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None, scalar=True)
         self.failures: list[tuple[str, dict[str, Any]]] = []
         self.hangs = False
 
@@ -98,26 +91,6 @@ class Probe:
             answers.append(Answer(float("nan"), str(error)))
             answers += (Answer(float("nan"), NOT_CALLED) for _ in waiting)
         return answers
-
-    def median_s(self, params: dict[str, Any]) -> float | None:
-        """Return the median time of a call in seconds, over as many calls as fit into 50 ms (3 to 1000).
-
-        None: the function keeps state and fails when it is called with the same params again.
-        """
-        call = self._function.functions[0]
-        times: list[float] = []
-        given = [{**params, "waypoints": params["waypoints"][:]} for _ in range(1000)]
-        try:
-            with Guard(self._function.time_limit_s):
-                while len(times) < 3 or (len(times) < len(given) and sum(times) < 0.05):
-                    began = time.perf_counter()
-                    call(given[len(times)])
-                    times.append(time.perf_counter() - began)
-        except CtrlC:
-            raise
-        except BaseException:  # noqa: BLE001 - reported by the check for standing still, where the same happens
-            return None
-        return median(times)
 
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)

@@ -1,5 +1,6 @@
 """Sample a reward function on a grid of positions, headings, speeds and steering angles."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,35 +18,26 @@ HEADINGS_DEG = 180.0
 _PLACES, _HEADINGS, _OFFSETS, _SPEEDS, _STEERINGS = 10, 25, 25, 13, 13
 
 
-class RewardSampler:
-    """Returns the rewards of poses; a function that keeps state is called with the step before first."""
+Sampler = Callable[..., tuple[Floats, NDArray[np.bool_]]]
+"""See `reward_sampler`."""
 
-    def __init__(self, setup: RaceSetup, state: State):
-        """Load the module of `setup`."""
-        self._setup = setup
-        self._is_stateful = state == "earlier calls"
-        self._probe = Probe(setup.reward, setup.reward_time_limit_s)
 
-    def rewards(
-        self,
-        ndist: ArrayLike,
-        offset_m: ArrayLike,
-        heading_error_rad: ArrayLike,
-        speed_mps: ArrayLike,
-        steering_deg: ArrayLike = 0.0,
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the rewards of poses (see `situations.poses`) and whether they are off the track.
+def reward_sampler(setup: RaceSetup, state: State) -> Sampler:
+    """Return a function that returns the rewards of poses and whether they are off the track.
 
-        Both have the broadcast shape of the arguments.
-        """
-        shape = np.broadcast_shapes(
-            *(np.shape(v) for v in (ndist, offset_m, heading_error_rad, speed_mps, steering_deg))
-        )
-        at = poses(self._setup, ndist, offset_m, heading_error_rad, speed_mps, steering_deg)
-        now = situations(self._setup, at)
-        before = situations(self._setup, at, earlier=True) if self._is_stateful else None
-        rewards = self._probe.rewards(now, before)
-        return rewards.reshape(shape), now.columns["is_offtrack"].reshape(shape)
+    It takes the arguments of `situations.poses` but the race; both results have their broadcast shape. A reward that
+    depends on earlier calls is called with the step before first.
+    """
+    probe = Probe(setup)
+
+    def rewards(*pose: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
+        shape = np.broadcast_shapes(*map(np.shape, pose))
+        at = poses(setup, *pose)
+        now = situations(setup, at)
+        before = situations(setup, at, earlier=True) if state == "earlier calls" else None
+        return probe.rewards(now, before).reshape(shape), now.columns["is_offtrack"].reshape(shape)
+
+    return rewards
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +67,12 @@ class RewardGrid:
         return len(self.headings_rad) // 2
 
 
-def sample_reward_grid(setup: RaceSetup, sampler: RewardSampler, detail: float) -> RewardGrid:
+def sample_reward_grid(setup: RaceSetup, rewards: Sampler, detail: float) -> RewardGrid:
     """Sample the rewards of a grid all over the track.
 
     Args:
         setup: the experiment's race.
-        sampler: of the reward function.
+        rewards: of the reward function.
         detail: 1, or less for slow functions.
     """
     low, high = setup.actions.low, setup.actions.high
@@ -94,12 +86,12 @@ def sample_reward_grid(setup: RaceSetup, sampler: RewardSampler, detail: float) 
     headings_rad = np.radians(np.linspace(-HEADINGS_DEG, HEADINGS_DEG, points(_HEADINGS)))
     beyond_m = setup.track.width_m / 2 + OFF_ROAD_M
     offsets_m = np.linspace(-beyond_m, beyond_m, points(_OFFSETS))
-    reward, off_track = sampler.rewards(
+    reward, off_track = rewards(
         ndist[:, None, None], offsets_m, headings_rad[:, None], speeds_mps[:, None, None, None]
     )
     all_speeds_mps = np.linspace(low[1], high[1], points(_SPEEDS) if high[1] > low[1] else 1)
     steerings_deg = np.linspace(low[0], high[0], points(_STEERINGS) if high[0] > low[0] else 1)
-    by_command, _ = sampler.rewards(ndist[:, None, None], 0.0, 0.0, all_speeds_mps[:, None], steerings_deg)
+    by_command, _ = rewards(ndist[:, None, None], 0.0, 0.0, all_speeds_mps[:, None], steerings_deg)
     return RewardGrid(
         speeds_mps=speeds_mps,
         headings_rad=headings_rad,
@@ -126,7 +118,7 @@ def state_of(setup: RaceSetup, probe: Probe, n: int = 40) -> State:
     alone = probe.rewards(now)
     if probe.failures:
         return "none"
-    again = Probe(setup.reward, setup.reward_time_limit_s)
+    again = Probe(setup)
     if not np.array_equal(alone, again.rewards(now), equal_nan=True):
         return "randomness"
     same = np.array_equal(alone, probe.rewards(now, before), equal_nan=True)

@@ -17,7 +17,7 @@ from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput
 
-from .reward_grid import RewardGrid, RewardSampler, State
+from .reward_grid import RewardGrid, Sampler, State
 from .situations import middle_speed_mps
 
 INK, FAINT, GROUND = "#22262b", "#7b828c", "#ffffff"
@@ -35,13 +35,13 @@ _PIXELS = 16_000
 
 
 def draw_reward_map(
-    setup: RaceSetup, sampler: RewardSampler, of: RewardGrid, state: State, detail: float, path: Path
+    setup: RaceSetup, rewards: Sampler, of: RewardGrid, state: State, detail: float, path: Path
 ) -> None:
     """Write the picture: the track coloured by the reward for driving along it, and four cuts.
 
     Args:
         setup: the experiment's race.
-        sampler: of the reward function.
+        rewards: of the reward function.
         of: rewards sampled on a grid.
         state: whether a reward depends on more than the params.
         detail: 1, or less for slow functions.
@@ -53,7 +53,7 @@ def draw_reward_map(
     track = setup.track
     low, high = (getattr(np.concatenate([track.inner, track.outer]), f)(axis=0) for f in ("min", "max"))
     low, high = low - _BESIDE_M - 0.1, high + _BESIDE_M + 0.1
-    pixels, extent = _track_pixels(setup, sampler, low, high, detail)
+    pixels, extent = _track_pixels(setup, rewards, low, high, detail)
     colors, norm, extend = _scale(of, pixels)
 
     width_in, foot_in, head_in = 12.0, 3.9, 1.0
@@ -98,7 +98,7 @@ def draw_reward_map(
 
 
 def _track_pixels(
-    setup: RaceSetup, sampler: RewardSampler, low: np.ndarray, high: np.ndarray, detail: float
+    setup: RaceSetup, rewards: Sampler, low: np.ndarray, high: np.ndarray, detail: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Return the rewards of a grid of points on and beside the track, NaN elsewhere, and its extent in metres."""
     track = setup.track
@@ -110,7 +110,7 @@ def _track_pixels(
     near = shapely.contains_xy(track.road.buffer(_BESIDE_M + 1.5 * cell_m), grid_x, grid_y)
     place = track.project(np.column_stack([grid_x[near], grid_y[near]]))
     pixels = np.full(grid_x.shape, np.nan)
-    pixels[near], _ = sampler.rewards(place.ndist, place.offset_m, 0.0, middle_speed_mps(setup))
+    pixels[near], _ = rewards(place.ndist, place.offset_m, 0.0, middle_speed_mps(setup))
     half_m = cell_m / 2
     return pixels, (x[0] - half_m, x[-1] + half_m, y[0] - half_m, y[-1] + half_m)
 

@@ -1,23 +1,28 @@
 """The command `validate`: check a reward function, print the findings, draw the map, train for a moment."""
 
 import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.runs.files import METRICS, read_metrics
 
 from .check import Check, look_closer, other_direction, read, try_named_situations
 from .probe import NOT_CALLED
 from .reward_map import draw_reward_map
-from .short_training import ShortTraining, run_short_training
 
 _MOST = 12
 """Most lines of one kind that are printed."""
+_FEWEST = 6
+"""Fewest iterations of a short training whose thirds can be compared."""
 
 
 def validate_reward(
@@ -64,7 +69,7 @@ def validate_reward(
     _print_lines(out, "Warnings", "yellow", check.warnings)
     _print_lines(out, "Failures", "red", check.failures)
     if trial is not None and not check.failures and not (strict and check.console):
-        _print_short_training(out, run_short_training(*trial, err))
+        _train_shortly(out, err, *trial)
     return _verdict(out, check, strict)
 
 
@@ -87,28 +92,18 @@ def _print_console_findings(out: Console, check: Check) -> None:
         _line(out, "AWS console: would accept it")
         return
     _line(out, "AWS console: would reject it", "yellow")
-    for finding in check.console[:_MOST]:
-        _line(out, f"  {finding}")
-    if len(check.console) > _MOST:
-        _line(out, f"  and {len(check.console) - _MOST} more")
+    _print_first(out, list(map(str, check.console)))
 
 
 def _print_situations(out: Console, check: Check) -> None:
     table = Table("situation", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
     table.add_column("reward", justify="right")
-    table.add_column("time per call", justify="right")
-    for tried in check.tried:
-        taken = "" if tried.microseconds is None else _time(tried.microseconds)
-        failed = tried.answer.failure is not None
-        how = "[dim]-[/dim]" if tried.answer.failure == NOT_CALLED else "[red]failed[/red]"
-        table.add_row(tried.name, how if failed else f"{tried.answer.reward:.4g}", taken)
+    for name, answer in check.tried.items():
+        how = "[dim]-[/dim]" if answer.failure == NOT_CALLED else "[red]failed[/red]"
+        table.add_row(name, f"{answer.reward:.4g}" if answer.failure is None else how)
     out.print()
     out.print(table, highlight=False)
     out.print()
-
-
-def _time(microseconds: float) -> str:
-    return f"{microseconds:.3g} us" if microseconds < 1000 else f"{microseconds / 1000:,.3g} ms"
 
 
 def _draw(out: Console, check: Check, path: Path) -> None:
@@ -125,26 +120,63 @@ def _draw(out: Console, check: Check, path: Path) -> None:
 
 
 def _print_lines(out: Console, title: str, style: str, lines: list[str]) -> None:
-    if not lines:
-        return
-    _line(out, f"\n{title}", style)
+    if lines:
+        _line(out, f"\n{title}", style)
+        _print_first(out, lines)
+
+
+def _print_first(out: Console, lines: list[str]) -> None:
     for line in lines[:_MOST]:
         _line(out, f"  {line}")
     if len(lines) > _MOST:
         _line(out, f"  and {len(lines) - _MOST} more")
 
 
-def _print_short_training(out: Console, trial: ShortTraining) -> None:
-    _line(out, f"\nTrial: {trial.env_steps:,} steps -> {trial.folder}")
-    if not trial.changes:
-        _line(out, "  too short to see whether anything improves; give it more time")
-    for change in trial.changes:
-        what = "improves" if change.rises else "does not improve"
-        _line(
-            out,
-            f"  {change.name} {what}: {change.first:.4g} in the first third ({trial.first_episodes:,} episodes), "
-            f"{change.last:.4g} in the last ({trial.last_episodes:,})",
+def _train_shortly(out: Console, err: Console, experiment: Experiment, composition: Composition) -> None:
+    """Train and print whether anything improves.
+
+    Raises:
+        BadInput: the experiment cannot be trained.
+        RunFailed: the training failed.
+        KeyboardInterrupt: it was interrupted.
+    """
+    from deepracer_exp.training.run import train
+
+    outcome = train(experiment, composition, err)
+    if outcome.status == "failed":
+        raise RunFailed(f"trial: run failed: {outcome.reason}; see {outcome.folder}")
+    if outcome.status == "interrupted":
+        raise KeyboardInterrupt
+    rows = read_metrics(outcome.folder / METRICS)
+    _line(out, f"\nTrial: {rows[-1]['env_steps'] if rows else 0:,} steps -> {outcome.folder}")
+    for line in compare_thirds(rows) or ["too short to see whether anything improves; give it more time"]:
+        _line(out, f"  {line}")
+
+
+def compare_thirds(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Compare the first third of iterations, rows of metrics.jsonl, with the last; return a line for each metric.
+
+    A metric improves if it rises by more than twice the standard error of the difference.
+    """
+    third = len(rows) // 3
+    if len(rows) < _FEWEST:
+        return []
+    ended = np.diff([0, *(row["episodes"] for row in rows)])
+    lines = []
+    for key, name in (("completion", "per cent of the lap"), ("mean_return", "reward of an episode")):
+        first, last = (
+            np.array([row[key] for row in part if row[key] is not None])
+            for part in (rows[:third], rows[-third:])
         )
+        if len(first) < 2 or len(last) < 2:
+            continue
+        error = np.hypot(first.std(ddof=1) / np.sqrt(len(first)), last.std(ddof=1) / np.sqrt(len(last)))
+        what = "improves" if last.mean() - first.mean() > 2 * error else "does not improve"
+        lines.append(
+            f"{name} {what}: {first.mean():.4g} in the first third ({ended[:third].sum():,} episodes), "
+            f"{last.mean():.4g} in the last ({ended[-third:].sum():,})"
+        )
+    return lines
 
 
 def _verdict(out: Console, check: Check, strict: bool) -> int:

@@ -14,8 +14,6 @@ from deepracer_exp.validation import check as checking
 from deepracer_exp.validation import reward_map
 from deepracer_exp.validation.check import Check, look_closer, other_direction, read, try_named_situations
 from deepracer_exp.validation.pitfalls import DrivenLap, action_space_laps
-from deepracer_exp.validation.probe import Probe
-from deepracer_exp.validation.reward_grid import RewardSampler, state_of
 
 
 @pytest.fixture(scope="session")
@@ -47,14 +45,6 @@ def race_with(race: RaceSetup, tmp_path: Path) -> Callable[..., RaceSetup]:
         file.write_text(text, encoding="utf-8")
         config = RewardConfig(name="", file=str(file), constants={}, time_limit_s=time_limit_s)
         return dataclasses.replace(race, reward=load_reward_source(config), reward_time_limit_s=time_limit_s)
-
-    return build
-
-
-@pytest.fixture
-def surveyor_of() -> Callable[[RaceSetup], RewardSampler]:
-    def build(race: RaceSetup) -> RewardSampler:
-        return RewardSampler(race, state_of(race, Probe(race.reward, race.reward_time_limit_s)))
 
     return build
 

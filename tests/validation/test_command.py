@@ -8,6 +8,7 @@ from matplotlib.image import imread
 from deepracer_exp.rewards.source import zoo_names
 from deepracer_exp.validation import check as checking
 from deepracer_exp.validation.check import read
+from deepracer_exp.validation.validate import compare_thirds
 
 pytestmark = pytest.mark.usefixtures("coarsely")
 
@@ -152,3 +153,30 @@ def test_a_short_training_reports_whether_anything_improves(call, tmp_path):
     assert "runs/validate/" in ended.stdout
     assert len(list(tmp_path.glob("runs/validate/*/metrics.jsonl"))) == 1
     assert "improve" in ended.stdout
+
+
+@pytest.mark.parametrize("text", ["", "0s", "-5s", "20000steps", "inf", "1h"])
+def test_a_time_other_than_seconds_or_minutes_is_refused(call, text):
+    call("validate", f"trial={text}").assert_bad_input("accepted: seconds or minutes above 0")
+
+
+def rows(completion: list[float | None], reward: list[float]) -> list[dict]:
+    return [
+        {"completion": c, "mean_return": r, "episodes": 10 * (i + 1)}
+        for i, (c, r) in enumerate(zip(completion, reward, strict=True))
+    ]
+
+
+def test_a_rise_beyond_noise_is_an_improvement():
+    noise = np.random.default_rng(0).normal(0, 3, 30)
+    completion, reward = compare_thirds(rows([*(np.linspace(10, 80, 30) + noise)], [*(50 + noise)]))
+    assert completion.startswith("per cent of the lap improves: ")
+    assert "in the first third (100 episodes)" in completion
+    assert reward.startswith("reward of an episode does not improve: ")
+
+
+def test_iterations_without_an_episode_count_for_nothing_and_few_say_nothing():
+    completion, _ = compare_thirds(rows([None, 5, 6, 7, 8, 9, 50, None, 60], [1.0] * 9))
+    assert "improves: 5.5 in the first third" in completion
+    assert "55 in the last" in completion
+    assert [compare_thirds(rows([1.0] * n, [1.0] * n)) for n in (0, 1, 5)] == [[], [], []]

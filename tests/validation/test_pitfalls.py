@@ -1,33 +1,20 @@
+"""Common mistakes in reward functions are warned of, and good functions are left alone."""
+
 import numpy as np
 import pytest
 
 from deepracer_exp.validation import pitfalls
-from deepracer_exp.validation.reward_grid import sample_reward_grid
+from deepracer_exp.validation.probe import Probe
+from deepracer_exp.validation.reward_grid import reward_sampler, sample_reward_grid, state_of
 
-CENTER = """\
-def reward_function(params):
-    return max(0.0, 1.0 - params["distance_from_center"])
-"""
-EDGE = """\
-def reward_function(params):
-    return params["distance_from_center"]
-"""
-LEFT_GRASS = """\
-def reward_function(params):
-    return 2.0 if params["is_offtrack"] and params["is_left_of_center"] else 1.0
-"""
-SPEED = """\
-def reward_function(params):
-    return params["speed"]
-"""
-PROGRESS_PER_STEP = """\
-def reward_function(params):
-    return params["progress"] / params["steps"]
-"""
-TIME = """\
-def reward_function(params):
-    return 100.0 if params["progress"] == 100 else -1.0
-"""
+
+def paying(expression: str) -> str:
+    return f"def reward_function(params):\n    return {expression}\n"
+
+
+CENTER = paying('max(0.0, 1.0 - params["distance_from_center"])')
+LEFT_GRASS = paying('2.0 if params["is_offtrack"] and params["is_left_of_center"] else 1.0')
+SPEED = paying('params["speed"]')
 DELTA = """\
 last = {"progress": 0.0, "steps": 0.0}
 
@@ -42,67 +29,56 @@ def reward_function(params):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (EDGE, "pays more off the track than on it"),
-        (LEFT_GRASS, "pays more off the track than on it: 2 per step"),
-        (SPEED, "pays as much off the track as on it: 2 per step"),
+        (paying('params["distance_from_center"]'), ["pays more off the track than on it"]),
+        (LEFT_GRASS, ["pays more off the track than on it: 2 per step", "m left of the centre line"]),
+        (SPEED, ["pays as much off the track as on it: 2 per step"]),
+        (CENTER, None),
+        (paying("-1.0 * params['is_offtrack']"), None),
     ],
 )
-def test_reward_off_the_track_is_reported(race_with, surveyor_of, text, words):
+def test_reward_off_the_track_is_reported(race_with, text, words):
     race = race_with(text)
-    (told,) = pitfalls.pays_off_the_road(sample_reward_grid(race, surveyor_of(race), 0.25))
-    assert words in told
-
-
-def test_the_side_that_pays_is_named(race_with, surveyor_of):
-    race = race_with(LEFT_GRASS)
-    (told,) = pitfalls.pays_off_the_road(sample_reward_grid(race, surveyor_of(race), 0.25))
-    assert "m left of the centre line" in told
+    sampler = reward_sampler(race, state_of(race, Probe(race)))
+    found = list(pitfalls.pays_off_the_road(sample_reward_grid(race, sampler, 0.25)))
+    assert len(found) == (words is not None)
+    assert all(word in found[0] for word in words or ())
 
 
 @pytest.mark.parametrize(
-    "text", [CENTER, "def reward_function(params):\n    return -1.0 * params['is_offtrack']\n"]
+    ("text", "warned"),
+    [
+        (CENTER, True),
+        (paying("1 - params['speed'] / 10"), True),
+        (SPEED, False),
+        (DELTA, False),
+        (paying('params["progress"] / params["steps"]'), False),
+        (paying("1 / params['speed']"), False),  # it cannot take a standing car
+    ],
 )
-def test_a_function_that_prefers_the_road_is_left_alone(race_with, surveyor_of, text):
+def test_reward_for_standing_is_reported(race_with, laps, text, warned):
+    found = list(pitfalls.pays_for_standing(race_with(text), laps))
+    assert [line.startswith("pays for standing still: ") for line in found] == [True] * warned
+
+
+@pytest.mark.parametrize(
+    ("text", "warned"),
+    [
+        (CENTER, True),
+        (paying("1 / params['speed']"), True),
+        (paying('100.0 if params["progress"] == 100 else -1.0'), False),
+        (DELTA, False),
+        (paying("params['speed'] ** 2"), False),
+    ],
+)
+def test_more_reward_for_a_slow_lap_is_reported_with_both_times(race_with, laps, text, warned):
     race = race_with(text)
-    assert not list(pitfalls.pays_off_the_road(sample_reward_grid(race, surveyor_of(race), 0.25)))
-
-
-@pytest.mark.parametrize(
-    "text", [CENTER, "def reward_function(params):\n    return 1 - params['speed'] / 10\n"]
-)
-def test_pay_for_standing_is_told(race_with, laps, text):
-    (told,) = pitfalls.pays_for_standing(race_with(text), laps)
-    assert told.startswith("pays for standing still: ")
-
-
-@pytest.mark.parametrize("text", [SPEED, DELTA, PROGRESS_PER_STEP])
-def test_less_pay_for_standing_than_for_driving_is_not(race_with, laps, text):
-    assert not list(pitfalls.pays_for_standing(race_with(text), laps))
-
-
-def test_a_function_that_cannot_take_a_standing_car_is_not_accused(race_with, laps):
-    divides = "def reward_function(params):\n    return 1 / params['speed']\n"
-    assert not list(pitfalls.pays_for_standing(race_with(divides), laps))
-
-
-@pytest.mark.parametrize("text", [CENTER, "def reward_function(params):\n    return 1 / params['speed']\n"])
-def test_more_pay_for_a_slow_lap_is_told_with_both_times(race_with, laps, text):
-    (told,) = pitfalls.pays_for_slowness(race_with(text), laps)
-    assert "pays more for a slow lap than for a fast one: " in told
-    assert f"in {laps[0].time_s:.1f} s" in told
-    assert f"in {laps[-1].time_s:.1f} s" in told
-
-
-@pytest.mark.parametrize(
-    "text", [TIME, DELTA, "def reward_function(params):\n    return params['speed'] ** 2\n"]
-)
-def test_more_pay_for_a_fast_lap_is_not(race_with, laps, text):
-    assert not list(pitfalls.pays_for_slowness(race_with(text), laps))
-
-
-def test_one_lap_alone_is_not_compared(race_with, laps):
-    assert not list(pitfalls.pays_for_slowness(race_with(CENTER), laps[:1]))
-    assert not list(pitfalls.pays_for_slowness(race_with(CENTER), []))
+    found = list(pitfalls.pays_for_slowness(race, laps))
+    assert len(found) == warned
+    for line in found:
+        assert "pays more for a slow lap than for a fast one: " in line
+        assert f"in {laps[0].time_s:.1f} s" in line
+        assert f"in {laps[-1].time_s:.1f} s" in line
+    assert not list(pitfalls.pays_for_slowness(race, laps[:1]))
 
 
 def test_only_a_constant_reward_is_reported_as_constant():
@@ -113,10 +89,8 @@ def test_only_a_constant_reward_is_reported_as_constant():
 
 
 @pytest.mark.parametrize(("factor", "warned"), [("1", False), ("2", True)])
-def test_a_reward_batch_that_pays_otherwise_is_told(race_with, laps, factor, warned):
+def test_a_reward_batch_that_pays_otherwise_is_reported(race_with, laps, factor, warned):
     batch = f'\n\ndef reward_batch(params):\n    return {factor} * params["speed"]\n'
     race, sampled = race_with(SPEED + batch), laps[0].paid
-    told = list(pitfalls.batch_differs(race, sampled, sampled.columns["speed"]))
-    assert bool(told) == warned
-    if told:
-        assert f"in {len(sampled)} of {len(sampled)}" in told[0]
+    found = list(pitfalls.batch_differs(race, sampled, sampled.columns["speed"]))
+    assert [f"in {len(sampled)} of {len(sampled)}" in line for line in found] == [True] * warned
