@@ -163,12 +163,12 @@ def _validated(path: str | Path, raw: bytes, adapter: "TypeAdapter[Content]", ac
         raise BadInput(f"{path}:{where} {finding['msg']}; accepted: {accepted}") from error
 
 
-def atomic_write(path: Path, text: str) -> Path:
+def atomic_write(path: Path, content: str | bytes) -> Path:
     """Write a file completely or not at all; of several processes that write it at once, the last one wins."""
     # Each in a file of its own: what another process moved into place would be missing here.
     aside = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
-        aside.write_text(text, encoding="utf-8")
+        aside.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
         return aside.replace(path)
     except BaseException:
         # A disk that takes no file may refuse to delete one as well.

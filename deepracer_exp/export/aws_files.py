@@ -1,6 +1,8 @@
 """The files that the AWS console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from deepracer_exp.config.custom_files import TAKEN
@@ -18,17 +20,8 @@ CONSOLE_STEERING_DEG = (-30.0, 30.0)
 CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
 
 
-@dataclass(frozen=True)
-class AwsFiles:
-    """The files by name, and notes on them."""
-
-    texts: dict[str, str]
-    notes: tuple[str, ...]
-    """Changed values and values the console would reject, one line each."""
-
-
-def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> AwsFiles:
-    """Return the files of an experiment.
+def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tuple[dict[str, str], list[str]]:
+    """Return the texts of an experiment's files by name, and a note on each value changed or beyond the console.
 
     Values are clipped to the console's ranges. The action space is kept, because another one makes another car.
 
@@ -39,26 +32,31 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> AwsF
     """
     metadata = metadata_of(actions)
     learning, changed = _hyperparameters(experiment)
-    return AwsFiles(
-        {
-            "reward_function.py": reward,
-            "model_metadata.json": model_metadata_text(metadata),
-            "hyperparameters.json": hyperparameters_text(learning),
-        },
-        (*_action_notes(metadata), *changed),
-    )
+    texts = {
+        "reward_function.py": reward,
+        "model_metadata.json": model_metadata_text(metadata),
+        "hyperparameters.json": hyperparameters_text(learning),
+    }
+    return texts, [*_action_notes(metadata), *changed]
 
 
-def write_aws_files(files: AwsFiles, folder: Path) -> None:
-    """Write the files into a folder, replacing those of the same names.
+def write_texts(texts: Mapping[str, str], folder: Path) -> None:
+    """Write files into a folder, replacing those of the same names.
 
     Raises:
         BadInput: the folder cannot be created or written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, text in files.texts.items():
+    with writing():
+        for name, text in texts.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def writing() -> Iterator[None]:
+    """Turn an OSError within the block into BadInput."""
+    try:
+        yield
     except OSError as error:
         raise BadInput(
             f"{error.filename}: cannot be written: {error.strerror}; give another folder by -o"

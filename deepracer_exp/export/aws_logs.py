@@ -19,7 +19,7 @@ from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput
 
-from .aws_files import hyperparameters_of
+from .aws_files import hyperparameters_of, write_texts, writing
 
 TRACE_HEADER = (
     "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
@@ -44,19 +44,8 @@ _PLACES = {
 }
 
 
-@dataclass(frozen=True)
-class AwsLogs:
-    """Summary of the export."""
-
-    rows: int
-    episodes: int
-    iterations: int
-    notes: tuple[str, ...]
-    """Differences from the run, one line each."""
-
-
-def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, layout: str) -> AwsLogs:
-    """Write the training of our own run in the layout of the console or of deepracer-for-cloud.
+def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, layout: str) -> list[str]:
+    """Write the training of our own run in the layout of the console or of deepracer-for-cloud; return notes on it.
 
     The service's iterations consist of whole episodes, always equally many: tools derive the iteration from the
     episode's number. So an episode belongs to the iteration of its last row, and the numbers have gaps: iteration k
@@ -76,42 +65,29 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     numbered = _number(recording.steps)
     job = _job(recording.name)
     learning = replace(hyperparameters_of(experiment), num_episodes_between_training=numbered.per_iteration)
-    head = _Head(
-        world=next(iter(experiment.tracks)),
-        metadata=model_metadata_text(metadata_of(build_action_space(experiment.action_space))),
-        hyperparameters=hyperparameters_text(learning),
-    )
+    metadata = model_metadata_text(metadata_of(build_action_space(experiment.action_space)))
+    hyperparameters = hyperparameters_text(learning)
+    head = _head(next(iter(experiment.tracks)), metadata, hyperparameters)
     texts = {
-        "model/model_metadata.json": head.metadata,
-        "ip/hyperparameters.json": head.hyperparameters,
+        "model/model_metadata.json": metadata,
+        "ip/hyperparameters.json": hyperparameters,
         _PLACES[layout]["metrics"].format(job=job): _metrics_text(numbered, recording.evaluations),
         f"logs/training/training-{job}-sagemaker.log": _trainer_log(head, numbered, recording.updates),
     }
     if recording.reward_source is not None:
         texts["reward_function.py"] = recording.reward_source
     if layout == "console":
-        texts["model_metadata.json"] = head.metadata
-        texts["hyperparameters.json"] = head.hyperparameters
-    try:
+        texts |= {"model_metadata.json": metadata, "hyperparameters.json": hyperparameters}
+    with writing():
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise BadInput(f"--output {folder}: is not empty; accepted: a new or an empty folder")
-        for name, text in texts.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(text, encoding="utf-8")
-        _write_trace(
-            numbered,
-            folder / _PLACES[layout]["trace"],
-            folder / f"logs/training/training-{job}-robomaker.log",
-            head.text(),
-        )
-    except OSError as error:
-        raise BadInput(
-            f"{error.filename}: cannot be written: {error.strerror}; give another folder by -o"
-        ) from error
-    return AwsLogs(
-        len(numbered.rows), len(numbered.episodes), numbered.iterations, _notes(numbered, experiment)
-    )
+    write_texts(texts, folder)
+    log = folder / f"logs/training/training-{job}-robomaker.log"
+    with writing():
+        _write_trace(numbered, folder / _PLACES[layout]["trace"], log, head)
+    what = f"{len(numbered.rows):,} rows, {len(numbered.episodes):,} episodes, {numbered.iterations:,} iterations"
+    return [f"{what}, as {layout} has them", *_notes(numbered, experiment)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,29 +163,22 @@ def _job(name: str) -> str:
     return f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{name}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Head:
-    """What every log of the service begins with."""
-
-    world: str
-    metadata: str
-    hyperparameters: str
-
-    def text(self) -> str:
-        model = json.loads(self.metadata)
-        return (
-            f" * /WORLD_NAME: {self.world}\n"
-            f"Sensor list {model['sensor']}, network {model['neural_network']}, simapp_version "
-            f"{float(model['version'])}, training_algorithm {model['training_algorithm']}, action_space_type "
-            f"{model['action_space_type']}\n"
-            f"Action space from file: {model['action_space']}\n"
-            f"Using the following hyper-parameters\n{self.hyperparameters}"
-        )
+def _head(world: str, metadata: str, hyperparameters: str) -> str:
+    """Return what every log of the service begins with."""
+    model = json.loads(metadata)
+    return (
+        f" * /WORLD_NAME: {world}\n"
+        f"Sensor list {model['sensor']}, network {model['neural_network']}, simapp_version "
+        f"{float(model['version'])}, training_algorithm {model['training_algorithm']}, action_space_type "
+        f"{model['action_space_type']}\n"
+        f"Action space from file: {model['action_space']}\n"
+        f"Using the following hyper-parameters\n{hyperparameters}"
+    )
 
 
-def _trainer_log(head: _Head, numbered: _Numbered, updates: pd.DataFrame) -> str:
+def _trainer_log(head: str, numbered: _Numbered, updates: pd.DataFrame) -> str:
     """Return the trainer's log: the end of each episode, and the mean over the epochs of each update."""
-    lines = [head.text().rstrip("\n"), _saved(0, 0)]
+    lines = [head.rstrip("\n"), _saved(0, 0)]
     driven = 0
     by_iteration = dict(iter(numbered.episodes.groupby("iteration", sort=False)))
     losses = {int(row["iteration"]) - numbered.first_iteration: row for row in updates.to_dict("records")}
@@ -345,7 +314,7 @@ def _actions(rows: pd.DataFrame) -> list[Any]:
     return action.astype(np.int64).tolist()
 
 
-def _notes(numbered: _Numbered, experiment: Experiment) -> tuple[str, ...]:
+def _notes(numbered: _Numbered, experiment: Experiment) -> list[str]:
     notes = [
         f"hyperparameters.json: num_episodes_between_training={numbered.per_iteration}, the most that ended in one "
         "iteration; episode numbers have gaps in the others"
@@ -361,4 +330,4 @@ def _notes(numbered: _Numbered, experiment: Experiment) -> tuple[str, ...]:
         notes.append(
             f"{names}: the service's trace has no column for the track; use track_len to distinguish them"
         )
-    return tuple(notes)
+    return notes

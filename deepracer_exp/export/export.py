@@ -15,9 +15,9 @@ from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.validation.console import console_findings
 
-from .aws_files import aws_files, write_aws_files
+from .aws_files import aws_files, write_texts
 from .aws_logs import write_aws_logs
-from .onnx_file import DeployedPolicy, write_onnx
+from .onnx_file import CHECKED, DeployedPolicy, write_onnx
 
 
 def export(config: ExportConfig, output: str | None, out: Console) -> Path:
@@ -53,7 +53,7 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
         "control_period_s": run.experiment.car.control_period_s,
     }
     features = tuple(feature_names(run.experiment.observation))
-    comparison = write_onnx(DeployedPolicy(stored.networks, actions), features, facts, path)
+    difference = write_onnx(DeployedPolicy(stored.networks, actions), features, facts, path)
     out.print(f"{path}", soft_wrap=True)
     out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
     out.print(f"  observation  {len(features)} features, named in the file's metadata")
@@ -61,20 +61,16 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
     out.print(f"  policy       {what}")
     out.print("  command      steering in degrees, positive to the left; speed in m/s")
     out.print(
-        f"  checked      largest difference to the network {comparison.largest_difference:.1e} "
-        f"on {comparison.observations:,} observations"
+        f"  checked      largest difference to the network {difference:.1e} on {CHECKED:,} observations"
     )
     return path
 
 
 def _aws_logs(run: StoredRun, folder: Path, layout: str, out: Console) -> Path:
     recording = read_own_recording(run.path)
-    logs = write_aws_logs(recording, run.experiment, folder, layout)
+    notes = write_aws_logs(recording, run.experiment, folder, layout)
     out.print(f"{folder}", soft_wrap=True)
-    out.print(
-        f"  {logs.rows:,} rows, {logs.episodes:,} episodes, {logs.iterations:,} iterations, as {layout} has them"
-    )
-    for note in (*logs.notes, *map(str, recording.problems)):
+    for note in (*notes, *map(str, recording.problems)):
         out.print(f"  {note}", soft_wrap=True)
     return folder
 
@@ -87,11 +83,11 @@ def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
         raise BadInput(
             f"{source}: cannot be read: {error}; this is the reward the run was trained with"
         ) from error
-    files = aws_files(run.experiment, build_action_space(run.experiment.action_space), reward)
-    write_aws_files(files, folder)
-    for name in files.texts:
+    texts, notes = aws_files(run.experiment, build_action_space(run.experiment.action_space), reward)
+    write_texts(texts, folder)
+    for name in texts:
         out.print(f"{folder / name}", soft_wrap=True)
-    for note in files.notes:
+    for note in notes:
         out.print(f"  {note}", soft_wrap=True)
     for finding in console_findings(reward):
         out.print(f"  reward_function.py: the AWS console would reject it: {finding}", soft_wrap=True)

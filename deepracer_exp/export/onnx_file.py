@@ -1,11 +1,9 @@
 """Export a policy as ONNX: observation features in, action probabilities and command out."""
 
-import contextlib
 import json
 import logging
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from torch import Tensor, nn
 from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.files import atomic_write
 
 OBSERVATION, POLICY, COMMAND = "observation", "policy", "command"
 CHECKED = 1000
@@ -58,19 +57,10 @@ class DeployedPolicy(nn.Module):
         return policy, self.table[0] * (1.0 - share) + self.table[1] * share
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Difference between the file and the network."""
-
-    observations: int
-    largest_difference: float
-    """Of any element of `policy`."""
-
-
 def write_onnx(
     model: DeployedPolicy, features: tuple[str, ...], facts: Mapping[str, Any], path: Path
-) -> Comparison:
-    """Write the file and compare it with the network.
+) -> float:
+    """Write the file and return its largest difference from the network, on `CHECKED` observations.
 
     Args:
         model: the policy.
@@ -97,26 +87,22 @@ def write_onnx(
         {"features": json.dumps(features), **{key: json.dumps(value) for key, value in facts.items()}},
     )
     content = program.SerializeToString()
-    comparison = compare(model, content, len(features))
-    if not comparison.largest_difference <= TOLERANCE:
+    difference = largest_difference(model, content, len(features))
+    if not difference <= TOLERANCE:
         raise RunFailed(
-            f"the ONNX file differs from the network by {comparison.largest_difference:.3g} on {CHECKED} observations; "
+            f"the ONNX file differs from the network by {difference:.3g} on {CHECKED} observations; "
             f"at most {TOLERANCE:g} is rounding"
         )
-    aside = path.with_name(f".{path.name}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        aside.write_bytes(content)
-        aside.replace(path)
+        atomic_write(path, content)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            aside.unlink()
         raise BadInput(f"{path}: cannot be written: {error.strerror}") from error
-    return comparison
+    return difference
 
 
-def compare(model: DeployedPolicy, content: bytes, n_features: int) -> Comparison:
-    """Compare file and network on standard normal observations, the typical scale of the features."""
+def largest_difference(model: DeployedPolicy, content: bytes, n_features: int) -> float:
+    """Return how far any `policy` of a file is from the network's, on standard normal observations."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -126,7 +112,7 @@ def compare(model: DeployedPolicy, content: bytes, n_features: int) -> Compariso
     (theirs,) = session.run([POLICY], {OBSERVATION: observations.numpy()})
     with torch.no_grad():
         ours = model(observations)[0].numpy()
-    return Comparison(CHECKED, float(np.abs(theirs - ours).max()))
+    return float(np.abs(theirs - ours).max())
 
 
 def _program(model: DeployedPolicy, n_features: int) -> Any:

@@ -6,12 +6,12 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.export.aws_files import AwsFiles, aws_files, write_aws_files
+from deepracer_exp.export.aws_files import aws_files, write_texts
 
 REWARD = "def reward_function(params):\n    return params['speed']\n"
 
 
-def files(*overrides: str) -> AwsFiles:
+def files(*overrides: str) -> tuple[dict[str, str], list[str]]:
     experiment, _ = compose_experiment(overrides)
     return aws_files(experiment, build_action_space(experiment.action_space), REWARD)
 
@@ -24,8 +24,8 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
         *("algorithm.episodes_per_iteration=40", "algorithm.frames_per_iteration=null"),
         "algorithm.loss_type='mean squared error'",
     )
-    exported = files(*overrides)
-    write_aws_files(exported, tmp_path / "aws")
+    texts, notes = files(*overrides)
+    write_texts(texts, tmp_path / "aws")
     sent, _ = compose_experiment(overrides)
     back, _ = compose_experiment([f"custom_files={tmp_path / 'aws'}"])
     assert back.algorithm == sent.algorithm
@@ -35,7 +35,7 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
     for field in vars(ours):
         assert getattr(ours, field).tolist() == getattr(theirs, field).tolist()
     assert (tmp_path / "aws" / "reward_function.py").read_text() == REWARD
-    assert exported.notes == ()
+    assert notes == []
 
 
 @pytest.mark.parametrize(
@@ -50,21 +50,19 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
     ],
 )
 def test_values_beyond_the_console_are_clipped_and_reported(tmp_path, override, key, value):
-    exported = files("algorithm.batch_size=64", override)
-    write_aws_files(exported, tmp_path)
+    texts, notes = files("algorithm.batch_size=64", override)
+    write_texts(texts, tmp_path)
     learning = read_hyperparameters(tmp_path / "hyperparameters.json")
     assert getattr(learning, key) == value
     assert learning.beyond_console() == ()
-    assert any(
-        note.startswith(f"hyperparameters.json: {key}={value}, the nearest to") for note in exported.notes
-    )
+    assert any(note.startswith(f"hyperparameters.json: {key}={value}, the nearest to") for note in notes)
 
 
 def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_told():
-    exported = files("algorithm.batch_size=64")
-    assert json.loads(exported.texts["hyperparameters.json"])["num_episodes_between_training"] == 20
-    assert "num_episodes_between_training=20" in exported.notes[0]
-    assert "8192 control steps" in exported.notes[0]
+    texts, notes = files("algorithm.batch_size=64")
+    assert json.loads(texts["hyperparameters.json"])["num_episodes_between_training"] == 20
+    assert "num_episodes_between_training=20" in notes[0]
+    assert "8192 control steps" in notes[0]
 
 
 @pytest.mark.parametrize(
@@ -78,10 +76,10 @@ def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_told()
     ],
 )
 def test_an_action_space_beyond_the_console_is_kept_and_reported(overrides, words):
-    assert any(words in note for note in files(*overrides).notes)
+    assert any(words in note for note in files(*overrides)[1])
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match=r"file.*cannot be written"):
-        write_aws_files(files(), tmp_path / "file")
+        write_texts(files()[0], tmp_path / "file")
