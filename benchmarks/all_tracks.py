@@ -10,7 +10,6 @@ share of laps among the last 50 episodes, and the fastest lap of the whole train
 Seconds mean something with one job only; several share the cores.
 """
 
-import argparse
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +22,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 
 from .command import read_summary, train
-from .report import number, table, write_json
+from .report import benchmark_parser, number, table, write_json
 
 TRACKS = (
     "2022_summit_speedway",
@@ -89,14 +88,9 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        prog="benchmarks.all_tracks",
-    )
+    parser = benchmark_parser("all_tracks", __doc__, None)
     parser.add_argument("--jobs", type=int, default=1, help="trainings at the same time")
     parser.add_argument("--markdown", action="store_true", help="print nothing but the table")
-    parser.add_argument("--json", type=Path, help="also write the rows as JSON to this file")
     parser.add_argument(
         "chosen",
         nargs="*",

@@ -18,9 +18,9 @@ With `--long-gb` also a report of a text log of so many gigabytes, the longest l
 Wanted: at most 20 s and 1.5 GB on two cores for the 44,247 steps of the console training, `read_ratio` at least 1.
 """
 
-import argparse
 import logging
 import os
+import re
 import statistics
 import sys
 import tempfile
@@ -33,13 +33,15 @@ from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
 
 from .command import command_line
-from .long_log import write_long_log
-from .report import number, table, write_json
+from .report import benchmark_parser, number, table, write_json
 
 CONSOLE_TRAINING = Path(__file__).parents[2] / "shared/reference/console_training"
 WANTED = {"report_s": 20.0, "peak_gb": 1.5, "read_ratio": 1.0}
 """At most, at most, at least."""
 REPORTS = 3
+_STEP = re.compile(rb"(.*?SIM_TRACE_LOG:)(\d+),(.*)", re.DOTALL)
+_TIME = 13
+"""Place of the time stamp among the values behind the episode's number."""
 
 
 def report(path: Path, page: Path) -> tuple[float, float]:
@@ -112,6 +114,45 @@ def measure_long(path: Path, gigabytes: float) -> dict[str, float]:
     return {"long_gb": gigabytes, "long_steps": steps, "long_s": taken, "long_peak_gb": peak}
 
 
+def write_long_log(source: Path, target: Path, size_bytes: int) -> int:
+    """Write the log again and again, whole, until the target has the size; return the number of trace lines.
+
+    Lines that number episodes themselves are left out: they would tell other numbers than the steps.
+
+    Raises:
+        SystemExit: there is no trace line.
+    """
+    lines = [_taken_apart(line) for line in source.read_bytes().splitlines(keepends=True)]
+    if not any(isinstance(line, tuple) for line in lines):
+        raise SystemExit(f"{source}: no control step to be repeated")
+    episodes = 1 + max(line[1] for line in lines if isinstance(line, tuple))
+    times = [float(line[2][_TIME]) for line in lines if isinstance(line, tuple)]
+    lasting_s = max(times) - min(times) + 1.0
+    written = steps = 0
+    with target.open("wb") as file:
+        turn = 0
+        while written < size_bytes:
+            for line in lines:
+                if isinstance(line, bytes):
+                    written += file.write(line)
+                    continue
+                prefix, episode, values = line
+                time = values[_TIME]
+                later = b"%.3f%b" % (float(time) + turn * lasting_s, time[len(time.rstrip()) :])
+                told = [*values[:_TIME], later, *values[_TIME + 1 :]]
+                written += file.write(b"%b%d,%b" % (prefix, episode + turn * episodes, b",".join(told)))
+                steps += 1
+            turn += 1
+    return steps
+
+
+def _taken_apart(line: bytes) -> bytes | tuple[bytes, int, list[bytes]]:
+    step = _STEP.fullmatch(line)
+    if step is not None and step[3].count(b",") >= _TIME:
+        return step[1], int(step[2]), step[3].split(b",")
+    return b"" if b"Training> Name" in line else line
+
+
 def measure(path: Path, turns: int, long_gb: float) -> dict[str, Any]:
     """Return all figures."""
     reading = measure_reading(path, turns)
@@ -155,13 +196,10 @@ def show(figures: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.analysis"
-    )
+    parser = benchmark_parser("analysis", __doc__, None)
     parser.add_argument("--path", type=Path, default=CONSOLE_TRAINING, help="logs in a layout that both know")
     parser.add_argument("--turns", type=int, default=7, help="readings of each")
     parser.add_argument("--long-gb", type=float, default=0.0, help="size of a long log, none without")
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
     options = parser.parse_args(arguments)
     try:
         figures = measure(options.path, options.turns, options.long_gb)

@@ -26,6 +26,7 @@ from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .replay import Errors, errors, replay
+from .report import number, table
 
 Floats = NDArray[np.float64]
 
@@ -154,10 +155,10 @@ def write_car(car: CarConfig, name: str, fitted: Sequence[Parameter], path: Path
     path.write_text(text, encoding="utf-8")
 
 
-def table(before: CarConfig, after: CarConfig, parameters: Sequence[Parameter]) -> str:
+def parameter_table(before: CarConfig, after: CarConfig, parameters: Sequence[Parameter]) -> str:
     """Return what became of the parameters as text."""
     rows = [(p.key, f"{getattr(before, p.key):.5g}", f"{getattr(after, p.key):.5g}") for p in parameters]
-    return _lines([("parameter", "before", "after"), *rows])
+    return table(("parameter", "before", "after"), rows)
 
 
 def unphysical(car: CarConfig, parameters: Sequence[Parameter]) -> list[str]:
@@ -176,31 +177,19 @@ def unphysical(car: CarConfig, parameters: Sequence[Parameter]) -> list[str]:
 
 def error_table(before: CarConfig, after: CarConfig, recorded: Sequence[Windows]) -> str:
     """Return the median errors at the ends of windows of several lengths, on both parts of the recordings."""
-    rows: list[tuple[str, ...]] = [("error (m), median", "windows", "before", "after")]
+
+    def median_error(car: CarConfig, some: Windows) -> float | None:
+        return float(np.median(errors(replay(car, some), some).distance_m[:, -1])) if len(some) else None
+
+    rows = []
     for windows in recorded:
         held = held_out(windows.iteration)
         for part, chosen in (("fitted iterations", ~held), ("held-out iterations", held)):
             some = windows.choose(chosen)
             name = f"{windows.steps * before.control_period_s:.0f} s, {part}"
-            rows.append((name, str(len(some)), *(median_error(car, some) for car in (before, after))))
-    return _lines(rows)
-
-
-def median_error(car: CarConfig, windows: Windows) -> str:
-    """Return the median distance in metres at the ends of the windows, a dash where there is none."""
-    if not len(windows):
-        return "-"
-    return f"{np.median(errors(replay(car, windows), windows).distance_m[:, -1]):.3f}"
-
-
-def _lines(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in rows
-    )
+            off = (number(median_error(car, some), 3) for car in (before, after))
+            rows.append((name, str(len(some)), *off))
+    return table(("error (m), median", "windows", "before", "after"), rows)
 
 
 def car_named(name: str) -> CarConfig:
@@ -248,7 +237,7 @@ def run(options: argparse.Namespace) -> None:
     fitted = fit(
         car, sample, PARAMETERS, options.evaluations, lambda cost: print(f"cost {cost:.2f}", flush=True)
     )
-    print(f"\n{table(car, fitted, PARAMETERS)}\n\n{error_table(car, fitted, (windows, long))}")
+    print(f"\n{parameter_table(car, fitted, PARAMETERS)}\n\n{error_table(car, fitted, (windows, long))}")
     for line in unphysical(fitted, PARAMETERS):
         print(line)
     if options.output is not None:

@@ -12,7 +12,6 @@ Figures are means over seeds with Student's 95 % interval. Both clones have the 
 within a seed tell more than those of the means: `tenth_minus_same`, and how much faster than the parent each is.
 """
 
-import argparse
 import json
 import tempfile
 from collections.abc import Sequence
@@ -25,8 +24,7 @@ import yaml
 
 from .command import at_once, read_summary, train
 from .fresh import TRIALS, drive
-from .intervals import mean_and_interval
-from .report import number, table, write_json
+from .report import benchmark_parser, mean_and_interval, number, table, write_json
 
 POLICIES = ("parent", "tenth", "same")
 """The trained run, and its clones by their rate."""
@@ -111,17 +109,11 @@ def markdown(seeds: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        prog="benchmarks.clone",
-    )
+    parser = benchmark_parser("clone", __doc__)
     parser.add_argument("--seeds", type=int, default=5, help="number of parents, with the seeds 0, 1, ...")
     parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of a parent")
     parser.add_argument("--more", type=int, default=500_000, help="control steps of each clone")
     parser.add_argument("--jobs", type=int, default=2, help="seeds at once")
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
         places = {seed: Path(temporary) / str(seed) for seed in range(options.seeds)}

@@ -1,31 +1,26 @@
 """What each physics setting costs, and how far it ends from a 0.5 ms reference of the same model.
 
-    python -m benchmarks.physics_accuracy [--cars 64] [--json FILE] [--markdown]
+    python -m benchmarks.physics_accuracy [--cars 64] [--json FILE]
 
 Every setting drives the same cars with the same random commands. A setting that changes the model (wheel
 shape, contact stiffness, slip) is held against a reference of that model. Costs are taken in turns, so that
 their ratios within one run are fair.
 """
 
-import argparse
 import dataclasses
-import json
-import os
-import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.sim.batch import CarBatch
 
-CAR_FILE = Path(__file__).parents[1] / "conf/car/deepracer.yaml"
+from .report import benchmark_parser, number, table, write_json
+
 SECONDS = 10
 REFERENCE_STEP_S = 0.0005
 MODEL_KEYS = ("wheel_contact", "contact_time_s", "contact_impedance", "rear_slip_time_s")
@@ -45,15 +40,8 @@ SETTINGS: tuple[dict[str, Any], ...] = (
     *({"contact_time_s": seconds} for seconds in (0.03, 0.05)),
     *({"rear_slip_time_s": seconds} for seconds in (0.04, 0.06)),
     # MuJoCo's own contact stiffness needs a step of at most 10 ms.
-    *(
-        {
-            "contact_time_s": 0.02,
-            "contact_impedance": 0.9,
-            "substeps": 10,
-            **more,
-        }
-        for more in ({}, {"solver_iterations": 8})
-    ),
+    {"contact_time_s": 0.02, "contact_impedance": 0.9, "substeps": 10},
+    {"contact_time_s": 0.02, "contact_impedance": 0.9, "substeps": 10, "solver_iterations": 8},
     {"wheel_contact": "ellipsoid"},
     {"wheel_contact": "cylinder"},
 )
@@ -107,7 +95,7 @@ def costs_us(cars: list[CarConfig], speed: Array, steering: Array, rounds: int) 
 
 def measure(n_cars: int, rounds: int) -> list[dict[str, Any]]:
     """Measure every setting; errors in metres, median and 90th percentile over cars."""
-    default = TypeAdapter(CarConfig).validate_python(yaml.safe_load(CAR_FILE.read_text()))
+    default = compose_experiment(["car=deepracer"])[0].car
     steps = int(SECONDS * default.control_hz)
     speed, steering = commands(n_cars, steps)
     references: dict[tuple[Any, ...], Array] = {}
@@ -132,7 +120,6 @@ def measure(n_cars: int, rounds: int) -> list[dict[str, Any]]:
         driven = path(car, speed, steering)
         row: dict[str, Any] = {
             "setting": ", ".join(f"{key}={value}" for key, value in change.items()) or "default",
-            **{f.name: getattr(car, f.name) for f in dataclasses.fields(car) if f.name in PHYSICS_KEYS},
         }
         for seconds in (1, SECONDS):
             at = int(seconds * default.control_hz) - 1
@@ -149,54 +136,37 @@ def measure(n_cars: int, rounds: int) -> list[dict[str, Any]]:
     return rows
 
 
-PHYSICS_KEYS = (
-    "substeps",
-    "integrator",
-    "solver",
-    "solver_iterations",
-    "line_search_iterations",
-    *MODEL_KEYS,
-)
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return the rows as a Markdown table."""
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """Return the table of the settings."""
     head = (
         "setting (otherwise default)",
         "after 1 s: median, p90 (mm)",
         "after 10 s: median, p90 (mm)",
         "µs",
     )
-    lines = [head, ("---", "---:", "---:", "---:")]
-    for row in rows:
-        errors = [
-            "blows up"
-            if row[f"median_{s}s_m"] is None
-            else f"{1e3 * row[f'median_{s}s_m']:.1f}, {1e3 * row[f'p90_{s}s_m']:.1f}"
-            for s in (1, SECONDS)
-        ]
-        cost = f"{row['us_per_step']:.1f}" if "us_per_step" in row else ""
-        lines.append((row["setting"], *errors, cost))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+    def error(row: dict[str, Any], seconds: int) -> str:
+        median, high = row[f"median_{seconds}s_m"], row[f"p90_{seconds}s_m"]
+        return "blows up" if median is None else f"{1e3 * median:.1f}, {1e3 * high:.1f}"
+
+    return table(
+        head,
+        [
+            (row["setting"], error(row, 1), error(row, SECONDS), number(row.get("us_per_step"), 1))
+            for row in rows
+        ],
+    )
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = benchmark_parser("physics_accuracy", __doc__, None)
     parser.add_argument("--cars", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=60, help="timed control steps per setting")
-    parser.add_argument("--json", type=Path, help="also write the rows as JSON to this file")
-    parser.add_argument("--markdown", action="store_true", help="print nothing but the table")
     options = parser.parse_args()
     rows = measure(options.cars, options.rounds)
-    if not options.markdown:
-        cores = len(os.sched_getaffinity(0))
-        sys.stdout.write(
-            f"{options.cars} cars, {SECONDS} s; cost per control step and car, one of {cores} cores\n"
-        )
-    sys.stdout.write(table(rows) + "\n")
-    if options.json:
-        options.json.write_text(json.dumps({"settings": rows}, indent=2) + "\n")
+    print(markdown(rows))
+    write_json(options.json, {"settings": rows, "cars": options.cars})
 
 
 if __name__ == "__main__":

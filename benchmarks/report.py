@@ -1,5 +1,6 @@
-"""What all benchmarks share: tables, medians, JSON files."""
+"""What all benchmarks share: arguments, tables, means, JSON files."""
 
+import argparse
 import json
 import math
 import os
@@ -8,6 +9,23 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from scipy.stats import ttest_1samp
+
+CONFIDENCE = 0.95
+
+
+def benchmark_parser(name: str, doc: str | None, command: str | None = "train") -> argparse.ArgumentParser:
+    """Return a parser with --json and, unless `command` is None, overrides for that command of deepracer-exp."""
+    parser = argparse.ArgumentParser(
+        prog=f"benchmarks.{name}", description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    if command is not None:
+        what = f"as for deepracer-exp {command}"
+        parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help=what)
+    return parser
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -34,6 +52,29 @@ def median(values: Sequence[float | None]) -> float | None:
 def number(value: float | None, digits: int = 0) -> str:
     """Return a number for a table, a dash for None."""
     return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def percent(share: float | None, digits: int = 0) -> str:
+    """Return a share for a table."""
+    return "-" if share is None else f"{share:.{digits}%}"
+
+
+def mean_and_interval(
+    values: Sequence[float | None], digits: int = 4
+) -> dict[str, float | list[float] | None]:
+    """Return `mean` and `interval` of the values that are known, for JSON.
+
+    Runs differ by their seeds only, and there are few of them: Student's interval of the mean. It is None with fewer
+    than two values, the mean with none.
+    """
+    known = np.array([value for value in values if value is not None])
+    if len(known) < 2:
+        return {"mean": round(float(known[0]), digits) if len(known) else None, "interval": None}
+    mean = float(known.mean())
+    if np.ptp(known) == 0:  # no interval is defined for what does not vary
+        return {"mean": round(mean, digits), "interval": [round(mean, digits)] * 2}
+    low, high = ttest_1samp(known, 0.0).confidence_interval(CONFIDENCE)
+    return {"mean": round(mean, digits), "interval": [round(float(low), digits), round(float(high), digits)]}
 
 
 def machine() -> dict[str, Any]:

@@ -14,7 +14,6 @@ end before its moment, everything is put back as it was before that process, and
 drawn.
 """
 
-import argparse
 import contextlib
 import json
 import os
@@ -34,7 +33,7 @@ from typing import Any
 import psutil
 
 from .command import command_line, read_metrics
-from .report import machine, table, write_json
+from .report import benchmark_parser, machine, table, write_json
 from .same import different_points, different_rows, different_tensors, different_traces
 
 # 300 iterations of a tenth of a second: checkpoints are a second apart, so that killed processes get somewhere.
@@ -248,15 +247,9 @@ def _hit(run: Path | None, before: int, iterations: int, since: float) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        prog="benchmarks.resume",
-    )
+    parser = benchmark_parser("resume", __doc__)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0, help="of the moments, not of the run")
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     options = parser.parse_args(arguments)
     # What it starts is in sessions of its own, and must not outlive it.
     signal.signal(signal.SIGTERM, lambda signum, _: sys.exit(128 + signum))

@@ -49,8 +49,7 @@ from deepracer_exp.training.stopping_replay import replay
 
 from .command import at_once, read_metrics, read_summary, train
 from .fresh import TRIALS, Driven, drive
-from .intervals import mean_and_interval
-from .report import number, table, write_json
+from .report import benchmark_parser, mean_and_interval, number, percent, table, write_json
 from .same import different_rows
 
 TRACKS = ("reinvent_base", "Oval_track", "Spain_track")
@@ -199,18 +198,9 @@ def markdown(runs: Sequence[dict[str, Any]]) -> str:
     return table((*head, *completion), [*rows, means("all", runs)])
 
 
-def percent(share: float | None, digits: int = 0) -> str:
-    """Return a share for a table."""
-    return "-" if share is None else f"{share:.{digits}%}"
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        prog="benchmarks.stopping",
-    )
+    parser = benchmark_parser("stopping", __doc__)
     parser.add_argument("--seeds", type=int, default=5, help="runs on each track")
     parser.add_argument("--first-seed", type=int, default=0, help="the others follow it")
     parser.add_argument("--tracks", default=",".join(TRACKS), help="options of the group track")
@@ -220,8 +210,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--reuse", type=Path, metavar="DIR", help="keep runs here, and take the finished ones"
     )
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
         result = benchmark(options, (options.reuse or Path(temporary)).resolve())

@@ -25,9 +25,7 @@ on `sweep.rerank_laps` more laps. For the sweep itself this must be the winner t
 - `steps_saved`: share of the control steps without pruning that were not needed;
 - `lap_time_loss`: how much slower the winner's mean lap is than that of the winner without pruning, as a share;
 - `best`: its trial, its value (the race score in seconds) in the sweep and on the re-ranking's laps, and its laps;
-- `rivals`: the same of `no_pruning`, `median` and `hyperband`; each with `at_equal_steps`, the winners of both among
-  what was found when as many steps were driven as the more frugal one needed for all trials, and how much slower
-  the sweep's winner is then (`lap_time_loss`, below zero: faster).
+- `rivals`: the same of `no_pruning`, `median` and `hyperband`.
 
 `--reuse DIR` leaves everything in DIR (35 MB a trial, mostly traces), resumes a sweep that was interrupted and reuses
 the finished runs in it. `minutes` is then the time of all starts of the sweep; `starts` counts them.
@@ -38,7 +36,7 @@ import collections
 import json
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,12 +44,10 @@ from typing import Any
 import optuna
 import torch
 from optuna.pruners import NopPruner
-from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from deepracer_exp.config.compose import compose_evaluation
-from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.config.sweep import Pruner, SweepConfig, compose_sweep
+from deepracer_exp.config.sweep import Pruner, compose_sweep
 from sweeps.best import best_trial
 from sweeps.objectives import cost
 from sweeps.pruners import build_pruner
@@ -61,14 +57,17 @@ from sweeps.study import load_study
 
 from .command import at_once
 from .fresh import TRIALS, Driven, drive
-from .pruning_replay import Course, Ended, Pace, found_within, makespan_s, replay
-from .report import number, table, write_json
-from .stopping import lap_time_loss, percent
+from .report import benchmark_parser, number, percent, table, write_json
+from .stopping import lap_time_loss
 from .sweep_runs import (
+    Course,
+    Ended,
     course_of,
     hold_against,
+    makespan_s,
     pace_of,
     refuse_others,
+    replay,
     score,
     started,
     whole_run,
@@ -77,23 +76,8 @@ from .sweep_runs import (
 READY = ("sweep=lr_entropy", "track=reinvent_base")
 OWN, NO_PRUNING = "sweep", "no_pruning"
 RIVALS: tuple[Pruner, ...] = ("median", "hyperband")
-WANTED = {
-    "trials_per_hour": 90,
-    "steps_saved": 0.5,
-    "lap_time_loss": 0.02,
-    "lap_time_loss_at_equal_steps": 0.0,
-}
-"""60 trials in 40 minutes and half of the steps, at least; the losses at most."""
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A way to make the trials, and what became of them."""
-
-    ended: Sequence[Ended]
-    minutes: float
-    runs: dict[int, Path]
-    """By number of the trial."""
+WANTED = {"trials_per_hour": 90, "steps_saved": 0.5, "lap_time_loss": 0.02}
+"""60 trials in 40 minutes and half of the steps, at least; the loss at most."""
 
 
 def winner_of(found: Sequence[Ended], objective: str, rerank: int, again: Callable[[Ended], float]) -> Ended:
@@ -114,14 +98,6 @@ def winner_of(found: Sequence[Ended], objective: str, rerank: int, again: Callab
     return min(first[:rerank], key=lambda one: cost([objective], [again(one)])) if rerank else first[0]
 
 
-def steps_by_outcome(ended: Sequence[Ended]) -> dict[str, int]:
-    """Return the control steps of the trials by how they ended."""
-    steps: dict[str, int] = collections.defaultdict(int)
-    for one in ended:
-        steps[one.outcome] += one.env_steps
-    return dict(sorted(steps.items()))
-
-
 def figures(ended: Sequence[Ended], minutes: float, unpruned: Sequence[Ended]) -> dict[str, Any]:
     """Return what a way to make the trials came to, without its laps.
 
@@ -131,130 +107,50 @@ def figures(ended: Sequence[Ended], minutes: float, unpruned: Sequence[Ended]) -
         unpruned: the same trials without pruning.
     """
     steps, every = (sum(one.env_steps for one in each) for each in (ended, unpruned))
+    by_outcome: dict[str, int] = collections.defaultdict(int)
+    for one in ended:
+        by_outcome[one.outcome] += one.env_steps
     return {
         "minutes": round(minutes, 2),
         "trials_per_hour": round(60 * len(ended) / minutes, 1),
         "env_steps": steps,
-        "steps_by_fate": steps_by_outcome(ended),
+        "steps_by_fate": dict(sorted(by_outcome.items())),
         "trials_by_fate": dict(sorted(collections.Counter(one.outcome for one in ended).items())),
         "steps_saved": round(1 - steps / every, 4),
     }
 
 
-def held(result: dict[str, Any]) -> dict[str, bool]:
-    """Return what came out as wanted; a winner without a lap has not."""
-
-    def at_most(loss: float | None, most: float) -> bool:
-        return loss is not None and loss <= most
-
-    equal = [result["rivals"][rival]["at_equal_steps"]["lap_time_loss"] for rival in RIVALS]
-    return {
-        "trials_per_hour": result["trials_per_hour"] >= WANTED["trials_per_hour"],
-        "steps_saved": result["steps_saved"] >= WANTED["steps_saved"],
-        "lap_time_loss": at_most(result["lap_time_loss"], WANTED["lap_time_loss"]),
-        "lap_time_loss_at_equal_steps": all(
-            at_most(loss, WANTED["lap_time_loss_at_equal_steps"]) for loss in equal
-        ),
-    }
-
-
 def markdown(result: dict[str, Any]) -> str:
     """Return the table of the sweep and its rivals, and that of the steps by outcome."""
-    ways = {OWN: result, **result["rivals"]}
-    head = (
-        "pruning",
-        "minutes",
-        "trials/h",
-        "steps (M)",
-        "saved",
-        "winner",
-        "value",
-        "lap (s)",
-        "laps done",
-        "loss",
-    )
-    rows = []
-    for name, one in ways.items():
-        equal, best = one.get("at_equal_steps"), one["best"]
-        rows.append(
-            (
-                name.replace("_", " "),
-                number(one["minutes"], 1),
-                number(one["trials_per_hour"]),
-                number(one["env_steps"] / 1e6, 2),
-                percent(one["steps_saved"]),
-                str(best["trial"]),
-                number(best["value_again"], 2),
-                number(best["lap_time_s"], 2),
-                percent(best["lap_share"]),
-                percent(one["lap_time_loss"], 1),
-                "-" if equal is None else number(equal["env_steps"] / 1e6, 2),
-                "-" if equal is None else number(equal["lap_time_s"], 2),
-                "-" if equal is None else number(equal["sweep_lap_time_s"], 2),
-            )
+    ways = {name.replace("_", " "): one for name, one in {OWN: result, **result["rivals"]}.items()}
+    head = ("pruning", "minutes", "trials/h", "steps (M)", "saved", "winner", "value", "lap (s)", "laps done")
+    rows = [
+        (
+            name,
+            number(one["minutes"], 1),
+            number(one["trials_per_hour"]),
+            number(one["env_steps"] / 1e6, 2),
+            percent(one["steps_saved"]),
+            str(one["best"]["trial"]),
+            number(one["best"]["value_again"], 2),
+            number(one["best"]["lap_time_s"], 2),
+            percent(one["best"]["lap_share"]),
+            percent(one["lap_time_loss"], 1),
         )
+        for name, one in ways.items()
+    ]
     outcomes = sorted({outcome for one in ways.values() for outcome in one["steps_by_fate"]})
     spent = [
         (
-            name.replace("_", " "),
+            name,
             *(
-                f"{one['trials_by_fate'].get(f, 0)}: {one['steps_by_fate'].get(f, 0) / 1e6:.2f} M"
-                for f in outcomes
+                f"{one['trials_by_fate'].get(each, 0)}: {one['steps_by_fate'].get(each, 0) / 1e6:.2f} M"
+                for each in outcomes
             ),
         )
         for name, one in ways.items()
     ]
-    at_equal = ("at steps (M)", "its lap (s)", "the sweep's (s)")
-    return f"{table((*head, *at_equal), rows)}\n\n{table(('trials: steps', *outcomes), spent)}"
-
-
-def contenders(
-    trials: Sequence[FrozenTrial],
-    courses: Sequence[Course],
-    config: SweepConfig,
-    measured_s: float,
-    runs: tuple[dict[int, Path], dict[int, Path]],
-    direction: StudyDirection,
-    study_name: str,
-) -> tuple[dict[str, Contender], Pace]:
-    """Return all ways to make the trials, the sweep's own first, and the pace of all.
-
-    Args:
-        trials: of the sweep.
-        courses: their whole runs.
-        config: of the sweep.
-        measured_s: that the sweep took.
-        runs: of the sweep, and the whole ones.
-        direction: of the values.
-        study_name: of the sweep.
-    """
-    pace, workers = pace_of(trials), config.workers or 1
-    again = partial(replay, pace=pace, workers=workers, direction=direction, study_name=study_name)
-    own = [
-        Course(
-            number=trial.number,
-            points=(),
-            env_steps=trial.user_attrs["env_steps"],
-            outcome=trial.user_attrs["fate"],
-            value=trial.values[0] if trial.state == TrialState.COMPLETE else None,
-        )
-        for trial in trials
-    ]
-    evaluations = max(len(course.points) for course in courses) or None
-    ended = {OWN: again(own, NopPruner(), ""), NO_PRUNING: again(courses, NopPruner(), "")}
-    for name in RIVALS:
-        pruner = build_pruner(replace(config, pruners=(name,)), evaluations)
-        ended[name] = again(courses, pruner, name)
-    # Start, re-ranking and page, and what the model of the workers leaves out.
-    besides_s = max(measured_s - makespan_s(ended[OWN]), 0.0)
-    return {
-        name: Contender(
-            each,
-            (measured_s if name == OWN else makespan_s(each) + besides_s) / 60,
-            runs[0] if name == OWN else runs[1],
-        )
-        for name, each in ended.items()
-    }, pace
+    return f"{table((*head, 'loss'), rows)}\n\n{table(('trials: steps', *outcomes), spent)}"
 
 
 def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -272,120 +168,100 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     study = load_study(request.study, open_storage(config.storage, folder / "runs"))
     # Without those whose worker was killed while it created them.
     trials = [trial for trial in study.get_trials(deepcopy=False) if "runs" in trial.user_attrs]
-    places = {
+    own_runs = {
         trial.number: folder / "runs" / request.study / Path(trial.user_attrs["run_dir"] or "").name
         for trial in trials
     }
     cut_short = [trial.number for trial in trials if trial.user_attrs["fate"] not in ("finished", "failed")]
-    gone_on = at_once(
+    resumed = at_once(
         options.workers,
-        [partial(whole_run, places[number], folder / "whole" / f"{number:03d}") for number in cut_short],
+        [partial(whole_run, own_runs[number], folder / "whole" / f"{number:03d}") for number in cut_short],
     )
-    fulls = places | dict(zip(cut_short, gone_on, strict=True))
-    courses = []
-    for trial in trials:
-        courses.append(course_of(trial.number, fulls[trial.number], objective, protocol))
-        hold_against(trial, courses[-1])
-    ways, pace = contenders(
-        trials, courses, config, noted["seconds"], (places, fulls), study.direction, request.study
+    whole_runs = own_runs | dict(zip(cut_short, resumed, strict=True))
+    courses = [course_of(trial.number, whole_runs[trial.number], objective, protocol) for trial in trials]
+    for trial, course in zip(trials, courses, strict=True):
+        hold_against(trial, course)
+
+    own = [
+        Course(
+            number=trial.number,
+            points=(),
+            env_steps=trial.user_attrs["env_steps"],
+            outcome=trial.user_attrs["fate"],
+            value=trial.values[0] if trial.state == TrialState.COMPLETE else None,
+        )
+        for trial in trials
+    ]
+    again = partial(
+        replay,
+        pace=pace_of(trials),
+        workers=config.workers or 1,
+        direction=study.direction,
+        study_name=request.study,
     )
-    result = compared(ways, pace, config, protocol, options.laps)
+    ended = {OWN: again(own, NopPruner(), ""), NO_PRUNING: again(courses, NopPruner(), "")}
+    evaluations = max(len(course.points) for course in courses) or None
+    for rival in RIVALS:
+        ended[rival] = again(courses, build_pruner(replace(config, pruners=(rival,)), evaluations), rival)
+    # Start, re-ranking and page, and what the model of the workers leaves out.
+    besides_s = max(noted["seconds"] - makespan_s(ended[OWN]), 0.0)
+
+    test = fresh(protocol, config.rerank_laps)
+    driven: dict[Path, Driven] = {}
+    found: dict[str, dict[str, Any]] = {}
+    for name, each in ended.items():
+        runs = own_runs if name == OWN else whole_runs
+
+        def value_again(one: Ended, runs: dict[int, Path] = runs) -> float:
+            return score(runs[one.number], objective, test)
+
+        won = winner_of([one for one in each if one.value is not None], objective, config.rerank, value_again)
+        run = runs[won.number]
+        if run not in driven:
+            checkpoint = "best" if (run / "checkpoints" / "best").exists() else "last"
+            (driven[run],) = drive(run, [checkpoint], options.laps)
+        seconds = noted["seconds"] if name == OWN else makespan_s(each) + besides_s
+        best = {"trial": won.number, "value": won.value, "value_again": value_again(won)}
+        found[name] = {
+            **figures(each, seconds / 60, ended[NO_PRUNING]),
+            "best": {**best, **asdict(driven[run])},
+            "laps_of": driven[run],
+        }
+    unpruned = found[NO_PRUNING]["laps_of"]
+    for one in found.values():
+        one["lap_time_loss"] = lap_time_loss(one.pop("laps_of"), unpruned)
     winner = best_trial(study).number
-    if result["best"]["trial"] != winner:
+    if found[OWN]["best"]["trial"] != winner:
         raise SystemExit(
-            f"the sweep says that trial {winner} has won, this benchmark {result['best']['trial']}"
+            f"the sweep says that trial {winner} has won, this benchmark {found[OWN]['best']['trial']}"
         )
     return {
-        **result,
+        **found.pop(OWN),
+        "rivals": found,
         "wanted": WANTED,
-        "held": held(result),
         "trials": len(trials),
         "workers": options.workers,
         "starts": noted["starts"],
         "overrides": overrides,
         "laps": options.laps,
-        "pace": asdict(pace),
-        "ended": {name: [asdict(one) for one in way.ended] for name, way in ways.items()},
+        "ended": {name: [asdict(one) for one in each] for name, each in ended.items()},
     }
-
-
-def compared(
-    ways: dict[str, Contender], pace: Pace, config: SweepConfig, protocol: EvaluationConfig, laps: int
-) -> dict[str, Any]:
-    """Return the figures of all ways, with the laps of their winners."""
-    (objective,) = config.objectives
-    test = fresh(protocol, config.rerank_laps)
-    driven: dict[Path, Driven] = {}
-
-    def best(way: Contender, found: Sequence[Ended]) -> tuple[Ended, Driven]:
-        won = winner_of(
-            found, objective, config.rerank, lambda one: score(way.runs[one.number], objective, test)
-        )
-        run = way.runs[won.number]
-        if run not in driven:
-            checkpoint = "best" if (run / "checkpoints" / "best").exists() else "last"
-            (driven[run],) = drive(run, [checkpoint], laps)
-        return won, driven[run]
-
-    unpruned = ways[NO_PRUNING]
-    every = {
-        name: best(way, [one for one in way.ended if one.value is not None]) for name, way in ways.items()
-    }
-    found_by_way: dict[str, dict[str, Any]] = {}
-    for name, way in ways.items():
-        won, laps_of = every[name]
-        found_by_way[name] = {
-            **figures(way.ended, way.minutes, unpruned.ended),
-            "lap_time_loss": lap_time_loss(laps_of, every[NO_PRUNING][1]),
-            "best": {
-                "trial": won.number,
-                "value": won.value,
-                "value_again": score(way.runs[won.number], objective, test),
-                **asdict(laps_of),
-            },
-        }
-        if name == OWN:
-            continue
-        steps = min(found_by_way[OWN]["env_steps"], found_by_way[name]["env_steps"])
-        pairs = [found_within(each.ended, steps, pace) for each in (way, ways[OWN])]
-        if not all(pairs):
-            found_by_way[name]["at_equal_steps"] = {
-                "env_steps": steps,
-                "lap_time_s": None,
-                "sweep_lap_time_s": None,
-            }
-            found_by_way[name]["at_equal_steps"]["lap_time_loss"] = None
-            continue
-        (rival, rivals), (mine, own) = best(way, pairs[0]), best(ways[OWN], pairs[1])
-        found_by_way[name]["at_equal_steps"] = {
-            "env_steps": steps,
-            "trial": rival.number,
-            "lap_time_s": rivals.lap_time_s,
-            "sweep_trial": mine.number,
-            "sweep_lap_time_s": own.lap_time_s,
-            "lap_time_loss": lap_time_loss(own, rivals),
-        }
-    return {**found_by_way.pop(OWN), "rivals": found_by_way}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sweep"
-    )
+    parser = benchmark_parser("sweep", __doc__, "sweep")
     parser.add_argument("--trials", type=int, default=60, help="of the sweep")
     parser.add_argument("--workers", type=int, default=2, help="of the sweep, and trainings that run at once")
     parser.add_argument("--laps", type=int, default=TRIALS, help="fresh laps that each winner drives")
     parser.add_argument(
         "--reuse", type=Path, metavar="DIR", help="keep everything here, and resume what is there"
     )
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp sweep")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as temporary:
         result = benchmark(options, (options.reuse or Path(temporary)).resolve())
     write_json(options.json, result)
-    print(f"\n{markdown(result)}\n\nwanted: {WANTED}\nheld: {result['held']}")
+    print(f"\n{markdown(result)}\n\nwanted: {WANTED}")
     print(json.dumps({key: value for key, value in result.items() if key != "ended"}))
 
 

@@ -1,16 +1,27 @@
-"""The runs of a sweep, and the same trials trained to the end of their budget."""
+"""The runs of a sweep, the same trials trained to the end of their budget, and what another pruner makes of these.
+
+A pruner sees nothing of a trial but the values it reports and their steps. So the values of a complete training,
+reported to a study in memory step by step, give the decisions that the pruner would have made during that training; a
+pruned training is the beginning of the complete one. Which values there are to compare with depends on what the other
+workers do at the same time: each worker is modelled by how long its trials take, at the measured pace.
+"""
 
 import contextlib
+import heapq
 import json
 import shutil
 import statistics
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from optuna.trial import FrozenTrial
+import optuna
+from optuna.pruners import BasePruner
+from optuna.study import StudyDirection
+from optuna.trial import FrozenTrial, Trial, TrialState
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
@@ -22,12 +33,126 @@ from deepracer_exp.training.callbacks import BUDGET_REACHED
 from sweeps.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary
-from .pruning_replay import Course, Pace
 
 _LEFT_BEHIND = ("trace", TRACKING)
 """Of a trial's run: most of its bytes, and its run in MLflow."""
 _NOTED, _SCORES = "sweep_started.json", "scores.json"
 _NOTE_S = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """A trial without pruning."""
+
+    number: int
+    points: tuple[tuple[int, float], ...]
+    """(env steps, value) of each evaluation before its end."""
+    env_steps: int
+    """At its end."""
+    outcome: str
+    """How it ends by itself."""
+    value: float | None
+    """Its value then; None: it failed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How long trials take."""
+
+    step_s: float
+    """A control step of one worker, learning included."""
+    trial_s: float
+    """The rest of a trial, seconds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ended:
+    """A trial that has ended."""
+
+    number: int
+    outcome: str
+    env_steps: int
+    value: float | None
+    """None: it was pruned, or failed."""
+    began_s: float
+    """Since the start of the sweep."""
+    ended_s: float
+
+
+def replay(
+    courses: Sequence[Course],
+    pruner: BasePruner,
+    outcome: str,
+    *,
+    pace: Pace,
+    workers: int,
+    direction: StudyDirection = StudyDirection.MINIMIZE,
+    study_name: str = "replay",
+) -> list[Ended]:
+    """Replay trials with a pruner; return them in their order.
+
+    Args:
+        courses: in the order in which they begin.
+        pruner: asked after each evaluation.
+        outcome: of the trials that it prunes.
+        pace: of all workers.
+        workers: how many trials run at once; the first free one takes the next trial.
+        direction: of the values.
+        study_name: chooses Hyperband's brackets, with the trial's number.
+    """
+    study = optuna.create_study(study_name=study_name, pruner=pruner, direction=direction)
+    waiting, ended = iter(courses), list[Ended]()
+    lines = [_worker(study, waiting, outcome, pace, ended) for _ in range(workers)]
+    moments = [(0.0, place) for place in range(workers)]
+    while moments:
+        _, place = heapq.heappop(moments)
+        moment_s = next(lines[place], None)
+        if moment_s is not None:
+            heapq.heappush(moments, (moment_s, place))
+    return sorted(ended, key=lambda one: one.number)
+
+
+def _worker(
+    study: optuna.Study, waiting: Iterator[Course], outcome: str, pace: Pace, ended: list[Ended]
+) -> Iterator[float]:
+    """Make trial after trial; yield the time of the next event, which happens at the next call."""
+    now_s = 0.0
+    for course in waiting:
+        trial, began_s, pruned_at = study.ask(), now_s, None
+        for step, (env_steps, value) in enumerate(course.points, 1):
+            yield began_s + env_steps * pace.step_s
+            trial.report(value, step)
+            if trial.should_prune():
+                pruned_at = env_steps
+                break
+        env_steps = course.env_steps if pruned_at is None else pruned_at
+        now_s = began_s + env_steps * pace.step_s + pace.trial_s
+        yield now_s
+        _report(study, trial, course, pruned_at is not None)
+        ended.append(
+            Ended(
+                number=course.number,
+                outcome=course.outcome if pruned_at is None else outcome,
+                env_steps=env_steps,
+                value=course.value if pruned_at is None else None,
+                began_s=began_s,
+                ended_s=now_s,
+            )
+        )
+
+
+def _report(study: optuna.Study, trial: Trial, course: Course, pruned: bool) -> None:
+    if pruned:
+        study.tell(trial, state=TrialState.PRUNED)
+    elif course.value is None:
+        study.tell(trial, state=TrialState.FAIL)
+    else:
+        study.tell(trial, course.value)
+
+
+def makespan_s(ended: Sequence[Ended]) -> float:
+    """Return when the last trial ended."""
+    return max((one.ended_s for one in ended), default=0.0)
 
 
 def started(overrides: Sequence[str], folder: Path) -> dict[str, Any]:
@@ -122,27 +247,17 @@ def hold_against(trial: FrozenTrial, course: Course) -> None:
     Raises:
         SystemExit: naming the trial and the difference.
     """
-    outcome = trial.user_attrs["fate"]
+    outcome, until = trial.user_attrs["fate"], trial.user_attrs["env_steps"]
     if outcome == "failed":
         return
-    refuse_other_reports(trial, course)
-    if outcome == "finished" and trial.values[0] != course.value:
-        raise SystemExit(
-            f"trial {trial.number}: had the value {trial.values[0]} and has {course.value} again"
-        )
-
-
-def refuse_other_reports(trial: FrozenTrial, course: Course) -> None:
-    """Compare what a trial reported to Optuna with what its complete run reports.
-
-    Raises:
-        SystemExit: they differ.
-    """
-    until = trial.user_attrs["env_steps"]
     reports = {step: value for step, (at, value) in enumerate(course.points, 1) if at <= until}
     if trial.intermediate_values != reports:
         raise SystemExit(
             f"trial {trial.number}: reported {trial.intermediate_values} to Optuna, its complete run reports {reports}"
+        )
+    if outcome == "finished" and trial.values[0] != course.value:
+        raise SystemExit(
+            f"trial {trial.number}: had the value {trial.values[0]} and has {course.value} again"
         )
 
 

@@ -24,7 +24,6 @@ iterations as collection alone would do in that time). Figures are medians over 
 the rounds' ratios.
 """
 
-import argparse
 import dataclasses
 import functools
 import json
@@ -51,7 +50,7 @@ from deepracer_exp.env.setup import build_setup
 from .all_tracks import TRACKS
 from .command import read_metrics, train
 from .driving import SameDriving
-from .report import machine, number, table, write_json
+from .report import benchmark_parser, machine, number, table, write_json
 
 Rates = dict[str, list[float]]
 """Steps per second of each round, by figure."""
@@ -207,16 +206,10 @@ def show(summary: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        prog="benchmarks.throughput",
-    )
+    parser = benchmark_parser("throughput", __doc__)
     parser.add_argument("--seconds", type=float, default=3.0, help="of each figure in each round")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--cars", type=int, default=256, help="of physics_steps_per_s and env_steps_per_s")
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     args = parser.parse_args(arguments)
     experiment, _ = compose_experiment(args.overrides)
     start_workers_early(True)  # as the command does

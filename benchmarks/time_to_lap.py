@@ -14,14 +14,13 @@ and start of the workers included) and are read from its summary.json:
 Steps are control steps over all cars. The median counts null as longer than anything.
 """
 
-import argparse
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from .command import read_summary, train
-from .report import median, number, table, write_json
+from .report import benchmark_parser, median, number, table, write_json
 
 WANTED_S = {"first_lap_s": 20.0, "reliable_s": 120.0}
 """Medians to stay below on two cores."""
@@ -46,14 +45,8 @@ def measure(seed: int, overrides: Sequence[str]) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        prog="benchmarks.time_to_lap",
-    )
+    parser = benchmark_parser("time_to_lap", __doc__)
     parser.add_argument("--seeds", type=int, default=3, help="number of runs, with the seeds 0, 1, ...")
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     options = parser.parse_args(arguments)
     seeds = []
     for seed in range(options.seeds):

@@ -227,7 +227,7 @@ def test_bad_input_is_refused_in_one_line_before_the_fit(
 
 @pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of the AWS console are not here")
 def test_the_fitted_car_predicts_held_out_recordings_and_the_bicycle_does_not(tmp_path):
-    from benchmarks.simple_cars import bicycle
+    from benchmarks.fidelity import bicycle
 
     for iteration in (11, 23):
         shutil.copy(TRACES / f"{iteration}-iteration.csv", tmp_path)

@@ -8,8 +8,8 @@ import pytest
 
 from benchmarks import fidelity
 from benchmarks.calibrate import car_named
+from benchmarks.fidelity import Formula, bicycle, fit_formula
 from benchmarks.replay import WARM_UP_STEPS, Windows, errors
-from benchmarks.simple_cars import Formula, bicycle, fit_formula
 
 CAR = car_named("deepracer")
 TRACES = Path(__file__).parents[3] / "shared/reference/console_training/sim-trace"

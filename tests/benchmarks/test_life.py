@@ -14,7 +14,7 @@ import pytest
 from benchmarks import clone, resume, stopping
 from benchmarks.command import at_once
 from benchmarks.fresh import Driven, drive, driven, fresh_trials
-from benchmarks.intervals import mean_and_interval
+from benchmarks.report import mean_and_interval
 from benchmarks.same import different_points, different_rows, different_tensors, different_traces
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator

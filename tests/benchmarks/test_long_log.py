@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.long_log import write_long_log
+from benchmarks.analysis import write_long_log
 from deepracer_exp.deepracer.recording_reader import read_recording
 from tests.deepracer import made_up_logs as made
 

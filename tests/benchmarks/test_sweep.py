@@ -11,8 +11,8 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from benchmarks import sweep, sweep_runs
 from benchmarks.command import read_metrics
-from benchmarks.pruning_replay import Course, Ended, Pace, found_within, makespan_s, replay, steps_until
 from benchmarks.same import different_rows
+from benchmarks.sweep_runs import Course, Ended, Pace, makespan_s, replay
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import compose_sweep
 
@@ -78,16 +78,6 @@ def test_the_median_ends_what_is_worse_than_the_median_of_the_complete_trials_at
     assert found[3].began_s == found[2].ended_s == 35 + 35 + 25
 
 
-def test_a_trial_is_compared_with_those_only_that_are_complete_by_then() -> None:
-    courses = [course(0, [5.0, 5.0, 5.0]), course(1, [9.0, 9.0, 9.0]), course(2, [9.0, 9.0, 9.0])]
-    pruner = MedianPruner(n_startup_trials=1, n_warmup_steps=1)
-    one_by_one = replay(courses, pruner, "median", pace=PACE, workers=1)
-    assert [one.env_steps for one in one_by_one] == [3000, 1000, 1000]
-    # Two at once: nothing is complete while the second one runs; the third one is held against both.
-    at_once = replay(courses, pruner, "median", pace=PACE, workers=2)
-    assert [one.env_steps for one in at_once] == [3000, 3000, 1000]
-
-
 def test_hyperband_lets_a_third_of_a_rung_go_on() -> None:
     courses = [course(number, [value] * 3) for number, value in enumerate([5.0, 6.0, 7.0, 4.0, 4.5])]
     pruner = HyperbandPruner(
@@ -97,15 +87,6 @@ def test_hyperband_lets_a_third_of_a_rung_go_on() -> None:
     # The first is alone at its rung; each new best of a third goes on.
     assert [one.env_steps for one in found] == [3000, 1000, 1000, 3000, 1000]
     assert [one.outcome for one in found] == ["finished", "hyperband", "hyperband", "finished", "hyperband"]
-
-
-def test_equal_steps_are_those_of_all_workers_together() -> None:
-    found = [ended(0, 1000, 9.0), ended(1, 3000, 8.0), ended(2, 2000, 7.0, began_s=15.0), ended(3, 500, None)]
-    assert steps_until(found, 10.0, PACE) == 1000 + 1000 + 0 + 500
-    # Trial 0 ends after 15 s: it and trial 1 have driven 1,000 and 1,500 steps, and trial 3 its 500.
-    assert [one.number for one in found_within(found, 2999, PACE)] == []
-    assert [one.number for one in found_within(found, 3000, PACE)] == [0]
-    assert [one.number for one in found_within(found, 6500, PACE)] == [0, 1, 2]
 
 
 def test_steps_are_saved_against_the_same_trials_without_pruning() -> None:
@@ -141,13 +122,13 @@ def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused()
     whole = course(0, [12.0, 10.0, 9.0, 8.0])
 
     def trial(reports: dict[int, float]) -> FrozenTrial:
-        attrs = {"env_steps": 2500}
+        attrs = {"env_steps": 2500, "fate": "collapsed"}
         return create_trial(state=TrialState.PRUNED, intermediate_values=reports, user_attrs=attrs)
 
-    sweep_runs.refuse_other_reports(trial({1: 12.0, 2: 10.0}), whole)
+    sweep_runs.hold_against(trial({1: 12.0, 2: 10.0}), whole)
     for reports in ({1: 12.0}, {1: 12.0, 2: 10.5}, {1: 12.0, 2: 10.0, 3: 9.0}):
         with pytest.raises(SystemExit, match="to Optuna"):
-            sweep_runs.refuse_other_reports(trial(reports), whole)
+            sweep_runs.hold_against(trial(reports), whole)
 
 
 def test_the_pace_is_that_of_all_steps_and_of_the_usual_trial() -> None:
@@ -205,17 +186,3 @@ def test_a_sweep_that_was_made_is_not_begun_again_and_another_one_is_refused(tmp
     assert sweep_runs.started(["a=1"], tmp_path) == noted
     with pytest.raises(SystemExit, match="has the sweep a=1"):
         sweep_runs.started(["a=2"], tmp_path)
-
-
-def test_what_is_wanted_is_held_only_with_laps_and_by_every_rival() -> None:
-    def rival(loss: float | None) -> dict[str, Any]:
-        return {"at_equal_steps": {"lap_time_loss": loss}}
-
-    good: dict[str, Any] = {"trials_per_hour": 90.0, "steps_saved": 0.5, "lap_time_loss": -0.01}
-    good["rivals"] = {"median": rival(0.0), "hyperband": rival(-0.1)}
-    assert all(sweep.held(good).values())
-    for key, value in (("trials_per_hour", 89.0), ("steps_saved", 0.49), ("lap_time_loss", None)):
-        assert [name for name, held in sweep.held(good | {key: value}).items() if not held] == [key]
-    for loss in (0.001, None):
-        worse = good | {"rivals": good["rivals"] | {"hyperband": rival(loss)}}
-        assert not sweep.held(worse)["lap_time_loss_at_equal_steps"]
