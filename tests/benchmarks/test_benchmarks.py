@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import all_tracks, generalisation, sb3_peer, throughput, time_to_lap
 from benchmarks.driving import PASS_STEPS, SameDriving, scalar_setup
-from benchmarks.report import median, table
+from benchmarks.report import median
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.tracks.track import world_track
@@ -179,8 +179,3 @@ def test_what_never_happened_took_longer_than_anything() -> None:
     assert median([3.0, None, 1.0]) == 3.0
     assert median([None, None, 1.0]) is None
     assert median([1.0, None]) is None
-
-
-def test_the_columns_of_a_table_stand_below_one_another() -> None:
-    lines = table(("a", "number"), [("long word", "1"), ("b", "1,000")]).splitlines()
-    assert len({len(line) for line in lines}) == 1

@@ -13,13 +13,11 @@ import pytest
 
 from benchmarks import clone, resume, stopping
 from benchmarks.command import at_once
-from benchmarks.fresh import Driven, drive, driven, fresh_trials
+from benchmarks.fresh import Driven, drive, fresh_trials
 from benchmarks.report import mean_and_interval
 from benchmarks.same import different_points, different_rows, different_tensors, different_traces
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import Evaluation, Group
 
 SHORT = ("budget.iterations=1", "checkpoints.every=null")
 
@@ -38,11 +36,6 @@ def _driven(lap_time_s: float | None = 10.0, completion: float = 90.0) -> Driven
         held_out_completion=completion - 10,
         held_out_lap_time_s=lap_time_s,
     )
-
-
-def _attempt(trial: int, time_s: float, progress: float) -> Attempt:
-    end = "lap_complete" if progress == 100 else "off_track"
-    return Attempt(trial=trial, begin_s=0, time_s=time_s, penalty_s=0, resets=0, progress=progress, end=end)
 
 
 def _judged(track: str, seed: int, saved_steps: int, kept: Driven, full: Driven) -> dict[str, Any]:
@@ -160,14 +153,6 @@ def test_fresh_trials_begin_where_no_evaluation_of_a_training_does() -> None:
     assert fresh.seed != own.seed
 
 
-def test_lap_times_are_of_complete_laps_and_completion_of_all() -> None:
-    usual = Group("A", "usual", (0, 1), (_attempt(0, 9.0, 100.0), _attempt(1, 3.0, 40.0)))
-    held_out = Group("A", "held_out", (2,), (_attempt(2, 3.0, 30.0),))
-    assert driven(Evaluation((usual, held_out))) == Driven(
-        completion=70, lap_share=0.5, lap_time_s=9, held_out_completion=30, held_out_lap_time_s=None
-    )
-
-
 def test_the_same_policy_drives_the_same_way_whatever_drives_beside_it(twins: list[Path]) -> None:
     alone, twice = drive(twins[0], ["last"], trials=2), drive(twins[1], ["last", "last"], trials=2)
     assert twice == alone * 2
@@ -268,22 +253,6 @@ def test_the_first_failure_of_many_calls_is_told_and_ends_the_rest() -> None:
     with pytest.raises(SystemExit, match="no"):
         at_once(1, [partial(call, number) for number in (1, *range(2, 2000))])
     assert len(made) < 1999
-
-
-def test_a_killed_run_is_one_that_has_its_configuration(tmp_path: Path) -> None:
-    (tmp_path / "runs" / "tiny" / "begun").mkdir(parents=True)
-    assert resume._run_in(tmp_path) is None
-    run = tmp_path / "runs" / "tiny" / "described"
-    run.mkdir()
-    (run / "config.yaml").write_text("")
-    assert resume._run_in(tmp_path) == run
-    assert (resume._last_iteration(run), resume._rows(run)) == (0, 0)
-    assert resume._hit(run, 0, 9, since=0.0) == "beginning"
-    (run / "metrics.jsonl").write_text("{}\n" * 9)
-    assert resume._hit(run, 0, 9, since=0.0) == "ending"
-    assert resume._hit(run, 5, 20, since=0.0) == "training"
-    (run / "checkpoints" / ".000009").mkdir(parents=True)
-    assert resume._hit(run, 5, 20, since=0.0) == "writing a checkpoint"
 
 
 COUNTER = """\

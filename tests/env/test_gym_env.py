@@ -7,8 +7,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from benchmarks.sb3_peer import SB3Cars
 from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.errors import BadInput
@@ -123,46 +124,6 @@ def test_gymnasiums_vector_wrappers_take_it():
 
 
 # --- Stable-Baselines3
-
-
-class SB3Cars(VecEnv):
-    """Our vector environment under Stable-Baselines3's interface."""
-
-    def __init__(self, cars: DeepRacerVectorEnv):
-        self.cars = cars
-        super().__init__(cars.num_envs, cars.single_observation_space, cars.single_action_space)
-
-    def reset(self):
-        return self.cars.reset()[0]
-
-    def step_async(self, actions):
-        self.actions = actions
-
-    def step_wait(self):
-        observation, reward, terminated, truncated, infos = self.cars.step(self.actions)
-        done = terminated | truncated
-        listed = [{} for _ in range(self.num_envs)]
-        for car in np.flatnonzero(done):
-            listed[car] = {
-                "terminal_observation": infos["final_obs"][car],
-                "TimeLimit.truncated": bool(truncated[car]),
-            }
-        return observation, reward.astype(np.float32), done, listed
-
-    def close(self):
-        self.cars.close()
-
-    def get_attr(self, attr_name, indices=None):
-        return [getattr(self.cars, attr_name, None)] * self.num_envs
-
-    def set_attr(self, attr_name, value, indices=None):
-        raise NotImplementedError
-
-    def env_method(self, method_name, *args, indices=None, **kwargs):
-        raise NotImplementedError
-
-    def env_is_wrapped(self, wrapper_class, indices=None):
-        return [False] * self.num_envs
 
 
 @pytest.mark.parametrize("space", SPACES)

@@ -42,12 +42,6 @@ def test_left_is_positive(race_of, direction):
         np.testing.assert_allclose(mirrored[name], seen[name], atol=0.02)
 
 
-def test_the_edge_of_the_road_is_an_offset_of_one(race_of):
-    race = race_of("track=Straight_track")
-    put(race, race.setup.track.width_m / 2, 0.0)
-    assert features(race)["offset"][0] == pytest.approx(1.0, rel=0.02)
-
-
 def test_the_road_ahead_is_where_the_centre_line_goes_on(race_of):
     race = race_of("observation.lookahead_m=[0.5,1.5]", "observation.lookahead_scale_m=3", n_cars=20)
     now, track, seen = race.rules.now, race.setup.track, features(race)

@@ -77,19 +77,6 @@ def test_a_partial_reset_starts_the_marked_cars_alone(setup_of):
     np.testing.assert_array_equal(env.race.rules.episode, [0, 1, 0])
 
 
-@pytest.mark.parametrize("space", SPACES)
-def test_a_seed_gives_the_same_rollout_whatever_the_threads(setup_of, space):
-    setup = setup_of(space, "randomization=aws", "episode.max_steps=25")
-    runs = []
-    for threads in (1, 2):
-        env = RaceEnv(Race(setup, 6, threads=threads))
-        env.set_seed(11)
-        torch.manual_seed(11)  # the actions
-        runs.append(env.rollout(60, break_when_any_done=False))
-    assert_same(*runs)
-    assert runs[0]["next", "done"].any()
-
-
 def test_the_rewards_of_the_trace_are_the_rewards(setup_of):
     steps = RaceEnv(Race(setup_of(), 3)).rollout(40, break_when_any_done=False)
     trace = steps["next", "trace"]
