@@ -67,13 +67,7 @@ def add_command(
 
 
 def add_run(parser: argparse.ArgumentParser, overrides: str | None = "KEY=VALUE", many: bool = False) -> None:
-    """Give a command the arguments `RUN [overrides]`, which `run_and_overrides` returns.
-
-    Args:
-        parser: of the command.
-        overrides: what they are called in the help.
-        many: the command takes several runs.
-    """
+    """Give a command the arguments `RUN [overrides]`, which `run_and_overrides` returns."""
     run = parser.add_argument("runs", nargs="*" if many else "?", metavar="RUN", help=RUN)
     run.completer = complete_runs  # type: ignore[attr-defined]
     add_overrides(parser, overrides, complete_runs)

@@ -53,12 +53,7 @@ def print_start() -> None:
 
 
 def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
-    """Print how a run ended, where its results are, and what to do next.
-
-    Args:
-        outcome: of the run.
-        tracked_in: `runs_dir` of a run that is recorded in MLflow, None for one that is not.
-    """
+    """Print how a run ended, where its results are, and what to do next."""
     from deepracer_exp.runs.result import result_of
 
     summary = outcome.summary

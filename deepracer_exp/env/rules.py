@@ -84,18 +84,10 @@ class EpisodeRules:
         moved_m: np.ndarray,
         off_track: np.ndarray,
     ) -> np.ndarray:
-        """Return each car's episode status.
+        """Return each car's status code, (N,) int64, for its control steps and its progress in per cent.
 
-        Args:
-            steps: control steps of the episode, the prepare step being 1, shape (N,).
-            progress: progress now, per cent, shape (N,).
-            last_progress: progress one step before, shape (N,).
-            moved_m: distance since one step before, in metres, shape (N,).
-            off_track: no wheel on the road, shape (N,).
-
-        Returns:
-            Status codes, shape (N,), int64. Where several rules hold the service's priority decides: time_up,
-            lap_complete, then the others.
+        The prepare step is step 1; `moved_m` is the distance since one step before, and off the track no wheel is on
+        the road. Where several rules hold the service's priority decides: time_up, lap_complete, then the others.
         """
         config = self._config
         running = steps > 1

@@ -63,14 +63,7 @@ class Measures:
 
     @classmethod
     def of(cls, car: CarState, front_point_m: float, tracks: Tracks, track_index: TrackIndex) -> "Measures":
-        """Measure cars.
-
-        Args:
-            car: their poses and motion, (N,).
-            front_point_m: how far ahead of the origin the front point is.
-            tracks: the courses.
-            track_index: number of each car's course, (N,).
-        """
+        """Measure cars (N,), whose front point is so far ahead of their origin, each against its course (N,)."""
         front = np.empty((len(car.x_m), 2))
         front[:, 0] = car.x_m + front_point_m * np.cos(car.yaw_rad)
         front[:, 1] = car.y_m + front_point_m * np.sin(car.yaw_rad)
@@ -101,11 +94,7 @@ class Measures:
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], n_cars: int) -> "Measures":
-        """Restore a `state_dict`.
-
-        Raises:
-            BadInput: it is of another number of cars.
-        """
+        """Restore a `state_dict`."""
         return cls(
             **{
                 field.name: checked_array(

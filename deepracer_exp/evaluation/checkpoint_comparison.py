@@ -83,11 +83,6 @@ def compare_checkpoints(
 ) -> Iterator[CheckpointResult]:
     """Evaluate every kept checkpoint of a run on the same trials, the oldest first.
 
-    Args:
-        run: of the checkpoints.
-        evaluator: of the trials.
-        on_next: called with the name of each checkpoint before it drives.
-
     Raises:
         RunFailed: a car's state became NaN.
     """
@@ -115,12 +110,7 @@ def compare_checkpoints(
 
 
 def lap_statistics(evaluation: Evaluation, metric: Metric) -> LapStatistics:
-    """Summarise an evaluation.
-
-    Args:
-        evaluation: of one policy.
-        metric: that it is ranked by.
-    """
+    """Summarise an evaluation."""
     usual = evaluation.on(USUAL)
     held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
     share = usual.statistics()["lap_share"]
@@ -155,10 +145,6 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
     """Return the best checkpoint by the run's own metric, and why; None if none can be used.
 
     On the trials of the training it is the run's own `best`. Ties go to the oldest, as in the training.
-
-    Args:
-        results: the oldest first.
-        metric: that the run's evaluations are ranked by.
     """
     driven = [(one, one.figures) for one in results if one.figures is not None]
     if not driven:
@@ -179,13 +165,7 @@ def _words(found: LapStatistics) -> str:
 
 
 def comparison_table(results: Sequence[CheckpointResult], chosen: str, console: Console) -> Table:
-    """Return the comparison as a table, one row per checkpoint, with as many columns as the console fits.
-
-    Args:
-        results: the oldest first.
-        chosen: name of the highlighted one.
-        console: on which it will be printed.
-    """
+    """Return the comparison as a table, one row per checkpoint, with as many columns as the console fits."""
     hidden = () if _has_held_out(results) else (_HELD_OUT,)
     endless = console.options.update(max_width=10_000)
     for intervals, left_out in ((True, hidden), (True, hidden + _MINOR), (False, hidden + _MINOR)):

@@ -38,14 +38,7 @@ _Row = tuple[str, str, dict[str, str]]
 def results_table(
     evaluation: Evaluation, config: EvaluationConfig, trained_on: Container[str], console: Console
 ) -> Table:
-    """Return the results as a table, one row per track and condition, with as many columns as the console fits.
-
-    Args:
-        evaluation: the results.
-        config: the protocol.
-        trained_on: names of the run's own tracks.
-        console: on which it will be printed.
-    """
+    """Return the results as a table, one row per track and condition, with as many columns as the console fits."""
     unseen = [track for track in evaluation.tracks if track not in trained_on]
     groups = [(f"{group.track}{' *' * (group.track in unseen)}", group) for group in evaluation.groups]
     if len(evaluation.tracks) > 1:
@@ -136,12 +129,6 @@ def evaluate(
     config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, err: Console
 ) -> Evaluation:
     """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.
-
-    Args:
-        config: validated.
-        video: file and view for a video of the best lap; None: no video.
-        out: for results.
-        err: for progress.
 
     Raises:
         BadInput: the run, the checkpoint, a track or a condition cannot be used, or the machine cannot render.

@@ -1,9 +1,8 @@
 """Video of the best lap of an evaluation, rendered by MuJoCo."""
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -208,25 +207,11 @@ def _png(image: Image.Image) -> bytes:
     return file.getvalue()
 
 
-@dataclass(frozen=True)
-class _Moment:
-    """One control step of all trials."""
-
-    rows: NDArray[np.float64]
-    """Columns `_COLUMNS`, (N, 6)."""
-    clock_s: NDArray[np.float64]
-
-
 class LapVideo:
     """Records all trials while they are driven, then renders the best lap."""
 
     def __init__(self, evaluator: Evaluator, file: Path, view: View):
-        """Prepare a video.
-
-        Args:
-            evaluator: that will drive.
-            file: an .mp4 to write.
-            view: from behind the car or from above.
+        """Prepare a video of an evaluation, in an .mp4 file, from behind the car or from above.
 
         Raises:
             BadInput: the file is not an .mp4, or its folder does not exist.
@@ -235,11 +220,11 @@ class LapVideo:
             raise BadInput(f"--video {file}: accepted: an .mp4 in an existing folder")
         self.file, self._view = file, view
         self._evaluator = evaluator
-        self._moments: list[_Moment] = []
+        self._steps: list[NDArray[np.float64]] = []
 
     def record(self, race: Race, protocol: RaceProtocol) -> None:
         """Record one control step."""
-        self._moments.append(_Moment(race.trace[:, _COLUMNS], protocol.clock_s.copy()))
+        self._steps.append(np.column_stack([race.trace[:, _COLUMNS], protocol.clock_s]))
 
     def write(self, evaluation: Evaluation, err: Console) -> None:
         """Render the fastest lap on the usual conditions, or the one with the most progress if none is complete.
@@ -274,7 +259,7 @@ class LapVideo:
 
     def _lap(self, lap: Attempt) -> NDArray[np.float64]:
         """Return the rows of a lap, columns `_COLUMNS` and the race clock."""
-        rows = np.array([np.r_[m.rows[lap.trial], m.clock_s[lap.trial]] for m in self._moments])
+        rows = np.array([step[lap.trial] for step in self._steps])
         clock_s = rows[:, -1]
         # The clock of a finished trial stands still.
         going = np.r_[True, np.diff(clock_s) > 0]
@@ -288,7 +273,7 @@ def _overlay(
     image = Image.fromarray(picture).convert("RGBA")
     shade = Image.new("RGBA", image.size)
     draw = ImageDraw.Draw(shade)
-    large, small = _font(34), _font(18)
+    large, small = ImageFont.load_default(34), ImageFont.load_default(18)
     right = 330
     draw.rounded_rectangle((16, 16, right + 14, 122), 10, fill=(0, 0, 0, 150))
     draw.text((30, 22), title, font=small, fill=(235, 235, 235, 255))
@@ -302,7 +287,3 @@ def _overlay(
     draw.rectangle((30, 98, 30 + (right - 30) * share, 108), fill=(245, 166, 35, 255))
     framed: NDArray[np.uint8] = np.asarray(Image.alpha_composite(image, shade).convert("RGB"))
     return np.ascontiguousarray(framed)
-
-
-def _font(size: int) -> Any:
-    return ImageFont.load_default(size)

@@ -23,11 +23,6 @@ from .onnx_file import CHECKED, DeployedPolicy, write_onnx
 def export(config: ExportConfig, output: str | None, out: Console) -> Path:
     """Export a run in the chosen format and print what was written.
 
-    Args:
-        config: validated.
-        output: file or folder to write; None: `export/` in the run's folder.
-        out: for the report.
-
     Raises:
         BadInput: the run, the checkpoint or the output cannot be used, or a package is missing.
         RunFailed: the ONNX file differs from the network.

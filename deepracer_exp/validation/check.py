@@ -73,10 +73,6 @@ def read(experiment: Experiment) -> Check:
 def try_named_situations(check: Check, against: Track) -> None:
     """Call the function in the named situations, each time in a freshly loaded module, and add the results to `check`.
 
-    Args:
-        check: from `read`.
-        against: the track in the other direction.
-
     Raises:
         BadInput: the module cannot be loaded.
     """

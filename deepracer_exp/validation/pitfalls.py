@@ -217,11 +217,6 @@ def pays_for_slowness(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
 def batch_differs(setup: RaceSetup, sampled: Situations, rewards: np.ndarray) -> Iterator[str]:
     """Warn if the module's `reward_batch`, which trainings use, differs from its `reward_function`.
 
-    Args:
-        setup: the experiment's race.
-        sampled: n situations.
-        rewards: of `reward_function`, (n,).
-
     Raises:
         BadInput, RewardFailed: `reward_batch` cannot be used.
     """

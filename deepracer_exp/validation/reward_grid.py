@@ -68,13 +68,7 @@ class RewardGrid:
 
 
 def sample_reward_grid(setup: RaceSetup, rewards: Sampler, detail: float) -> RewardGrid:
-    """Sample the rewards of a grid all over the track.
-
-    Args:
-        setup: the experiment's race.
-        rewards: of the reward function.
-        detail: 1, or less for slow functions.
-    """
+    """Sample the rewards of a grid all over the track; `detail` is 1, or less for slow functions."""
     low, high = setup.actions.low, setup.actions.high
 
     def points(n: int) -> int:
@@ -107,10 +101,7 @@ def sample_reward_grid(setup: RaceSetup, rewards: Sampler, detail: float) -> Rew
 def state_of(setup: RaceSetup, probe: Probe, n: int = 40) -> State:
     """Find out whether a reward depends on more than the params: on earlier calls, or on randomness.
 
-    Args:
-        setup: the experiment's race.
-        probe: a module that was not called before; it collects the failures.
-        n: number of situations.
+    `probe` must not have been called before; it collects the failures.
     """
     at = sample(setup, n)
     now = situations(setup, at)

@@ -39,14 +39,6 @@ def draw_reward_map(
 ) -> None:
     """Write the picture: the track coloured by the reward for driving along it, and four cuts.
 
-    Args:
-        setup: the experiment's race.
-        rewards: of the reward function.
-        of: rewards sampled on a grid.
-        state: whether a reward depends on more than the params.
-        detail: 1, or less for slow functions.
-        path: its suffix chooses the format.
-
     Raises:
         BadInput: the picture cannot be written.
     """

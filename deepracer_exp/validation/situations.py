@@ -106,12 +106,9 @@ def poses(
 
 
 def situations(setup: RaceSetup, at: Poses, earlier: bool = False) -> Situations:
-    """Return the params that the environment's rules compute for poses.
+    """Return the params that the environment's rules compute for poses, or `earlier`, one step before.
 
-    Args:
-        setup: the experiment's race.
-        at: n poses.
-        earlier: one step before, for cars that drove straight at the commanded speed.
+    Cars have driven straight at the commanded speed since then.
     """
     n = len(at.ndist)
     place = setup.track.start_pose(at.ndist)
@@ -157,12 +154,7 @@ def middle_speed_mps(setup: RaceSetup) -> float:
 
 
 def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
-    """Return start, mid-lap, off-track, finish, wrong way, and mid-lap on the track driven in reverse.
-
-    Args:
-        setup: the track, the car and the action space.
-        against: the same track in the other direction.
-    """
+    """Return start, mid-lap, off-track, finish, wrong way, and mid-lap on the track driven in reverse."""
     speed = middle_speed_mps(setup)
     track = setup.track
     # The second step is the first that is rewarded; in the first the car stood on the start line.

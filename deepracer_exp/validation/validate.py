@@ -33,15 +33,7 @@ def validate_reward(
     out: Console,
     err: Console,
 ) -> int:
-    """Validate the reward function of an experiment and print the findings.
-
-    Args:
-        experiment: the reward function, the track, the car and the action space.
-        trial: the same as a short training; None: no training.
-        output: picture to write; None: in `runs_dir`, named after reward function and track.
-        strict: fail if the AWS console would reject it.
-        out: for the report.
-        err: for the progress of the training.
+    """Validate the reward function of an experiment, print the findings, draw its map and try a short training.
 
     Returns:
         The exit code: 0; 2 if the function cannot be used here, or, with `strict`, by AWS.
