@@ -66,8 +66,10 @@ def replay_reward(
     if view.course is None:
         why = str(view.problems[0]) if view.problems else view.name
         raise BadInput(f"{why}: no step is on a known course, so no reward can be computed")
-    parts = [view.steps, view.evaluations] if view.trained else [view.evaluations]
-    steps = pd.concat(parts, ignore_index=True)
+    steps = view.recording.steps
+    here = (steps["track"] == view.track_name).to_numpy()
+    # A course without a name in the log has been recognised.
+    steps = steps[here if here.any() else (steps["track"] == "").to_numpy()]
     stream = steps["stream"].astype("category").cat.codes.to_numpy().astype(np.int64)
     process = stream * 2**16 + steps["worker"].to_numpy()
     order = np.lexsort((steps["episode"].to_numpy(), process))

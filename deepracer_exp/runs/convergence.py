@@ -531,5 +531,7 @@ def _entropy_stopping(stopping: Mapping[str, Any] | None) -> EntropyStopping | N
 
 def moving_average(values: NDArray[np.float64], over: int = 3) -> NDArray[np.float64]:
     """Return the mean of each value and those before it without unknown ones; NaN where the value itself is NaN."""
+    import pandas as pd  # takes half a second, and only reports need it
+
     series = pd.Series(values, dtype=np.float64)
     return series.rolling(over, min_periods=1).mean().where(series.notna()).to_numpy()

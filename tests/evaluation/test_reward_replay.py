@@ -201,8 +201,8 @@ def test_laps_driven_the_other_way_are_reversed(reward):
 def test_rows_without_a_position_have_no_reward_and_those_without_a_course_are_refused(reward):
     one = reward("def reward_function(p):\n    return 1\n")
     view = laps_of({0: 50, 1: 60})
-    lost = view.steps["episode"] == 1
-    view.steps.loc[lost, "X"] = np.nan
+    lost = view.recording.steps["episode"] == 1
+    view.recording.steps.loc[lost, "X"] = np.nan
     replayed = replay_reward(view, one)
     assert replayed.steps["new_reward"].isna().tolist() == lost.tolist()
     assert replayed.laps["episode"].tolist() == [0]
