@@ -8,14 +8,19 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, RangeSweep
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -172,9 +177,53 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     )
 
 
+class OptionFiles(FileConfigSource):
+    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read an option.
+
+        Raises:
+            BadInput: the file cannot be read, or is not YAML with keys and values.
+        """
+
+        def load(text: str) -> ConfigResult:
+            config = OmegaConf.load(StringIO(text))
+            if not isinstance(config, DictConfig):
+                raise ValueError("has no keys")
+            header = self._get_header_dict(text[:512])
+            return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
+
+        return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
+
+    def is_config(self, config_path: str) -> bool:
+        """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
+        path = self._file(config_path)
+        return self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
+
+    def is_group(self, config_path: str) -> bool:
+        """Return whether there is such a folder."""
+        return self._is_below(config_path) and super().is_group(config_path)
+
+    def _file(self, config_path: str) -> Path:
+        return Path(self.path, self._normalize_file_name(config_path))
+
+    @staticmethod
+    def _is_below(config_path: str) -> bool:
+        # Names in `defaults:` of an option file must not lead out of the folder either.
+        return not Path(config_path).is_absolute() and ".." not in Path(config_path).parts
+
+
+def register_option_files() -> None:
+    """Replace the one reader of files that Hydra has by `OptionFiles`."""
+    Plugins.instance()  # registers Hydra's own reader
+    SourcesRegistry.instance().types[OptionFiles.scheme()] = OptionFiles
+
+
 def _composed(name: str | None, lines: list[str]) -> DictConfig:
     """Let Hydra compose a file of `conf/`, or the overrides alone; the result includes Hydra's own settings."""
     project, *more = conf_dirs()
+    register_option_files()
     register_worlds()
     if more:
         lines = [*lines, override_line("hydra.searchpath", [f"file://{folder}" for folder in more])]
@@ -215,10 +264,6 @@ def check_option(group: str, name: object, key: str | None = None) -> None:
         ConfigStore.instance().store(group=group, name=name, node=own)
         return
     if name.removesuffix(".yaml") in known or (group == TRACK and find_world(name)):
-        file = Path("conf", group, f"{name.removesuffix('.yaml')}.yaml").absolute()
-        # Hydra would wait for a pipe, and unfold a bomb of aliases.
-        if os.path.lexists(file) and not isinstance(read_yaml(file, "lines KEY: VALUE"), dict):
-            raise BadInput(f"{file}: has no keys; accepted: lines KEY: VALUE")
         return
     hint = nearest(name, known)
     if key == group and f"{group}.file" in PLAIN_TEXT and Path(name).suffix in _FILES:

@@ -67,7 +67,7 @@ def in_degrees(table: pa.Table) -> pa.Table:
 
 
 def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int) -> Ints:
-    """Return the iteration of each row of a text log: by its checkpoints, or else by counting episodes."""
+    """Return the iteration of each row of a text log: as logged, or by counting episodes."""
     episode = table["episode"].to_numpy().astype(np.int64)
     driven = [(first, checkpoint_number(name)) for first, name in log.checkpoints if first is not None]
     if driven:
@@ -75,7 +75,17 @@ def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int
         return number[np.maximum(np.searchsorted(starts, episode, side="right") - 1, 0)] - first_checkpoint(
             log
         )
-    return episode // episodes_per_iteration
+    if not any(log.iteration_of.values()):
+        return episode // _episodes_between(log, episodes_per_iteration)
+    known = np.array(sorted(log.iteration_of))
+    logged = np.array([log.iteration_of[number] for number in known.tolist()], np.int64)
+    place = np.searchsorted(known, episode)
+    # Episodes after the last logged one were not finished when the log ended.
+    counts = np.unique(logged, return_counts=True)[1]
+    usual = int(counts[:-1].max()) if len(counts) > 1 else episodes_per_iteration
+    behind = episode - known[-1] - (usual - int(counts[-1]))
+    beyond = logged[-1] + np.where(behind > 0, 1 + (behind - 1) // usual, 0)
+    return np.where(place < len(known), logged[np.minimum(place, len(known) - 1)], beyond)
 
 
 def checkpoint_number(name: str) -> int:
@@ -90,6 +100,14 @@ def first_checkpoint(log: TrainingLog) -> int:
     return checkpoint_number(next(fresh, names[0])) if names else 0
 
 
+def _episodes_between(log: TrainingLog, usual: int) -> int:
+    """Return how many episodes an iteration has: as many as lie between two evaluations."""
+    ends = log.evaluated_after
+    if len(ends) > 1:
+        return ends[1] - ends[0]
+    return ends[0] if ends and 0 in log.iteration_of else usual
+
+
 def rows_also_in(log: Drives, other: Drives) -> Flags:
     """Return for each row of a log whether the other drives contain it, perhaps with more digits.
 
@@ -98,8 +116,11 @@ def rows_also_in(log: Drives, other: Drives) -> Flags:
     mine, theirs = log.key, other.key
     if not len(mine) or not len(theirs):
         return np.zeros(len(mine), np.bool_)
-    order = np.argsort(theirs, kind="stable")
-    match = order[np.minimum(np.searchsorted(theirs, mine, sorter=order), len(theirs) - 1)]
+    if _rises(theirs):
+        match = np.minimum(np.searchsorted(theirs, mine), len(theirs) - 1)
+    else:
+        order = np.argsort(theirs, kind="stable")
+        match = order[np.minimum(np.searchsorted(theirs[order], mine), len(theirs) - 1)]
     same = theirs[match] == mine
     common = int(same.sum())
     for name, near in (("tstamp", _NEAR_S), ("X", _NEAR_M), ("Y", _NEAR_M)):

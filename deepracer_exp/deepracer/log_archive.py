@@ -1,28 +1,28 @@
 """The files of a folder or an archive, and what their paths say about them."""
 
 import bz2
+import contextlib
 import gzip
 import lzma
 import re
+import stat
 import tarfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
+from .log_blocks import READ_ERRORS
 from .recording import LogProblem, readable
 
-READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError)
-"""Errors of reading a file or a member of an archive."""
 _ACCEPTED = "trace CSVs or logs of the service"
 
 _KIND = re.compile(r"(?:^|[-_.])(training|evaluation|leaderboard)(?=[-_.]|$)", re.IGNORECASE)
-_FOLDER = re.compile(r"training|evaluation(?:-\d{14})?|leaderboard")
+_FOLDERS = {"training": "training", "evaluation": "evaluation", "leaderboard": "leaderboard"}
+_DRFC_EVALUATION = re.compile(r"evaluation-\d{14}")
 _WORKER = re.compile(r"(?:TrainingMetrics_|(?:worker|robomaker|simulation)[-_.]?)(\d{1,3})(?=\D|$)")
 _STAMP = re.compile(r"\d{14}|\d{4}-\d\d-\d\dT[\d:.]+Z")
 _ENDINGS = re.compile(
@@ -44,11 +44,16 @@ class LogFile:
     """For messages; a member of an archive has a path below the archive's."""
     parts: tuple[str, ...]
     """Names of the folders it is in, as far as they matter, and its own name."""
-    open: Callable[[], IO[bytes]]
+    opener: Callable[..., IO[bytes]]
+    given: tuple[object, ...] = ()
 
     def __post_init__(self) -> None:
         """Make the names printable."""
         object.__setattr__(self, "parts", tuple(readable(part) for part in self.parts))
+
+    def open(self) -> IO[bytes]:
+        """Open it for reading."""
+        return self.opener(*self.given)
 
     @property
     def name(self) -> str:
@@ -60,129 +65,16 @@ class LogFile:
         """Sorts 10-iteration.csv after 9-iteration.csv."""
         return natural("/".join(self.parts))
 
-    @property
-    def piece(self) -> tuple[tuple[str, ...], int]:
-        """The whole log that `robomaker.log.1` is a piece of, and a key that sorts its pieces from the oldest.
 
-        The highest number is the oldest piece; the one without a number is still being written.
-        """
-        stem, _, number = self.name.rpartition(".")
-        return ((*self.parts[:-1], stem), -int(number)) if stem and number.isdigit() else (self.parts, 1)
+@dataclass
+class LogFolder:
+    """The files found."""
 
-
-def log_files(path: Path, problems: list[LogProblem]) -> Iterator[LogFile]:
-    """Yield the files below a folder and in the archives there, in one archive, or the one file.
-
-    Links are not followed. Archives and compressed files are read without being unpacked: a file has to be read before
-    the next one is asked for.
-
-    Args:
-        path: a folder, an archive or a file.
-        problems: gets what cannot be read.
-
-    Raises:
-        BadInput: it does not exist or cannot be read at all.
-    """
-    parts = path.resolve().parts
-    if path.is_dir():
-        yield from _below(path, parts[-2:], problems)
-        return
-    open_user_file(path, _ACCEPTED, LOG_BYTES).close()
-    try:
-        yield from _packed(path, parts[-3:], (), problems)
-    except _NotPackedError:
-        yield LogFile(path, parts[-3:], partial(open_user_file, path, _ACCEPTED, LOG_BYTES))
-    except (*READ_ERRORS, ValueError) as error:
-        raise BadInput(f"{path}: cannot be read: {reason_of(error)}") from error
-
-
-def reason_of(error: Exception) -> str:
-    """Return the message of an error of reading on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _below(root: Path, above: tuple[str, ...], problems: list[LogProblem]) -> Iterator[LogFile]:
-    files: list[LogFile] = []
-    waiting, packed = [root], []
-    while waiting:
-        folder = waiting.pop()
-        try:
-            entries = list(folder.iterdir())
-        except OSError as error:
-            problems.append(LogProblem(str(folder), None, f"cannot be read: {error.strerror}"))
-            continue
-        for entry in entries:
-            if entry.is_symlink():
-                problems.append(LogProblem(str(entry), None, "a link; not followed"))
-            elif entry.is_dir():
-                waiting.append(entry)
-            elif entry.is_file() and _PACKED.search(entry.name):
-                packed.append(entry)
-            elif entry.is_file():
-                parts = (*above, *entry.relative_to(root).parts)
-                files.append(LogFile(entry, parts, partial(open_user_file, entry, _ACCEPTED, LOG_BYTES)))
-    yield from sorted(files, key=lambda file: file.order)
-    for path in sorted(packed):
-        parts = (*above, *path.relative_to(root).parts)
-        try:
-            yield from _packed(path, parts, parts, problems)
-        except (*READ_ERRORS, ValueError) as error:
-            problems.append(LogProblem(str(path), None, f"cannot be read ({reason_of(error)})"))
-
-
-class _NotPackedError(ValueError):
-    """A file is neither an archive nor compressed."""
-
-
-def _packed(
-    path: Path, parts: tuple[str, ...], inside: tuple[str, ...], problems: list[LogProblem]
-) -> Iterator[LogFile]:
-    """Yield the members of an archive, or a compressed file.
-
-    Args:
-        path: of the archive or compressed file.
-        parts: its folders and its name.
-        inside: folders that members are in; empty if the archive is all there is.
-        problems: gets what cannot be read.
-    """
-    try:
-        archive = tarfile.open(path, "r:*")  # noqa: SIM115 - closed below
-    except tarfile.ReadError:
-        with path.open("rb") as file:
-            head = file.read(8)
-        opener = next((_OPEN[ending] for mark, ending in _MARKS.items() if head.startswith(mark)), None)
-        if opener is None:
-            raise _NotPackedError("neither an archive nor compressed") from None
-        with opener(path) as stream:
-            stream.read(1)
-        yield LogFile(path, (*parts[:-1], _PACKED.sub("", path.name)), partial(opener, path))
-        return
-    with archive:
-        try:
-            for member in archive:
-                if member.islnk() or member.issym():
-                    problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
-                names = PurePosixPath(member.name).parts
-                own = tuple(part for part in names if part not in ("/", "..", "."))
-                if member.isfile() and own:
-                    unpacked = own if _ending(own[-1]) is None else (*own[:-1], _PACKED.sub("", own[-1]))
-                    yield LogFile(path.joinpath(*own), (*inside, *unpacked), partial(_open, archive, member))
-        except (*READ_ERRORS, ValueError, OverflowError) as error:
-            problems.append(LogProblem(str(path), None, f"cannot be read to its end ({reason_of(error)})"))
-
-
-def _open(archive: tarfile.TarFile, member: tarfile.TarInfo) -> IO[bytes]:
-    stream = archive.extractfile(member)
-    assert stream is not None
-    ending = _ending(member.name)
-    opened: IO[bytes] = stream if ending is None else _OPEN[ending](stream)
-    return opened
-
-
-def _ending(name: str) -> str | None:
-    """Return the compression of a single file by its name; None for an archive and any other file."""
-    packed = _PACKED.search(name)
-    return packed[1].lower() if packed is not None and packed[1] else None
+    files: list[LogFile] = field(default_factory=list)
+    """In the order in which they are read fastest."""
+    problems: list[LogProblem] = field(default_factory=list)
+    parallel: bool = True
+    """Whether files can be read in parallel."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +111,7 @@ def place_of(parts: tuple[str, ...]) -> Place:
     kind = named[1].lower() if named else "training"
     if named is None:
         for folder in reversed(parts[:-1]):
-            if _FOLDER.fullmatch(folder):
+            if folder in _FOLDERS or _DRFC_EVALUATION.fullmatch(folder):
                 kind = folder.partition("-")[0]
                 break
     numbered = _WORKER.search(parts[-1])
@@ -238,3 +130,201 @@ def same_job(one: str, other: str) -> bool:
         return True
     first, second = (_STAMP.split(label(name))[-1].strip("-_") for name in (one, other))
     return bool(stamps[0] and stamps[1] and first and first == second)
+
+
+@contextlib.contextmanager
+def log_folder(path: Path) -> Iterator[LogFolder]:
+    """Find the files below a folder and in the archives there, in one archive, or the one file.
+
+    Links are not followed. Archives and compressed files are read without being unpacked.
+
+    Raises:
+        BadInput: nothing is there, or it cannot be opened.
+    """
+    try:
+        mode = path.stat().st_mode
+        if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
+            raise BadInput(
+                f"{path}: is neither a file nor a folder; accepted: logs of the service or a run's folder"
+            )
+        with contextlib.ExitStack() as opened:
+            if stat.S_ISDIR(mode):
+                yield _walk(path, opened)
+            elif _is_packed(path):
+                found = LogFolder(parallel=False)
+                archives = opened.enter_context(contextlib.closing(_Archives()))
+                _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
+                yield found
+            else:
+                yield LogFolder(
+                    [LogFile(path, path.resolve().parts[-3:], open_user_file, (path, _ACCEPTED, LOG_BYTES))]
+                )
+    except FileNotFoundError as error:
+        raise BadInput(f"{path}: no such file or folder; accepted: {_ACCEPTED}") from error
+    except (*READ_ERRORS, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
+        raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
+    found = LogFolder()
+    above = root.resolve().parts[-2:]
+    waiting, packed = [root], []
+    while waiting:
+        folder = waiting.pop()
+        try:
+            entries = list(folder.iterdir())
+        except OSError as error:
+            found.problems.append(LogProblem(str(folder), None, f"cannot be read: {error.strerror}"))
+            continue
+        for entry in entries:
+            if entry.is_symlink():
+                found.problems.append(LogProblem(str(entry), None, "a link; not followed"))
+            elif entry.is_dir():
+                waiting.append(entry)
+            elif entry.is_file() and _PACKED.search(entry.name):
+                packed.append(entry)
+            elif entry.is_file():
+                parts = (*above, *entry.relative_to(root).parts)
+                found.files.append(LogFile(entry, parts, open_user_file, (entry, _ACCEPTED, LOG_BYTES)))
+    found.files.sort(key=lambda file: file.order)
+    archives = opened.enter_context(contextlib.closing(_Archives()))
+    for path in sorted(packed):
+        folders = (*above, *path.relative_to(root).parts[:-1])
+        plain = path.with_name(_PACKED.sub("", path.name))
+        try:
+            if plain.is_file():
+                found.problems.append(LogProblem(str(path), None, f"not read: {plain.name} lies beside it"))
+            else:
+                _unpack(found, path, (*folders, path.name), folders, archives)
+        except (*READ_ERRORS, ValueError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason})"))
+    return found
+
+
+def _is_packed(path: Path) -> bool:
+    with path.open("rb") as file:
+        head = file.read(512)
+    return head.startswith(tuple(_MARKS)) or head[257:262] == b"ustar"
+
+
+class _Archives:
+    """Opens members of archives, keeping one archive open at a time: a folder may hold very many."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._archive: tarfile.TarFile | None = None
+
+    def open(self, path: Path, member: tarfile.TarInfo) -> IO[bytes]:
+        """Open a member for reading; a member of another archive must have been read completely."""
+        if self._archive is None or self._path != path:
+            self.close()
+            self._path, self._archive = path, tarfile.open(path, "r:*")  # noqa: SIM115 - closed by the next `open` or by `close`
+        stream = self._archive.extractfile(member)
+        if stream is None:
+            raise OSError(f"{member.name} is not a regular file")
+        ending = _ending(member.name)
+        return stream if ending is None else _OPEN[ending](stream)
+
+    def close(self) -> None:
+        """Close what is open."""
+        if self._archive is not None:
+            self._archive.close()
+
+
+def _unpack(
+    found: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], archives: _Archives
+) -> None:
+    """Add the members of an archive, or a compressed file.
+
+    Args:
+        found: the files to add to.
+        path: path of the archive or compressed file.
+        inside: folders that the members are in; empty if the archive is all there is.
+        beside: folders that a compressed file is in.
+        archives: opens the members.
+
+    Raises:
+        OSError: it cannot be read, or is neither an archive nor compressed.
+    """
+    try:
+        with tarfile.open(path, "r:*") as archive:
+            members = _members(path, archive, archives)
+    except tarfile.ReadError:
+        with path.open("rb") as file:
+            head = file.read(8)
+        opener = next((_OPEN[ending] for mark, ending in _MARKS.items() if head.startswith(mark)), None)
+        if opener is None:
+            raise OSError("neither an archive nor compressed" if head else "empty") from None
+        with opener(path) as stream:
+            stream.read(1)
+        found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path,)))
+        return
+    if inside and not any(map(_may_hold_data, members.files)):
+        found.problems += members.problems
+        found.files.append(
+            LogFile(path, (*beside, path.name), open_user_file, (path, _ACCEPTED, LOG_BYTES))
+        )  # perhaps a model for the car
+        return
+    found.parallel = False
+    found.problems += members.problems
+    rest = [file for file in members.files if not inside or not _lies_beside(path, file)]
+    if len(rest) < len(members.files):
+        count = len(members.files) - len(rest)
+        reason = f"{count} of {len(members.files)} files are not read: the same are unpacked beside it"
+        found.problems.append(LogProblem(str(path), None, reason))
+    found.files += [replace(file, parts=(*inside, *file.parts)) for file in rest]
+
+
+def _lies_beside(path: Path, file: LogFile) -> bool:
+    """Return whether a member of an archive is also unpacked beside it, with the same name and size."""
+    named = (_PACKED.sub("", path.name),)
+    _, member = file.given
+    assert isinstance(member, tarfile.TarInfo)
+    for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
+        with contextlib.suppress(OSError):  # not there, or a name that no file system takes
+            if path.parent.joinpath(*place).stat().st_size == member.size:
+                return True
+    return False
+
+
+def _may_hold_data(file: LogFile) -> bool:
+    """Return whether a file may be a trace, a log or metrics."""
+    name = "/".join(file.parts).lower()
+    return (
+        name.endswith(".csv")
+        or LOG.search(file.name) is not None
+        or ("metric" in name and name.endswith(".json"))
+    )
+
+
+def _ending(name: str) -> str | None:
+    """Return the compression of a single file by its name; None for an archive and any other file."""
+    packed = _PACKED.search(name)
+    return packed[1].lower() if packed is not None and packed[1] else None
+
+
+def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFolder:
+    """List the members in their order in the archive: going back would mean reading it again."""
+    found = LogFolder(parallel=False)
+    members: dict[tuple[str, ...], tarfile.TarInfo] = {}
+    try:
+        while (member := archive.next()) is not None:
+            if member.isfile():
+                parts = tuple(
+                    part for part in PurePosixPath(member.name).parts if part not in ("/", "..", ".")
+                )
+                members.pop(parts, None)
+                members[parts] = member  # the later one counts, as in unpacking
+            elif member.islnk() or member.issym():
+                found.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
+    except (*READ_ERRORS, ValueError, OverflowError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        found.problems.append(LogProblem(str(path), None, f"cannot be read to its end ({reason})"))
+    for parts, member in members.items():
+        if parts:
+            plain = parts if _ending(parts[-1]) is None else (*parts[:-1], _PACKED.sub("", parts[-1]))
+            found.files.append(LogFile(path.joinpath(*parts), plain, archives.open, (path, member)))
+    return found

@@ -1,23 +1,28 @@
 """The files of a recording, each read by itself."""
 
+import heapq
 import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO, Any
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, fields
+from typing import IO, Any, TypeVar
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import SETTINGS_BYTES, read_yaml
 
 from . import sim_trace
 from .hyperparameters import read_hyperparameters
-from .log_archive import LOG, READ_ERRORS, LogFile, log_files, natural, place_of, reason_of
+from .log_archive import LOG, LogFile, LogFolder, Place, natural, place_of
+from .log_blocks import READ_ERRORS
 from .model_metadata import ModelMetadata, read_model_metadata
 from .recording import TRAINING, LogProblem
-from .sim_trace import Refused, StepTables, read_trace_csv
-from .training_log import MARKER, TrainingLog, read_training_log
+from .sim_trace import StepTables, read_trace_csv
+from .training_log import MARKER, TrainingLog, piece_of, read_training_logs
+
+Result = TypeVar("Result")
 
 MOST_LISTED = 20
 """Lines of one file that are listed one by one; the rest is counted."""
@@ -31,53 +36,62 @@ _BESIDE = re.compile(
     r"|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
 )
 _MOST_NAMED = 3
+_THREADS = 4
 _MOST_METRICS_BYTES = 2**26
 _LARGEST = 2**31 - 1
 
-MetricsRows = list[dict[str, Any]]
-"""Episodes: `episode` (from 0), `trial`, `phase`, `reward`, `completion`, `time_s`, `episode_status`, `resets`."""
+
+@dataclass
+class TraceFile:
+    """One CSV trace."""
+
+    file: LogFile
+    place: Place
+    number: int | None
+    """The iteration in its name."""
+    steps: StepTables
+
+
+@dataclass
+class MetricsJson:
+    """The episodes of one metrics file of the service."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """Keys `episode` (from 0), `trial`, `phase`, `reward`, `completion`, `time_s`, `episode_status`, `resets`."""
+    refused: list[str] = field(default_factory=list)
 
 
 @dataclass
 class Parts:
     """The content of all files."""
 
-    traces: list[tuple[LogFile, StepTables]] = field(default_factory=list)
+    traces: list[TraceFile] = field(default_factory=list)
     logs: list[tuple[LogFile, TrainingLog]] = field(default_factory=list)
-    metrics: list[tuple[LogFile, MetricsRows]] = field(default_factory=list)
+    metrics: list[tuple[LogFile, MetricsJson]] = field(default_factory=list)
     metadata: list[tuple[LogFile, ModelMetadata]] = field(default_factory=list)
     hyperparameters: list[tuple[LogFile, dict[str, Any]]] = field(default_factory=list)
     reward: list[tuple[LogFile, str]] = field(default_factory=list)
     worlds: dict[str, str] = field(default_factory=dict)
     """Course by kind of job, from the files that start it."""
-    files: list[Path] = field(default_factory=list)
+    files: list[LogFile] = field(default_factory=list)
     problems: list[LogProblem] = field(default_factory=list)
 
-    def steps(self) -> list[tuple[LogFile, StepTables]]:
-        """Return the steps of all files."""
-        return [*self.traces, *((file, log.steps) for file, log in self.logs)]
+    @property
+    def left_out(self) -> bool:
+        """Whether steps were left out because there were too many."""
+        return any(trace.steps.left_out for trace in self.traces) or any(
+            log.steps.left_out for _, log in self.logs
+        )
 
-    def drop_excess(self) -> None:
-        """Drop the first steps of all files while there are too many in memory: the training's earliest, of logs first.
+    def add(self, other: "Parts") -> None:
+        """Add the content of other files."""
+        for part in fields(self):
+            if part.name == "worlds":
+                self.worlds |= other.worlds
+            else:
+                getattr(self, part.name).extend(getattr(other, part.name))
 
-        Those of CSVs have more digits.
-        """
-
-        def order(one: tuple[LogFile, StepTables]) -> tuple[Any, ...]:
-            file, place = one[0], place_of(one[0].parts)
-            is_csv = file.name.lower().endswith(".csv")
-            age = iteration_in_name(file) or 0 if is_csv else file.piece[1]
-            root = natural("/".join(place.root))
-            return place.kind != TRAINING, is_csv, root, age, place.worker, file.order
-
-        excess = sum(steps.rows for _, steps in self.steps()) - sim_trace.MOST_STEPS
-        for _, steps in sorted(self.steps(), key=order) if excess > 0 else ():
-            while excess > 0 and steps.rows:
-                before = steps.rows
-                steps.drop_first()
-                excess -= before - steps.rows
-
-    def refuse(self, file: LogFile, refused: Refused) -> None:
+    def refuse(self, file: LogFile, refused: list[tuple[int | None, str]]) -> None:
         """List what of a file cannot be read."""
         rest = refused[MOST_LISTED:] if len(refused) > MOST_LISTED + 1 else []
         for line, reason in refused[: len(refused) - len(rest)]:
@@ -89,82 +103,164 @@ class Parts:
             self.problems.append(LogProblem(str(file.path), rest[0][0], reason, lines=len(rest)))
 
 
-def iteration_in_name(file: LogFile) -> int | None:
-    """Return the iteration that a CSV is named after."""
-    number = _NUMBER.search(file.name)
-    return int(number[1]) if number else None
-
-
-def read_parts(path: Path) -> Parts:
-    """Read every file of a folder or an archive that may hold data, each by itself."""
-    parts = Parts()
+def read_parts(folder: LogFolder) -> Parts:
+    """Read every file that may hold data, each by itself."""
+    alone = len(folder.files) == 1
+    whole = Parts(problems=list(folder.problems))
     others: list[LogFile] = []
-    for file in log_files(path, parts.problems):
-        try:
-            if _read(parts, file, alone=file.path == path):
-                parts.files.append(file.path)
-                parts.drop_excess()
-            elif not _BESIDE.fullmatch(file.name):
+    limit = _StepLimit()
+    # The members of an archive come out of one stream.
+    with ThreadPoolExecutor(_THREADS if folder.parallel else 1) as pool:
+        found = _in_turn(pool, lambda file: _read_one(file, alone), folder.files)
+        for file, (parts, known) in zip(folder.files, found, strict=True):
+            whole.add(parts)
+            limit.add(parts)
+            if known:
+                whole.files.append(file)
+            elif not parts.problems and not _BESIDE.fullmatch(file.name):
                 others.append(file)
-        except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
-            reason = reason_of(error).removeprefix(f"{file.path}: ")
-            parts.problems.append(LogProblem(str(file.path), None, reason))
-    for file, steps in parts.steps():
-        if steps.left_out:
-            reason = sim_trace.left_out_reason(steps.left_out)
-            parts.problems.append(LogProblem(str(file.path), None, reason, lines=steps.left_out))
+    whole.problems += limit.problems()
     if others:
         named = ", ".join("/".join(file.parts[-2:]) for file in others[:_MOST_NAMED])
         more = ", …" if len(others) > _MOST_NAMED else ""
         reason = f"not logs of the service: {named}{more}"
-        parts.problems.append(LogProblem(f"{len(others)} other files", None, reason))
-    return parts
+        whole.problems.append(LogProblem(f"{len(others)} other files", None, reason))
+    return whole
+
+
+class _StepLimit:
+    """The steps of all files, in the order in which they are dropped if there are too many."""
+
+    def __init__(self) -> None:
+        self._steps: list[tuple[Any, LogFile, StepTables]] = []
+        self._next: list[tuple[Any, int]] = []
+        self._rows = 0
+
+    def add(self, parts: Parts) -> None:
+        """Add the content of one file, and drop the first steps of all while there are too many."""
+        for trace in parts.traces:
+            self._put((1, trace.place, trace.number or 0), trace.file, trace.steps)
+        for file, log in parts.logs:
+            # Before those of CSVs, which have more digits.
+            name, age = piece_of(file.name)
+            self._put((0, place_of((*file.parts[:-1], name)), age), file, log.steps)
+        while self._rows > sim_trace.MOST_STEPS:
+            _, first = self._next[0]
+            steps = self._steps[first][2]
+            if steps.rows:
+                self._rows -= steps.rows
+                steps.drop_first()
+                self._rows += steps.rows
+            else:
+                heapq.heappop(self._next)
+
+    def problems(self) -> list[LogProblem]:
+        """Return what was left out of each file."""
+        return [
+            LogProblem(
+                str(file.path),
+                None,
+                sim_trace.left_out_reason(steps.left_out),
+                lines=steps.left_out,
+            )
+            for _, file, steps in sorted(self._steps, key=lambda one: one[0])
+            if steps.left_out
+        ]
+
+    def _put(self, where: tuple[int, Place, int], file: LogFile, steps: StepTables) -> None:
+        if not (steps.rows or steps.left_out):
+            return
+        is_csv, place, age = where
+        key = (place.kind != TRAINING, is_csv, natural("/".join(place.root)), age, place.worker, file.order)
+        heapq.heappush(self._next, (key, len(self._steps)))
+        self._steps.append((key, file, steps))
+        self._rows += steps.rows
+
+
+def _in_turn(
+    pool: ThreadPoolExecutor, read: Callable[[LogFile], Result], files: Sequence[LogFile]
+) -> Iterator[Result]:
+    """Read files in parallel and yield their content in their order; only a few wait to be yielded."""
+    waiting: deque[Future[Result]] = deque()
+    for file in files:
+        waiting.append(pool.submit(read, file))
+        if len(waiting) > _THREADS:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+def _read_one(file: LogFile, alone: bool) -> tuple[Parts, bool]:
+    """Return the content of a file, and whether it was read."""
+    parts = Parts()
+    try:
+        return parts, _read(parts, file, alone)
+    except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
+        reason = " ".join(str(error).split()).removeprefix(f"{file.path}: ")
+        parts.problems.append(LogProblem(str(file.path), None, reason or type(error).__name__))
+        return parts, False
 
 
 def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
     """Read one file; return whether it was recognised."""
     name = file.name
     if name.lower().endswith(".csv"):
+        return _read_csv(parts, file)
+    if _METADATA.fullmatch(name):
         with file.open() as stream:
-            steps, refused = read_trace_csv(stream)
-        parts.traces.append((file, steps))
-        parts.refuse(file, refused)
-    elif _METADATA.fullmatch(name):
-        parts.metadata.append((file, read_model_metadata(file.path, _content(file))))
-    elif _HYPERPARAMETERS.fullmatch(name):
-        _read_hyperparameters(parts, file, _content(file))
-    elif name.endswith(".json") and not _BESIDE.fullmatch(name):
+            parts.metadata.append((file, read_model_metadata(file.path, stream.read(SETTINGS_BYTES + 1))))
+        return True
+    if _HYPERPARAMETERS.fullmatch(name):
         with file.open() as stream:
-            rows, refused = read_metrics_json(stream)
-        parts.metrics.append((file, rows))
-        parts.refuse(file, refused)
-    elif name.startswith("reward_function") and name.endswith(".py"):
-        parts.reward.append((file, _content(file)[:SETTINGS_BYTES].decode("utf-8", "replace")))
-    elif params := _PARAMS.fullmatch(name):
-        data = read_yaml(file.path, "a job's parameters", raw=_content(file))
-        world = data.get("WORLD_NAME") if isinstance(data, Mapping) else None
-        world = world[0] if isinstance(world, list) and world else world  # the first of several
-        if isinstance(world, str):
+            _read_hyperparameters(parts, file, stream.read(SETTINGS_BYTES + 1))
+        return True
+    if name.endswith(".json") and not _BESIDE.fullmatch(name):
+        with file.open() as stream:
+            metrics = read_metrics_json(stream)
+        parts.metrics.append((file, metrics))
+        parts.refuse(file, [(None, reason) for reason in metrics.refused])
+        return True
+    if name.startswith("reward_function") and name.endswith(".py"):
+        with file.open() as stream:
+            parts.reward.append((file, stream.read(SETTINGS_BYTES).decode("utf-8", "replace")))
+        return True
+    params = _PARAMS.fullmatch(name)
+    if params is not None:
+        with file.open() as stream:
+            world = _world(file, stream.read(SETTINGS_BYTES + 1))
+        if world:
             parts.worlds[params[1]] = world
-    elif alone or LOG.search(name):
-        _read_log(parts, file)
-    else:
-        return False
-    return True
+        return True
+    return _read_log(parts, file) if alone or LOG.search(name) else False
 
 
-def _content(file: LogFile) -> bytes:
+def _read_csv(parts: Parts, file: LogFile) -> bool:
     with file.open() as stream:
-        return stream.read(SETTINGS_BYTES + 1)
+        try:
+            trace = read_trace_csv(stream)
+        except ValueError as error:
+            reason = str(error)
+        else:
+            number = _NUMBER.search(file.name)
+            place = place_of(file.parts)
+            parts.traces.append(TraceFile(file, place, int(number[1]) if number else None, trace.steps))
+            parts.refuse(file, trace.refused)
+            return True
+    # CloudWatch exports logs as CSV too.
+    if reason != "empty" and _read_log(parts, file):
+        return True
+    raise BadInput(f"{reason}; accepted: a trace of the service")
 
 
-def _read_log(parts: Parts, file: LogFile) -> None:
+def _read_log(parts: Parts, file: LogFile) -> bool:
     with file.open() as stream:
-        log = read_training_log(stream)
-    parts.refuse(file, log.refused)
-    if not log.recognised and not log.refused:
-        raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
-    parts.logs.append((file, log))
+        logs = read_training_logs(stream)
+    for log in logs:
+        parts.refuse(file, log.refused)
+        if not log.recognised and not log.refused:
+            raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
+        parts.logs.append((file, log))
+    log = logs[0]  # all workers print the same settings
     if log.metadata is not None:
         try:
             raw = json.dumps(log.metadata).encode()
@@ -173,45 +269,55 @@ def _read_log(parts: Parts, file: LogFile) -> None:
             parts.refuse(file, [(None, f"action space: {str(error).removeprefix(f'{file.path}: ')}")])
     if log.hyperparameters is not None:
         _read_hyperparameters(parts, file, json.dumps(log.hyperparameters).encode())
+    return True
 
 
 def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
     """Add the values that the file itself gives; one that cannot be used is listed, the others stay."""
     refused: list[str] = []
     known = read_hyperparameters(file.path, raw, refused)
-    values = {key: getattr(known, key) for key in known.given if hasattr(known, key)}
-    parts.hyperparameters.append((file, values))
+    parts.hyperparameters.append(
+        (file, {key: getattr(known, key) for key in known.given if hasattr(known, key)})
+    )
     parts.refuse(file, [(None, f"hyperparameters: {reason}") for reason in refused])
 
 
-def read_metrics_json(stream: IO[bytes]) -> tuple[MetricsRows, Refused]:
+def _world(file: LogFile, raw: bytes) -> str:
+    """Return the course named by a job's parameters, the first of several."""
+    data = read_yaml(file.path, "a job's parameters", raw=raw)
+    world = data.get("WORLD_NAME") if isinstance(data, Mapping) else None
+    world = world[0] if isinstance(world, list) and world else world
+    return world if isinstance(world, str) else ""
+
+
+def read_metrics_json(stream: IO[bytes]) -> MetricsJson:
     """Read the metrics of a training or of an evaluation.
 
-    Returns:
-        Its episodes, and the reasons of those that cannot be read.
-
     Raises:
-        ValueError: it holds no list of metrics, or is not JSON; the message gives the reason.
+        ValueError: it holds no list of metrics, or cannot be read; the message gives the reason.
     """
-    raw = stream.read(_MOST_METRICS_BYTES + 1)
+    try:
+        raw = stream.read(_MOST_METRICS_BYTES + 1)
+    except READ_ERRORS as error:
+        raise ValueError(f"cannot be read ({' '.join(str(error).split())})") from error
     if len(raw) > _MOST_METRICS_BYTES:
         raise ValueError(f"larger than {_MOST_METRICS_BYTES // 2**20} MiB")
     try:
         data = json.loads(raw.decode("utf-8-sig", "replace"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"not JSON ({reason_of(error)})") from error
+        raise ValueError(f"not JSON ({' '.join(str(error).split())})") from error
     items = data.get("metrics") if isinstance(data, dict) else None
     if not isinstance(items, list):
         raise ValueError('no metrics; accepted: {"metrics": [...]}')
-    rows: MetricsRows = []
-    refused: Refused = []
+    metrics = MetricsJson()
     for number, item in enumerate(items):
         try:
-            rows.append(_episode_row(number, item))
+            metrics.rows.append(_episode_row(number, item))
         except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
-            reason = f"{type(error).__name__}: {reason_of(error)}"
-            refused.append((None, f"metrics[{number}] is not an episode ({reason})"))
-    return rows, refused
+            metrics.refused.append(
+                f"metrics[{number}] is not an episode ({type(error).__name__}: {' '.join(str(error).split())})"
+            )
+    return metrics
 
 
 def _episode_row(number: int, item: dict[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from deepracer_exp.errors import BadInput
 from .deduplicate import (
     EPISODES_PER_ITERATION,
     Drives,
+    Ints,
     Rows,
     checkpoint_number,
     concatenated,
@@ -25,7 +26,7 @@ from .deduplicate import (
     rows_also_in,
     steps_of,
 )
-from .log_archive import LogFile, Place, label, natural, place_of, same_job
+from .log_archive import LogFile, Place, label, log_folder, natural, place_of, same_job
 from .recording import (
     METRICS_COLUMNS,
     TRAINING,
@@ -36,14 +37,12 @@ from .recording import (
     readable,
     typed_table,
 )
-from .recording_parts import MetricsRows, Parts, iteration_in_name, read_parts
-from .sim_trace import StepTables
+from .recording_parts import MetricsJson, Parts, TraceFile, read_parts
 from .training_log import TrainingLog, Update, join_rolled
 
 _KINDS = (TRAINING, "evaluation", "leaderboard")
-Root = tuple[str, ...]
+_NEARLY = 0.75
 Numbers = Mapping[tuple[int, int, int], int]
-"""Number of an episode in the recording, by round, worker, and its number in the worker's own log."""
 
 
 def read_recording(path: Path) -> Recording:
@@ -57,7 +56,8 @@ def read_recording(path: Path) -> Recording:
     Raises:
         BadInput: there is nothing, or nothing that can be read.
     """
-    parts = read_parts(path)
+    with log_folder(path) as folder:
+        parts = read_parts(folder)
     name = path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".tgz")
     recording = _Assembly(parts).recording(readable(name))
     if not (len(recording.steps) or len(recording.updates) or len(recording.metrics)):
@@ -74,77 +74,80 @@ class _Assembly:
         self.problems = list(parts.problems)
         # Of several files of settings the one nearest to the top is used, files before logs.
         self.settings = _uppermost(parts.hyperparameters) or {}
-        self.episodes_per_iteration = int(
-            self.settings.get("num_episodes_between_training", EPISODES_PER_ITERATION)
-        )
-        self.logs = join_rolled(parts.logs)
-        self.drives = [*self._drives_of_csv()]
-        self.jobs: dict[Root, Root] = {}
-        """Folder of the CSVs by the root of the text logs of the same training."""
-        roots = [self._add_log(file, log) for file, log in self.logs]
-        self.roots = [self.jobs.get(root, root) for root in roots]
-        """Of each log, the root of its drives."""
-        for one in self.drives:
-            one.place = replace(one.place, root=self.jobs.get(one.place.root, one.place.root))
-        self.copies: dict[Root, Drives] = {}
-        """Copies of other trainings, by their folders."""
-        self._drop_copies()
-        self.training = [one for one in self.drives if one.place.kind == TRAINING]
-        self.evaluations = self._named_evaluations()
-        roots_found = {one.place.root for one in self.training} or {()}
-        self.rounds = sorted(roots_found, key=lambda root: natural("/".join(root)))
-        self.first: dict[int, tuple[int, int]] = {}
-        """First iteration and first episode of each round."""
-        self.numbers: Numbers = {}
         self.iteration_of: dict[int, int] = {}
         """Iteration of each training episode of the recording."""
+        self.logs = join_rolled(parts.logs)
+        self.drives = [*self._drives_of_csv()]
+        self.roots: dict[int, tuple[str, ...]] = {}
+        self.jobs: dict[tuple[str, ...], tuple[str, ...]] = {}
+        """Folder of the CSVs by the root of the text logs of the same training."""
+        self.copies: dict[tuple[str, ...], Drives] = {}
+        """Copies of other trainings, by their folders."""
+        for number, (files, log) in enumerate(self.logs):
+            self._add_log(number, files, log)
+        for one in self.drives:
+            one.place = replace(one.place, root=self.jobs.get(one.place.root, one.place.root))
+        self.roots = {number: self.jobs.get(root, root) for number, root in self.roots.items()}
+        self._without_copies()
+        self._without_repeats()
+        self.training = [one for one in self.drives if one.place.kind == TRAINING]
+        self.rounds = sorted(
+            {one.place.root for one in self.training}, key=lambda root: natural("/".join(root))
+        )
+        if not self.rounds:
+            self.rounds = [()]
 
     def recording(self, name: str) -> Recording:
         """Return the recording."""
-        rows = [*self._training_rows(), *self._evaluation_rows()]
+        rows, numbers, first = self._training_rows()
         parts = self.parts
         worlds = [one.world for one in self.training if one.world]
-        rounds = [Round("/".join(self.rounds[number]), *begin) for number, begin in self.first.items()]
+        rounds = [
+            Round("/".join(root), *first[number])
+            for number, root in enumerate(self.rounds)
+            if number in first
+        ]
         return Recording(
             name=name,
-            steps=steps_of(rows),
-            updates=self._updates(),
-            metrics=self._metrics(),
+            steps=steps_of([*rows, *self._evaluation_rows()]),
+            updates=self._updates({number: begin[0] for number, begin in first.items()}),
+            metrics=self._metrics(numbers, {number: begin[0] for number, begin in first.items()}),
             metadata=_uppermost(parts.metadata),
             hyperparameters=self.settings or None,
             reward_source=_uppermost(parts.reward),
             track=worlds[0] if worlds else parts.worlds.get(TRAINING),
             problems=tuple(self.problems),
-            files=tuple(parts.files),
-            checkpoints=self._checkpoints(),
+            files=tuple(file.path for file in parts.files),
+            checkpoints=self._checkpoints({number: begin[0] for number, begin in first.items()}),
             rounds=tuple(rounds) if len(rounds) > 1 else (),
         )
 
-    def _leave_out(self, file: str, count: int, reason: str) -> None:
-        self.problems.append(LogProblem(file, None, f"{count} {reason}", lines=count))
+    @property
+    def _per_iteration(self) -> int:
+        return int(self.settings.get("num_episodes_between_training", EPISODES_PER_ITERATION))
 
     def _drives_of_csv(self) -> Iterable[Drives]:
-        groups: dict[Place, list[tuple[LogFile, StepTables]]] = {}
-        for file, steps in self.parts.traces:
-            place = place_of(file.parts)
+        groups: dict[Place, list[TraceFile]] = {}
+        for trace in self.parts.traces:
+            place = trace.place
             if place.kind == TRAINING:
                 place = replace(place, name=place.root[-1] if place.root else TRAINING)
-            groups.setdefault(place, []).append((file, steps))
+            groups.setdefault(place, []).append(trace)
         for place, traces in groups.items():
-            traces.sort(
-                key=lambda one: (-1 if (at := iteration_in_name(one[0])) is None else at, one[0].order)
-            )
-            tables, iterations = [], []
-            for file, steps in traces:
-                number = iteration_in_name(file)
-                tables.append(in_degrees(steps.whole))
-                counted = tables[-1]["episode"].to_numpy().astype(np.int64) // self.episodes_per_iteration
-                iterations.append(counted if number is None else np.full_like(counted, number))
+            traces.sort(key=lambda trace: (-1 if trace.number is None else trace.number, trace.file.order))
+            tables = [in_degrees(trace.steps.whole) for trace in traces]
+            iterations = [
+                table["episode"].to_numpy().astype(np.int64) // self._per_iteration
+                if trace.number is None
+                else np.full(len(table), trace.number, np.int64)
+                for trace, table in zip(traces, tables, strict=True)
+            ]
             world = self.parts.worlds.get(place.kind, "")
             yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
 
-    def _add_log(self, file: LogFile, log: TrainingLog) -> Root:
-        """Add the drives of a log, or its names to the drives of CSVs with the same steps; return their root."""
+    def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
+        """Add the drives of a log, or its settings where its drives are known already."""
+        file = files[0]
         place = place_of(file.parts)
         if place.kind == TRAINING:
             name = place.name.replace(str(place.worker), "#") if place.worker else place.name
@@ -153,25 +156,25 @@ class _Assembly:
                 name = f"{log.job}, {first_checkpoint(log)}"
             worker = place.worker if log.worker is None else log.worker
             place = replace(place, root=(*place.root, name), worker=worker)
+        job = place.root
+        self.roots[number] = place.root
         if not log.steps.rows:
-            return place.root
+            return
         settings = log.hyperparameters or {}
-        per_iteration = settings.get("num_episodes_between_training")
-        if not isinstance(per_iteration, int) or per_iteration < 1:
-            per_iteration = self.episodes_per_iteration
+        per_iteration = settings.get("num_episodes_between_training", self._per_iteration)
+        whole = per_iteration if isinstance(per_iteration, int) and per_iteration > 0 else self._per_iteration
         table = in_degrees(concatenated([log.steps.whole]))
-        mine = Drives(place, table, iterations_of(table, log, per_iteration), log.world or "", [place.name])
+        mine = Drives(place, table, iterations_of(table, log, whole), log.world or "", [place.name])
         if place.kind != TRAINING:
             mine.iteration[:] = 0
         left = np.ones(len(mine.iteration), np.bool_)
-        root = place.root
         for other in self.drives:
             same = rows_also_in(mine, other)
             if same.any():
                 if left.all():  # of copies the first counts
-                    root = other.place.root
+                    self.roots[number] = other.place.root
                     if place.kind == TRAINING:
-                        self.jobs[place.root] = root
+                        self.jobs[job] = other.place.root
                 left &= ~same
                 other.world = log.world or other.world
                 other.names.append(place.name)
@@ -179,38 +182,56 @@ class _Assembly:
             mine.world = mine.world or self.parts.worlds.get(place.kind, "")
             self.drives.append(mine)
         elif left.any():
-            episodes = table["episode"].to_numpy()[left]
-            reason = (
-                f"steps of episodes {episodes.min()} to {episodes.max()} are left out: they are in the log only, not "
-                "in the CSVs of the same training"
-            )
-            self._leave_out(str(file.path), len(episodes), reason)
-        return root
+            self._add_rest(file, mine.choose(left), self.roots[number], _finished(mine))
 
-    def _drop_copies(self) -> None:
-        """Leave out drives and rows that are there twice, as with a copy of a folder or a file."""
+    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], finished: Ints) -> None:
+        """Add the finished iterations that only the log contains."""
+        others = [one for one in self.drives if one.place.root == root and one.place.kind == rest.place.kind]
+        known = np.unique(np.concatenate([one.iteration for one in others]))
+        whole = ~np.isin(rest.iteration, known) & np.isin(rest.iteration, finished)
+        if rest.place.kind == TRAINING and whole.any():
+            more, into = rest.choose(whole), others[0]
+            iteration = np.concatenate([into.iteration, more.iteration])
+            order = np.argsort(iteration, kind="stable")
+            table = concatenated([into.table, more.table]).take(order)
+            whole_drives = Drives(into.place, table, iteration[order], into.world, into.names)
+            self.drives[self.drives.index(into)] = whole_drives
+            rest = rest.choose(~whole)
+        if rest.table.num_rows:
+            episodes = rest.table["episode"].to_numpy()
+            reason = (
+                f"{rest.table.num_rows} steps of episodes {episodes.min()} to {episodes.max()} are left out: they are "
+                "in the log only, not in the CSVs of the same training"
+            )
+            self.problems.append(LogProblem(str(file.path), None, reason, lines=rest.table.num_rows))
+
+    def _without_copies(self) -> None:
+        """Leave out drives that are there twice, as with a copy of a folder."""
         known: dict[tuple[str, bytes, bytes], Drives] = {}
         for one in list(self.drives):
-            folder = "/".join(one.place.root)
             times = one.table["tstamp"].to_numpy()
             first = known.setdefault((one.place.kind, one.key.tobytes(), times.tobytes()), one)
             if first is not one and len(times):
-                reason = f"steps are left out: copies of {'/'.join(first.place.root)}"
-                self._leave_out(folder, len(times), reason)
+                reason = f"{len(times)} steps are left out: copies of {'/'.join(first.place.root)}"
+                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=len(times)))
                 self.drives.remove(one)
                 self.copies[one.place.root] = one
-                continue
+
+    def _without_repeats(self) -> None:
+        for number, one in enumerate(self.drives):
             twice = repeated(one)
             if twice.any():
-                self._leave_out(folder, int(twice.sum()), "rows are left out: they are there twice")
-                self.drives[self.drives.index(one)] = one.choose(~twice)
+                count = int(twice.sum())
+                reason = f"{count} rows are left out: they are there twice"
+                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=count))
+                self.drives[number] = one.choose(~twice)
 
-    def _training_rows(self) -> Iterable[Rows]:
-        """Yield the rows of the training, and number its rounds, iterations and episodes."""
+    def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, tuple[int, int]]]:
+        """Return the rows, the numbers of the episodes, and the first iteration and episode of each round."""
         place = {root: number for number, root in enumerate(self.rounds)}
         drives = sorted(self.training, key=lambda one: (place[one.place.root], one.place.worker))
         if not drives:
-            return
+            return [], {}, {}
         rounds = np.concatenate([np.full(len(one.iteration), place[one.place.root]) for one in drives])
         worker = np.concatenate([np.full(len(one.iteration), one.place.worker) for one in drives])
         iteration = np.concatenate([one.iteration for one in drives])
@@ -221,39 +242,43 @@ class _Assembly:
             table = table.take(order)
             rounds, worker, iteration = rounds[order], worker[order], iteration[order]
         raw, steps = (table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
-        episode, self.numbers = number_episodes(rounds, worker, raw, iteration, steps)
+        episode, numbers = number_episodes(rounds, worker, raw, iteration, steps)
+        first: dict[int, tuple[int, int]] = {}
         so_far = 0
         for number in np.unique(rounds).tolist():
             of = rounds == number
             # An iteration has the number of the checkpoint that drove it, unless an earlier round has used it.
             so_far = max(so_far, self._base(number))
             iteration[of] += so_far
-            self.first[number] = (so_far, int(episode[of].min()))
+            first[number] = (so_far, int(episode[of].min()))
             so_far = int(iteration[of].max()) + 1
         self.iteration_of = dict(zip(episode.tolist(), iteration.tolist(), strict=True))
         worlds = [
             next((one.world for one in drives if one.place.root == root and one.world), "")
             for root in self.rounds
         ]
-        yield Rows(TRAINING, table, worker, iteration, episode, worlds, rounds)
+        return [Rows(TRAINING, table, worker, iteration, episode, worlds, rounds)], numbers, first
 
     def _logs_of(self, number: int) -> list[TrainingLog]:
         """Return the logs of a round that name its checkpoints."""
-        found = []
-        for (file, log), root in zip(self.logs, self.roots, strict=True):
-            drove = log.checkpoints and log.steps.rows and place_of(file.parts).kind == TRAINING
-            if (log.saved or drove) and self._round(file, root) == number:
-                found.append(log)
-        return found
+        return [
+            log
+            for at, (files, log) in enumerate(self.logs)
+            if (
+                log.saved
+                or (log.checkpoints and log.steps.rows and place_of(files[0].parts).kind == TRAINING)
+            )
+            and self._round(files[0], self.roots[at]) == number
+        ]
 
     def _base(self, number: int) -> int:
         """Return the number of the checkpoint that drove a round's first iteration."""
         return max(map(first_checkpoint, self._logs_of(number)), default=0)
 
-    def _checkpoints(self) -> dict[int, str]:
+    def _checkpoints(self, first: Mapping[int, int]) -> dict[int, str]:
         """Return the names of checkpoints by the iteration that they drove."""
         found: dict[int, str] = {}
-        for number, (begin, _) in self.first.items():
+        for number, begin in first.items():
             base = self._base(number)
             for log in self._logs_of(number):
                 for name in (*log.saved, *(name for _, name in log.checkpoints)):
@@ -261,14 +286,16 @@ class _Assembly:
                         found[checkpoint_number(name) - base + begin] = name
         return dict(sorted(found.items()))
 
-    def _evaluation_rows(self) -> Iterable[Rows]:
-        for name, one in self.evaluations.items():
+    def _evaluation_rows(self) -> list[Rows]:
+        found = []
+        for name, one in self._evaluations().items():
             raw, steps = (one.table[key].to_numpy().astype(np.int64) for key in ("episode", "steps"))
             none = np.zeros_like(raw)
             episode, _ = number_episodes(none, none, raw, none, steps)
-            yield Rows(name, one.table, none, one.iteration, episode, [one.world], none)
+            found.append(Rows(name, one.table, none, one.iteration, episode, [one.world], none))
+        return found
 
-    def _named_evaluations(self) -> dict[str, Drives]:
+    def _evaluations(self) -> dict[str, Drives]:
         """Return evaluations and races by their unique names, in chronological order."""
         drives = [one for one in self.drives if one.place.kind != TRAINING]
         drives.sort(key=lambda one: (_KINDS.index(one.place.kind), natural(one.place.name)))
@@ -282,33 +309,34 @@ class _Assembly:
             named[name] = one
         return named
 
-    def _updates(self) -> pd.DataFrame:
+    def _updates(self, first: Mapping[int, int]) -> pd.DataFrame:
         rows: dict[tuple[int, int], dict[str, Any]] = {}
-        for (file, log), root in zip(self.logs, self.roots, strict=True):
-            of = self._round(file, root) if log.updates else None
+        for number, (files, log) in enumerate(self.logs):
+            if not log.updates:
+                continue
+            of = self._round(files[0], self.roots[number])
             if of is None:
                 continue
-            if self.first and of not in self.first:
-                reason = "policy updates are left out, as their steps are"
-                self._leave_out(str(file.path), len(log.updates), reason)
+            if first and of not in first:
+                self._leave_out(files[0], "policy updates", len(log.updates))
                 continue
-            begin, _ = self.first.get(of, (0, 0))
+            begin = first.get(of, 0)
             for iteration, update in zip(_iterations(log.updates), log.updates, strict=True):
                 row = {"iteration": begin + iteration, "value_loss": np.nan, **update._asdict()}
                 rows.setdefault((row["iteration"], update.epoch), row)
         return typed_table(UPDATE_COLUMNS, [rows[key] for key in sorted(rows)])
 
-    def _round(self, file: LogFile, root: Root) -> int | None:
+    def _round(self, file: LogFile, root: tuple[str, ...]) -> int | None:
         """Return the round that a file belongs to, by its drives, its name, or its folder; None: to a copy."""
         if root in self.copies:
             return None
         if root in self.rounds or (len(self.rounds) == 1 and not self.copies):
             return self.rounds.index(root) if root in self.rounds else 0
-        names: dict[Root, list[str]] = {}
+        names: dict[tuple[str, ...], list[str]] = {}
         for one in (*self.training, *self.copies.values()):
             names.setdefault(one.place.root, []).extend(one.names)
 
-        def nearness(of: Root) -> tuple[bool, int]:
+        def nearness(of: tuple[str, ...]) -> tuple[bool, int]:
             common = next(
                 (at for at, (a, b) in enumerate(zip(of, file.parts, strict=False)) if a != b), len(of)
             )
@@ -317,56 +345,70 @@ class _Assembly:
         nearest = max((*self.rounds, *self.copies), key=nearness)
         return self.rounds.index(nearest) if nearest in self.rounds else None
 
-    def _metrics(self) -> pd.DataFrame:
-        rows: MetricsRows = []
+    def _leave_out(self, file: LogFile, what: str, count: int) -> None:
+        """Report data about steps that are left out."""
+        reason = f"{count} {what} are left out, as their steps are"
+        self.problems.append(LogProblem(str(file.path), None, reason, lines=count))
+
+    def _metrics(self, numbers: Numbers, first: Mapping[int, int]) -> pd.DataFrame:
+        rows: list[dict[str, Any]] = []
         evaluated: set[tuple[str, str]] = set()
-        for file, episodes in self.parts.metrics:
-            if episodes and _of_training(file, episodes):
-                rows += self._training_metrics(file, episodes)
-            elif episodes:
-                names = [
-                    name
-                    for name, one in self.evaluations.items()
-                    if any(same_job(file.name, known) for known in one.names)
+        begins: dict[tuple[int, int], int] = {}
+        for of, own_worker, own in numbers if self.parts.left_out else ():
+            begins[of, own_worker] = min(own, begins.get((of, own_worker), own))
+        evaluations = self._evaluations()
+        for file, metrics in self.parts.metrics:
+            if not metrics.rows:
+                continue
+            if _of_training(file, metrics):
+                worker, number = place_of(file.parts).worker, self._round(file, ())
+                if number is None:
+                    continue
+                begin = begins.get((number, worker), math.inf if begins else 0)
+                gone = sum(row["episode"] < begin for row in metrics.rows)
+                if gone:
+                    self._leave_out(file, "episodes", gone)
+                counted = _iterations_by_trial(metrics.rows)
+                known = [
+                    self.iteration_of[numbers[key]] - at
+                    for row, at in zip(metrics.rows, counted, strict=True)
+                    if row["phase"] == TRAINING and (key := (number, worker, row["episode"])) in numbers
                 ]
-                stream = names[0] if names else label(file.name)
-                # A copy of another evaluation's folder has the same rows.
-                if (stream, repr(episodes)) not in evaluated:
-                    rows += [{**row, "stream": stream, "worker": 0, "iteration": 0} for row in episodes]
-                evaluated.add((stream, repr(episodes)))
+                shift = int(np.median(known)) if known else first.get(number, 0)
+                for row, at in zip(metrics.rows, counted, strict=True):
+                    if row["episode"] < begin:
+                        continue
+                    key = (number, worker, row["episode"])
+                    episode = numbers.get(key)
+                    if episode is None:
+                        episode = _behind(numbers, key)
+                    own_row = {"stream": TRAINING, "worker": worker, "iteration": at + shift}
+                    rows.append({**row, **own_row, "episode": episode})
+            else:
+                stream = label(file.name)
+                for name, one in evaluations.items():
+                    if any(same_job(file.name, known) for known in one.names):
+                        stream = name
+                        break
+                # A copy of another evaluation's folder.
+                if (stream, repr(metrics.rows)) in evaluated:
+                    continue
+                evaluated.add((stream, repr(metrics.rows)))
+                rows += [{**row, "stream": stream, "worker": 0, "iteration": 0} for row in metrics.rows]
         rows.sort(key=lambda row: (0, row["episode"]) if row["stream"] == TRAINING else (1, 0))
         return typed_table(METRICS_COLUMNS, rows)
 
-    def _training_metrics(self, file: LogFile, episodes: MetricsRows) -> MetricsRows:
-        """Return the rows of a training's metrics, with the numbers of the recording."""
-        worker, number = place_of(file.parts).worker, self._round(file, ())
-        if number is None:
-            return []
-        keys = [(number, worker, row["episode"]) for row in episodes]
-        counted = _iterations_by_trial(episodes)
-        known = [
-            self.iteration_of[self.numbers[key]] - at
-            for row, key, at in zip(episodes, keys, counted, strict=True)
-            if row["phase"] == TRAINING and key in self.numbers
-        ]
-        shift = int(np.median(known)) if known else self.first.get(number, (0, 0))[0]
-        dropped = any(steps.left_out for _, steps in self.parts.steps())
-        begin = min((own for *of, own in self.numbers if of == [number, worker]), default=math.inf)
-        rows = [
-            {
-                **row,
-                "stream": TRAINING,
-                "worker": worker,
-                "iteration": at + shift,
-                "episode": self.numbers[key] if key in self.numbers else _behind(self.numbers, key),
-            }
-            for row, key, at in zip(episodes, keys, counted, strict=True)
-            if not dropped or row["episode"] >= begin
-        ]
-        if len(rows) < len(episodes):
-            reason = "episodes are left out, as their steps are"
-            self._leave_out(str(file.path), len(episodes) - len(rows), reason)
-        return rows
+
+def _finished(log: Drives) -> Ints:
+    """Return the finished iterations of a log.
+
+    All but the last are, and the last is if nearly as many episodes ended in it as in the one before: a job ends in
+    the middle of an episode.
+    """
+    iterations = np.unique(log.iteration)
+    done = log.table["done"].to_numpy()
+    counts = [int(done[log.iteration == one].sum()) for one in iterations[-2:]]
+    return iterations if len(counts) > 1 and counts[1] >= _NEARLY * counts[0] else iterations[:-1]
 
 
 def _iterations_by_trial(rows: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -391,11 +433,11 @@ def _behind(numbers: Numbers, key: tuple[int, int, int]) -> int:
     return key[2] if same else max(numbers.values()) + max(1, key[2] - own)
 
 
-def _of_training(file: LogFile, episodes: MetricsRows) -> bool:
+def _of_training(file: LogFile, metrics: MetricsJson) -> bool:
     name = file.name.lower()
     if "training" in name or "evaluation" in name:
         return name.rfind("training") > name.rfind("evaluation")
-    return any(row["phase"] == TRAINING for row in episodes)
+    return any(row["phase"] == TRAINING for row in metrics.rows)
 
 
 def _iterations(updates: Sequence[Update]) -> list[int]:

@@ -1,26 +1,21 @@
 """The simulation trace of every generation of the service, as tables: lines of a log, or a CSV file."""
 
-import codecs
-import contextlib
+import csv
 import math
 import re
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
-from typing import IO
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import IO, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 from pyarrow import csv as arrow_csv
 
-from deepracer_exp.files import LOG_BYTES
+from .log_blocks import Blocks
 
-from .log_archive import READ_ERRORS, reason_of
-
-BLOCK_BYTES = 2**23
-_PIECE_BYTES = 2**16
-_LONGEST_LINE = 2**24
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 COMMON = (
     *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done"),
     *("all_wheels_on_track", "progress", "closest_waypoint", "track_len", "tstamp"),
@@ -29,9 +24,11 @@ COMMON = (
 LATER = ("episode_status", "pause_duration", "obstacle_crash_counter", "wall_clock")
 """Columns of some generations."""
 _COUNTER_OR_CLOCK = "counter or clock"
+Layouts = Mapping[int, Sequence[str]]
+"""Names of the columns by the number of values of a line."""
 # deepracer-simapp, metrics/constants.py. The fourth of 18 later values is the obstacle counter in some versions and
 # the clock in others.
-_LOG_LAYOUTS: Mapping[int, Sequence[str]] = {
+LOG_LAYOUTS: Layouts = {
     15: COMMON,
     16: (*COMMON, "episode_status"),
     17: (*COMMON, "episode_status", "pause_duration"),
@@ -43,6 +40,7 @@ _WHOLE = ("episode", "steps", "closest_waypoint")
 _FLAGS = ("done", "all_wheels_on_track")
 _TRUE, _FALSE = ("True", "true", "1"), ("False", "false", "0")
 _STATUS = re.compile(r"[A-Za-z_ ]{0,40}")
+_CHUNK = 1024
 _LARGEST = 2**31 - 1
 _HEADER = b"episode"
 MOST_STEPS = 4_000_000
@@ -63,81 +61,35 @@ SCHEMA = pa.schema(
 """Columns of a table of rows; `values` is the number of values of the line."""
 
 
-Refused = list[tuple[int | None, str]]
-"""Line (None: from an unknown line on) and reason of what cannot be read."""
+class RefusedLine(NamedTuple):
+    """A line that is not a row of a trace."""
+
+    at: int
+    """Among the lines given."""
+    reason: str
 
 
-class Blocks:
-    """Reads a stream in blocks of whole lines, so that memory does not grow with the file.
-
-    A file with the byte order mark of UTF-16, as PowerShell writes logs, is converted to UTF-8.
-    """
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self.stream = stream
-        self.lines = 0
-        """Lines before the current block."""
-        self.refused: Refused = []
-
-    def __iter__(self) -> Iterator[bytes]:
-        """Yield blocks; only the last may end without a line break."""
-        rest = b""
-        for chunk in self._chunks():
-            end = chunk.rfind(b"\n") + 1
-            if end:
-                block = rest + chunk[:end]
-                yield block
-                self.lines += block.count(b"\n")
-                rest = b""
-            rest += chunk[end:]
-            if len(rest) > _LONGEST_LINE:
-                reason = f"a line of more than {_LONGEST_LINE // 2**20} MiB; the rest is not read"
-                self.refused.append((self.lines + 1, reason))
-                return
-        if rest:
-            yield rest
-
-    def _chunks(self) -> Iterator[bytes]:
-        decoder = None
-        for number, chunk in enumerate(self._bytes()):
-            if not number and chunk[:2] in _UTF_16:
-                decoder = codecs.getincrementaldecoder("utf-16")(errors="replace")
-            elif not number:
-                chunk = chunk.removeprefix(codecs.BOM_UTF8)
-            yield chunk if decoder is None else decoder.decode(chunk).encode("utf-8", "replace")
-
-    def _bytes(self) -> Iterator[bytes]:
-        # In pieces: a truncated archive loses only the piece that fails, not what was read before.
-        pieces: list[bytes] = []
-        size = total = 0
-        while True:
-            try:
-                piece = self.stream.read(_PIECE_BYTES)
-            except READ_ERRORS as error:
-                self.refused.append((None, f"cannot be read to its end ({reason_of(error)})"))
-                piece = b""
-            if total > LOG_BYTES:
-                self.refused.append((None, f"longer than {LOG_BYTES // 2**30} GiB; the rest is not read"))
-                piece = b""
-            pieces.append(piece)
-            size += len(piece)
-            if size >= BLOCK_BYTES or (size and not piece):
-                yield b"".join(pieces)
-                total += size
-                pieces, size = [], 0
-            if not piece:
-                return
+def left_out_reason(steps: int) -> str:
+    """Return the message about steps that were left out because there are too many."""
+    return f"{steps:,} steps are left out: only the last {MOST_STEPS:,} of a recording are kept"
 
 
 class StepTables:
     """Tables of `SCHEMA` in the order of reading; beyond `MOST_STEPS` rows the first tables are dropped."""
 
-    def __init__(self) -> None:
-        self._tables: deque[pa.Table] = deque()
-        self.rows = 0
+    def __init__(self, tables: Iterable[pa.Table] = (), left_out: int = 0) -> None:
+        self._tables = deque(tables)
+        self.rows = sum(table.num_rows for table in self._tables)
         """Rows held."""
-        self.left_out = 0
+        self.left_out = left_out
         """Rows dropped."""
+
+    @classmethod
+    def joined(cls, pieces: Sequence["StepTables"]) -> "StepTables":
+        """Return the tables of several files, one after the other."""
+        return cls(
+            (table for piece in pieces for table in piece._tables), sum(piece.left_out for piece in pieces)
+        )
 
     def add(self, table: pa.Table) -> None:
         """Append rows, and drop the first tables while there are too many rows."""
@@ -145,12 +97,6 @@ class StepTables:
         self.rows += table.num_rows
         while self.rows > MOST_STEPS and len(self._tables) > 1:
             self.drop_first()
-
-    def extend(self, other: "StepTables") -> None:
-        """Append the tables of another file."""
-        self._tables += other._tables
-        self.rows += other.rows
-        self.left_out += other.left_out
 
     def drop_first(self) -> None:
         """Drop the first table: dropping a part of one would not free its memory."""
@@ -169,118 +115,141 @@ class StepTables:
         return pa.concat_tables(self._tables) if self._tables else SCHEMA.empty_table()
 
 
-def left_out_reason(steps: int) -> str:
-    """Return the message about steps that were left out because there are too many."""
-    return f"{steps:,} steps are left out: only the last {MOST_STEPS:,} of a recording are kept"
+@dataclass
+class TraceCsv:
+    """The rows of one CSV file."""
+
+    steps: StepTables = field(default_factory=StepTables)
+    refused: list[tuple[int | None, str]] = field(default_factory=list)
+    """Line (None: from an unknown line on) and reason of what is not a row."""
 
 
-def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
+def read_trace_csv(stream: IO[bytes]) -> TraceCsv:
     """Read a CSV trace; several files one after the other, each with its header, are read as one.
-
-    Returns:
-        The rows, and the lines that are not rows.
 
     Raises:
         ValueError: the first line does not name the columns of a trace; the message names the missing ones.
     """
-    steps, refused, blocks = StepTables(), Refused(), Blocks(stream)
+    trace, blocks = TraceCsv(), Blocks(stream)
     header: Sequence[str] | None = None
     for block in blocks:
-        first = blocks.lines + 1
-        while header is None and block:
-            line, _, block = block.partition(b"\n")
-            first += 1
-            header = _column_names(line) if line.strip() else None
-        if header is None or not block:
+        at, number = 0, blocks.lines + 1
+        while header is None and at < len(block):
+            end = block.find(b"\n", at) + 1 or len(block)
+            line, at, number = block[at:end], end, number + 1
+            if line.strip():
+                header = _column_names(line)
+        if header is None:
             continue
-        count = block.count(b"\n") + (not block.endswith(b"\n"))
-        try:
-            steps.add(_read_rows(block, header, count))
-        except ValueError:
-            _read_csv_lines(steps, refused, block, first, header)
+        data = block[at:]
+        count = data.count(b"\n") + (not data.endswith(b"\n"))
+        table = _read_fast(data, header, count) if data else SCHEMA.empty_table()
+        if table is not None:
+            trace.steps.add(table)
+        else:
+            header = _read_csv_lines(trace, data, number, header)
     if header is None:
-        raise ValueError(blocks.refused[0][1] if blocks.refused else "empty")
-    return steps, refused + blocks.refused
+        raise ValueError("empty" if not blocks.refused else blocks.refused[0][1])
+    trace.refused += blocks.refused
+    return trace
 
 
 def _column_names(line: bytes) -> list[str]:
     names = [name.strip().strip('"') for name in line.decode("utf-8", "replace").split(",")]
     missing = [name for name in COMMON if name not in names]
     if missing:
-        raise ValueError(f"no column {', '.join(missing)}; accepted: a trace of the service")
-    # Of a column that appears twice the first one counts.
-    return [name if name not in names[:at] else f"{name} {at}" for at, name in enumerate(names)]
+        raise ValueError(f"no column {', '.join(missing)}")
+    return names
 
 
-def _read_csv_lines(
-    steps: StepTables, refused: Refused, data: bytes, first: int, header: Sequence[str]
-) -> None:
-    """Read lines of which some are not rows, such as the headers of further files."""
+def _read_csv_lines(trace: TraceCsv, data: bytes, first: int, header: Sequence[str]) -> Sequence[str]:
+    """Read lines of which some are not rows; return the header in force at the end."""
     lines: list[bytes] = []
     numbers: list[int] = []
+
+    def flush() -> None:
+        table, refused = read_rows(lines, {len(header): header})
+        trace.steps.add(table)
+        trace.refused += [(numbers[one.at], one.reason) for one in refused]
+        lines.clear()
+        numbers.clear()
+
     for number, line in enumerate(data.split(b"\n"), start=first):
         line = line.rstrip(b"\r")
-        is_header = line.lstrip(b'" ').startswith(b"episode")
-        if is_header and line.count(b",") + 1 != len(header):
-            refused.append((number, "another header than before"))
-        elif line.strip() and not is_header:
-            lines.append(line)
-            numbers.append(number)
-    table, bad = read_rows(lines, header)
-    steps.add(table)
-    refused += [(numbers[at], reason) for at, reason in bad]
+        if not line.strip():
+            continue
+        if line.lstrip(b'" ').startswith(_HEADER):
+            flush()
+            try:
+                header = _column_names(line)
+            except ValueError as error:
+                trace.refused.append((number, str(error)))
+            continue
+        lines.append(line)
+        numbers.append(number)
+    flush()
+    return header
 
 
-def columns_of(lines: Sequence[bytes]) -> Sequence[str]:
-    """Return the columns of the generation that most trace lines of a log belong to."""
-    counts = Counter(line.count(b",") + 1 for line in lines)
-    return _LOG_LAYOUTS[max(_LOG_LAYOUTS, key=lambda values: counts[values])]
-
-
-def read_rows(lines: Sequence[bytes], columns: Sequence[str]) -> tuple[pa.Table, list[tuple[int, str]]]:
+def read_rows(
+    lines: Sequence[bytes], layouts: Layouts, before: int | None = None
+) -> tuple[pa.Table, list[RefusedLine]]:
     """Read the lines of a trace.
+
+    A single line with fewer values than its neighbours is incomplete, even if an older generation had so many.
 
     Args:
         lines: comma-separated values, without what precedes them in a log.
-        columns: their names.
+        layouts: the columns by the number of values.
+        before: how many values the line before the first had; None if there was none.
 
     Returns:
-        Rows in the order of lines with the columns of `SCHEMA`, and index and reason of each line that is not a row.
+        Rows in the order of lines with the columns of `SCHEMA`, and the lines that are not rows.
     """
-    with contextlib.suppress(ValueError):  # some line is not a row
-        return _read_rows(b"\n".join(lines), columns, len(lines)), []
-    tables: list[pa.Table] = [SCHEMA.empty_table()]
-    refused: list[tuple[int, str]] = []
-
-    def read(places: Sequence[int]) -> None:
-        """Read some lines; where one is not a row, halve them to find out which."""
-        try:
-            tables.append(_read_rows(b"\n".join([lines[at] for at in places]), columns, len(places)))
-        except ValueError as error:
-            half = len(places) // 2
-            if not half:
-                refused.append((places[0], str(error)))
-                return
-            read(places[:half])
-            read(places[half:])
-
-    whole = []
-    for at, line in enumerate(lines):
-        values = line.count(b",") + 1
-        if values == len(columns) or b'"' in line:
-            whole.append(at)
-        else:
-            refused.append((at, f"{values} values; accepted: {len(columns)}"))
-    if whole:
-        read(whole)
-    return pa.concat_tables(tables), sorted(refused)
+    if not lines:
+        return SCHEMA.empty_table(), []
+    whole = _read_chunk(lines, layouts) if len(lines) > 1 or before is None else None
+    if whole is not None:
+        return whole, []
+    incomplete = _incomplete(np.array([line.count(b",") + 1 for line in lines]), before)
+    refused = [
+        RefusedLine(at, f"incomplete: {lines[at].count(b',') + 1} values, fewer than the lines around it")
+        for at in np.flatnonzero(incomplete).tolist()
+    ]
+    kept: list[int] = np.flatnonzero(~incomplete).tolist()
+    tables = []
+    for start in range(0, len(kept), _CHUNK):
+        places = kept[start : start + _CHUNK]
+        chunk = [lines[place] for place in places]
+        table = _read_chunk(chunk, layouts)
+        if table is None:
+            table, bad = _read_slowly(chunk, layouts)
+            refused += [RefusedLine(places[one.at], one.reason) for one in bad]
+        tables.append(table)
+    table = pa.concat_tables(tables) if tables else SCHEMA.empty_table()
+    return table, sorted(refused)
 
 
-def _read_rows(data: bytes, columns: Sequence[str], lines: int) -> pa.Table:
-    """Read flawless lines of the same columns.
+def _incomplete(counts: NDArray[np.int64], before: int | None) -> NDArray[np.bool_]:
+    # At either end the only neighbour counts twice.
+    ahead, after = np.roll(counts, 1), np.roll(counts, -1)
+    if before is not None:
+        ahead[0] = before
+    elif len(counts) > 1:
+        ahead[0] = after[0]
+    after[-1] = ahead[-1]
+    return (counts < ahead) & (counts < after)
 
-    Raises:
-        ValueError: a line is not a row; the message says why.
+
+def _read_chunk(lines: Sequence[bytes], layouts: Layouts) -> pa.Table | None:
+    columns = layouts.get(lines[0].count(b",") + 1)
+    return None if columns is None else _read_fast(b"\n".join(lines), columns, len(lines))
+
+
+def _read_fast(data: bytes, columns: Sequence[str], lines: int) -> pa.Table | None:
+    """Read flawless lines of the same columns; None if they are anything else.
+
+    What it accepts, it reads exactly as `_read_slowly` does.
     """
     kinds = {name: pa.float64() for name in columns}
     kinds |= dict.fromkeys(_FLAGS, pa.bool_()) | {"action": pa.string()}
@@ -288,8 +257,8 @@ def _read_rows(data: bytes, columns: Sequence[str], lines: int) -> pa.Table:
         kinds["episode_status"] = pa.dictionary(pa.int32(), pa.string())
     known = [name for name in columns if name in COMMON or name in LATER or name == _COUNTER_OR_CLOCK]
     # Arrow would end a line at a lone carriage return, too.
-    if b"\r" in data and b"\r" in data.replace(b"\r\n", b""):
-        raise ValueError("has a carriage return")
+    if len(set(known)) != len(known) or (b"\r" in data and b"\r" in data.replace(b"\r\n", b"")):
+        return None
     try:
         read = arrow_csv.read_csv(
             pa.BufferReader(data),
@@ -303,31 +272,15 @@ def _read_rows(data: bytes, columns: Sequence[str], lines: int) -> pa.Table:
                 false_values=_FALSE,
             ),
         )
-    except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        raise ValueError(_reason(str(error), columns)) from error
+    except (pa.ArrowInvalid, UnicodeDecodeError):
+        return None
     if read.num_rows != lines:
-        raise ValueError("is not one line of values")
+        return None
     return _checked({name: read[name] for name in known}, len(columns), lines)
 
 
-def _reason(error: str, columns: Sequence[str]) -> str:
-    """Return in our words why Arrow cannot read a line."""
-    found = re.search(
-        r"column #(\d+): (?:Row #\d+: )?CSV conversion error to (\w+): invalid value '(.*)'", error
-    )
-    if found is None:
-        return " ".join(error.split())
-    value = found[3] if len(found[3]) <= 40 else f"{found[3][:39]}…"
-    accepted = "True or False" if found[2] == "bool" else "a number"
-    return f"{columns[int(found[1])]} is {value!r}; accepted: {accepted}"
-
-
-def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Table:
-    """Return the table of `SCHEMA`.
-
-    Raises:
-        ValueError: a value is out of range.
-    """
+def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Table | None:
+    """Return the table of `SCHEMA`, None if a value is out of range."""
     if _COUNTER_OR_CLOCK in read:
         numbers = read[_COUNTER_OR_CLOCK].to_numpy()
         clock = numbers >= _EARLIEST_CLOCK_S
@@ -346,31 +299,99 @@ def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Tab
             numbers = column.to_numpy()
             # A NaN makes every comparison false.
             if not (((numbers >= 0) & (numbers <= _LARGEST)).all() and (numbers == np.floor(numbers)).all()):
-                raise ValueError(f"{name} is {numbers[0]:g}; accepted: a whole number from 0")
+                return None
             column = numbers.astype(np.int32)
         elif name == "action":
             column = _actions(column)
+            if column is None:
+                return None
         elif name == "episode_status":
             words = {word for chunk in column.chunks for word in chunk.dictionary.to_pylist()}
             if any(word != word.strip() or not _STATUS.fullmatch(word) for word in words):
-                raise ValueError("episode_status is not a status of the service")
+                return None
         elif pa.types.is_floating(kind) and name not in LATER and not np.isfinite(column.to_numpy()).all():
-            raise ValueError(f"{name} is {column[0]}; accepted: a finite number")
+            return None
         columns.append(column if isinstance(column, pa.ChunkedArray) else pa.chunked_array([column]))
     return pa.Table.from_arrays(columns, schema=SCHEMA)
 
 
-def _actions(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return action numbers, NaN for a continuous action: [steer speed].
-
-    Raises:
-        ValueError: one is neither.
-    """
+def _actions(column: pa.ChunkedArray) -> pa.ChunkedArray | None:
+    """Return action numbers, NaN for a continuous action: [steer speed]."""
     continuous = pc.and_(pc.starts_with(column, "["), pc.ends_with(column, "]"))
     try:
         numbers = pc.cast(pc.if_else(continuous, pa.scalar("nan"), column), pa.float64())
     except pa.ArrowInvalid:
-        numbers = None
-    if numbers is None or not np.isfinite(numbers.to_numpy()[~continuous.to_numpy()]).all():
-        raise ValueError(f"action is {column[0]}; accepted: a number or [steer speed]")
-    return numbers
+        return None
+    discrete = numbers.to_numpy()[~continuous.to_numpy()]
+    return numbers if np.isfinite(discrete).all() else None
+
+
+def _read_slowly(lines: Sequence[bytes], layouts: Layouts) -> tuple[pa.Table, list[RefusedLine]]:
+    """Read line by line, and say what is wrong with those that are not rows."""
+    rows, refused = [], []
+    for index, line in enumerate(lines):
+        try:
+            rows.append(_row(line.decode("utf-8", "replace"), layouts))
+        except ValueError as error:
+            refused.append(RefusedLine(index, str(error)))
+    return pa.Table.from_pylist(rows, schema=SCHEMA), refused
+
+
+def _row(line: str, layouts: Layouts) -> dict[str, object]:
+    """Read one line.
+
+    Raises:
+        ValueError: it is not a row; the message gives the reason.
+    """
+    try:
+        values = next(csv.reader([line]), []) if '"' in line else line.split(",")
+    except csv.Error as error:
+        raise ValueError(f"cannot be split into values ({error})") from error
+    columns = layouts.get(len(values))
+    if columns is None:
+        least, most = min(layouts), max(layouts)
+        accepted = f"{least} to {most}" if most > least else str(least)
+        raise ValueError(f"{len(values)} values; accepted: {accepted}")
+    # Of a column that appears twice the first one counts.
+    by_name = dict(zip(reversed(columns), reversed([value.strip() for value in values]), strict=True))
+    row: dict[str, object] = {"values": min(len(values), 127), "episode_status": "", "pause_duration": 0.0}
+    row |= {"obstacle_crash_counter": math.nan, "wall_clock": math.nan}
+    for name, value in by_name.items():
+        if name in COMMON or name in LATER:
+            row[name] = _value(name, value)
+        elif name == _COUNTER_OR_CLOCK:
+            number = _number("the value before the last", value)
+            row["wall_clock" if number >= _EARLIEST_CLOCK_S else "obstacle_crash_counter"] = number
+    return row
+
+
+def _value(name: str, value: str) -> float | bool | str:
+    if name in _FLAGS:
+        if value not in (*_TRUE, *_FALSE):
+            raise ValueError(f"{name} is {_short(value)}; accepted: True or False")
+        return value in _TRUE
+    if name == "episode_status":
+        if not _STATUS.fullmatch(value):
+            raise ValueError(f"{name} is {_short(value)}; accepted: a status of the service")
+        return value
+    if name == "action" and value.startswith("[") and value.endswith("]"):
+        return math.nan
+    number = _number(name, value)
+    if name in _WHOLE:
+        if not (0 <= number <= _LARGEST and number == math.floor(number)):
+            raise ValueError(f"{name} is {_short(value)}; accepted: a whole number from 0")
+        return int(number)
+    if name not in LATER and not math.isfinite(number):
+        raise ValueError(f"{name} is {_short(value)}; accepted: a finite number")
+    return number
+
+
+def _number(name: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise ValueError(f"{name} is {_short(value)}; accepted: a number") from None
+
+
+def _short(value: str) -> str:
+    return repr(value if len(value) <= 40 else f"{value[:39]}…")

@@ -1,4 +1,4 @@
-"""Text logs of simulations and trainers: trace lines, policy updates, settings."""
+"""Text logs of simulations and trainers: trace lines, policy updates, settings; whole, rolled or of several workers."""
 
 import ast
 import json
@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import IO, Any, NamedTuple
 
 from .log_archive import LogFile
-from .sim_trace import Blocks, Refused, StepTables, columns_of, read_rows
+from .log_blocks import Blocks
+from .sim_trace import LOG_LAYOUTS, StepTables, read_rows
 
 MARKER = b"SIM_TRACE_LOG:"
 """Precedes the values of a control step; anything may stand before it."""
@@ -19,17 +20,19 @@ _UPDATE = re.compile(
     rb"Policy training> Surrogate loss=%b, KL divergence=%b, Entropy=%b, training epoch=(\d{1,9}), "
     rb"learning_rate=%b" % (_NUMBER, _NUMBER, _NUMBER, _NUMBER)
 )
-_EPISODE = re.compile(rb"Training> Name=[^\n]*?Episode=\d{1,9},[^\n]*?Training iteration=(\d{1,9})")
+_EPISODE = re.compile(rb"Training> Name=[^\n]*?Episode=(\d{1,9}),[^\n]*?Training iteration=(\d{1,9})")
 _WORLD = re.compile(rb"WORLD_NAME['\"]?\s*[=:]\s*\[?u?['\"]?([\w-]+(?:\.\.\.)?)")
 _SETTING = re.compile(rb'"(\w+)"\s*:\s*("[^"\n]*"|[-+.\deE]+|true|false)')
 _SENSORS = re.compile(
     rb"Sensor list (\[[^\]\n]*\]), network (\w+), simapp_version ([\d.]+)"
-    rb"(?:, training_algorithm (\w+), action_space_type (\w+))?"
+    rb"(?:, training_algorithm (\w+), action_space_type (\w+))?(?: lidar_config (\{[^}\n]*\}))?"
 )
 _WORKER = re.compile(rb"--rollout_idx (\d{1,3})")
 _JOB = re.compile(rb"S3 prefix: ([^\s\x1b]+)")
 _RESTORED = re.compile(rb"Restoring from path[^\n]*?(\d{1,9}_Step-\d{1,12})\.ckpt")
 _SAVED = re.compile(rb"Saving in path=\[[^\n]*?(\d{1,9}_Step-\d{1,12})\.ckpt")
+# The prefix docker puts before the lines of each of several containers.
+_TAG = re.compile(rb"(?m)^([^\s|]+) +\| [^\n]*SIM_TRACE_LOG:")
 _LONGEST_SETTINGS = 10_000
 
 
@@ -51,6 +54,10 @@ class TrainingLog:
 
     steps: StepTables = field(default_factory=StepTables)
     updates: list[Update] = field(default_factory=list)
+    iteration_of: dict[int, int] = field(default_factory=dict)
+    """Iteration of an episode, both counted from 0. A simulation logs 0 for all of them, a trainer the right one."""
+    evaluated_after: list[int] = field(default_factory=list)
+    """How many episodes were driven before each evaluation; there is one after every iteration."""
     hyperparameters: dict[str, Any] | None = None
     action_space: Any = None
     sensors: dict[str, Any] | None = None
@@ -64,27 +71,14 @@ class TrainingLog:
     """First episode driven with each checkpoint (None: not driven yet) and its name, `309_Step-8349`."""
     saved: list[str] = field(default_factory=list)
     """Names of the checkpoints that a trainer wrote; the first one drives the first episodes."""
-    refused: Refused = field(default_factory=list)
-    last_iteration: int | None = None
-    """Iteration of the last episode that a trainer logged."""
-    columns: Sequence[str] | None = None
-    """Names of the values of a trace line."""
-
-    def extend(self, later: "TrainingLog") -> None:
-        """Append the next piece of a rolled log."""
-        self.steps.extend(later.steps)
-        self.updates += later.updates
-        self.checkpoints += later.checkpoints
-        self.saved += later.saved
-        for name in ("hyperparameters", "world", "worker", "job"):
-            if getattr(self, name) is None:
-                setattr(self, name, getattr(later, name))
+    refused: list[tuple[int | None, str]] = field(default_factory=list)
+    """Line (None: from an unknown line on) and reason of what cannot be read."""
 
     @property
     def recognised(self) -> bool:
         """Whether it is a log of the service at all."""
-        found = (self.updates, self.hyperparameters, self.sensors, self.world, self.saved)
-        return self.steps.found or self.last_iteration is not None or any(map(bool, found))
+        found = (self.updates, self.iteration_of, self.hyperparameters, self.sensors, self.world, self.saved)
+        return self.steps.found or any(map(bool, found))
 
     @property
     def metadata(self) -> dict[str, Any] | None:
@@ -94,71 +88,112 @@ class TrainingLog:
         )
 
 
-def read_training_log(stream: IO[bytes]) -> TrainingLog:
-    """Read a text block by block; lines of other programs are ignored."""
-    blocks, log = Blocks(stream), TrainingLog()
+def read_training_logs(stream: IO[bytes]) -> list[TrainingLog]:
+    """Read a text block by block; lines of other programs are ignored.
+
+    Returns:
+        The log in it, or the logs of several workers that share the text: mixed line by line, each line with the
+        container's name before it, or one after the other.
+    """
+    blocks = Blocks(stream)
+    logs: dict[bytes, TrainingLog] = {b"": TrainingLog()}
+    before: dict[bytes, int | None] = {}
+    last = b""
     for block in blocks:
-        _read_checkpoints(log, block)
-        _read_trace(log, block, blocks.lines)
-        _read_updates(log, block, blocks.lines)
-        _read_job(log, block)
-    log.refused += blocks.refused
-    return log
+        for key, part, lines in _parts(block, blocks.lines, last, logs):
+            last = key
+            log = logs.setdefault(key, TrainingLog())
+            _read_checkpoints(log, part)
+            if MARKER in part:
+                before[key] = _read_trace(log, part, lines, before.get(key))
+            _read_updates(log, part, lines)
+            _read_job(log, part)
+    found = [log for log in logs.values() if log.recognised or log.refused] or [logs[b""]]
+    found[0].refused += blocks.refused
+    return found
+
+
+def _parts(
+    block: bytes, lines: int, key: bytes, logs: dict[bytes, TrainingLog]
+) -> Iterator[tuple[bytes, bytes, int]]:
+    """Yield the parts of a block by the log they belong to, each with the number of lines before it."""
+    tags = list(dict.fromkeys(_TAG.findall(block)))
+    if tags:
+        rows = block.split(b"\n")
+        for tag in tags:
+            begins = tag + b" "
+            yield tag, b"\n".join(row if row.startswith(begins) else b"" for row in rows), lines
+        return
+    start = 0
+    for found in _WORKER.finditer(block):
+        worker, at = found[1], block.rfind(b"\n", 0, found.start()) + 1
+        known = logs[key].worker if key in logs else None
+        # A worker logs its number once, at its beginning.
+        if (known is not None or start) and str(known).encode() != worker and at > start:
+            yield key, block[start:at], lines + block.count(b"\n", 0, start)
+            key, start = b"worker " + worker, at
+        elif known is None and key in logs:
+            logs[key].worker = int(worker)
+    yield key, block[start:], lines + block.count(b"\n", 0, start)
 
 
 def _read_checkpoints(log: TrainingLog, block: bytes) -> None:
-    if log.checkpoints and log.checkpoints[-1][0] is None:
-        _drive_with(log, log.checkpoints.pop()[1], block, 0)
-    for found in _RESTORED.finditer(block):
-        _drive_with(log, found[1].decode(), block, found.start())
+    """Record from which episode on each checkpoint drives."""
+    marks = sorted(
+        [(found.start(), found[1].decode()) for found in _RESTORED.finditer(block)]
+        + ([(0, "")] if log.checkpoints and log.checkpoints[-1][0] is None else [])
+    )
+    for start, name in marks:
+        at = block.find(MARKER, start) + len(MARKER)
+        episode = block[at : at + 12].partition(b",")[0] if at >= len(MARKER) else b""
+        first = int(episode) if episode.isdigit() else None
+        if not name:
+            name = log.checkpoints.pop()[1]
+        if log.checkpoints and log.checkpoints[-1][0] in (first, None):
+            log.checkpoints.pop()
+        log.checkpoints.append((first, name))
     log.saved += [found[1].decode() for found in _SAVED.finditer(block)]
 
 
-def _drive_with(log: TrainingLog, checkpoint: str, block: bytes, start: int) -> None:
-    """Record from which episode on a checkpoint drives; of several that are restored before it, the last one does."""
-    at = block.find(MARKER, start) + len(MARKER)
-    episode = block[at : at + 12].partition(b",")[0] if at >= len(MARKER) else b""
-    first = int(episode) if episode.isdigit() else None
-    if log.checkpoints and log.checkpoints[-1][0] in (first, None):
-        log.checkpoints.pop()
-    log.checkpoints.append((first, checkpoint))
-
-
-def _read_trace(log: TrainingLog, block: bytes, lines_before: int) -> None:
+def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
     lines = _TRACE.findall(block)
-    if not lines:
-        return
-    log.columns = log.columns or columns_of(lines)
-    table, refused = read_rows(lines, log.columns)
+    table, refused = read_rows(lines, LOG_LAYOUTS, before)
     log.steps.add(table)
     if refused:
         starts = [found.start() for found in _TRACE.finditer(block)]
-        log.refused += [(_line(block, starts[at], lines_before), reason) for at, reason in refused]
+        log.refused += [(_line(block, starts[one.at], lines_before), one.reason) for one in refused]
+    return int(lines[-1].count(b",")) + 1
 
 
 def _read_updates(log: TrainingLog, block: bytes, lines_before: int) -> None:
-    marks = (b"Policy training>", b"Training> Name=")
-    for start, line in sorted(place for mark in marks for place in _find(block, mark)):
-        if episode := _EPISODE.match(line):
-            log.last_iteration = int(episode[1])
-        elif update := _UPDATE.match(line):
-            try:
+    marks = (b"Policy training>", b"Training> Name=", b"Starting evaluation phase")
+    places = [place for mark in marks for place in _find(block, mark)]
+    for start, line in sorted(places):
+        episode = _EPISODE.match(line)
+        if episode is not None:
+            log.iteration_of[int(episode[1]) - 1] = int(episode[2])
+            continue
+        if line.startswith(b"Starting"):
+            driven = next(reversed(log.iteration_of), -1) + 1
+            if driven > (log.evaluated_after[-1] if log.evaluated_after else 0):
+                log.evaluated_after.append(driven)
+            continue
+        try:
+            update = _UPDATE.match(line)
+            if update is not None:
                 loss, kl, entropy, rate = (float(update[group]) for group in (1, 2, 3, 5))
-            except ValueError:
-                log.refused.append((_line(block, start, lines_before), "a policy update that cannot be read"))
-            else:
-                log.updates.append(Update(log.last_iteration, int(update[4]), loss, kl, entropy, rate))
-        elif line.startswith(b"Policy"):
+                iteration = next(reversed(log.iteration_of.values()), None)
+                log.updates.append(Update(iteration, int(update[4]), loss, kl, entropy, rate))
+                continue
+        except ValueError:
+            pass
+        if line.startswith(b"Policy"):
             log.refused.append((_line(block, start, lines_before), "a policy update that cannot be read"))
 
 
 def _read_job(log: TrainingLog, block: bytes) -> None:
-    for worker in map(int, _WORKER.findall(block)):
-        log.worker = worker if log.worker is None else log.worker
-        if worker != log.worker:
-            log.refused.append(
-                (None, f"holds the steps of worker {worker}, too; give each worker a log of its own")
-            )
+    if log.worker is None and (worker := _WORKER.search(block)):
+        log.worker = int(worker[1])
     if log.job is None and (job := _JOB.search(block)):
         log.job = job[1].decode("utf-8", "replace").strip("/")
     if log.hyperparameters is None:
@@ -183,13 +218,14 @@ def _sensors(line: bytes) -> dict[str, Any] | None:
     found = _SENSORS.match(line)
     if found is None:
         return None
-    sensor, network, version, algorithm, kind = found.groups()
+    sensor, network, version, algorithm, kind, lidar = found.groups()
     values = {
         "sensor": _parsed(ast.literal_eval, sensor),
         "neural_network": network.decode(),
         "version": version.decode().partition(".")[0],
         "training_algorithm": None if algorithm is None else algorithm.decode(),
         "action_space_type": None if kind is None else kind.decode(),
+        "lidar_config": None if lidar is None else _parsed(ast.literal_eval, lidar),
     }
     return {key: value for key, value in values.items() if value is not None}
 
@@ -216,13 +252,47 @@ def _line(block: bytes, start: int, lines_before: int) -> int:
     return lines_before + block.count(b"\n", 0, start) + 1
 
 
-def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[LogFile, TrainingLog]]:
-    """Join the pieces of rolled logs, the earliest first."""
-    groups: dict[tuple[str, ...], list[tuple[LogFile, TrainingLog]]] = {}
+def piece_of(name: str) -> tuple[str, int]:
+    """Return the name of the whole log and a key that sorts its pieces (`robomaker.log.1`) from the oldest.
+
+    The highest number is the oldest piece; the one without a number is still being written.
+    """
+    stem, _, number = name.rpartition(".")
+    return (stem, -int(number)) if number.isdigit() else (name, 1)
+
+
+def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[LogFile], TrainingLog]]:
+    """Join the pieces of rolled logs, the earliest first: by their episodes, or else by their numbers."""
+    groups: dict[tuple[str | int, ...], list[tuple[LogFile, TrainingLog]]] = {}
+    of_file: dict[LogFile, int] = {}
     for file, log in logs:
-        groups.setdefault(file.piece[0], []).append((file, log))
+        name, _ = piece_of(file.name)
+        # One text may hold the logs of several workers.
+        of_file[file] = of_file.get(file, -1) + 1
+        groups.setdefault((*file.parts[:-1], name, of_file[file]), []).append((file, log))
+    joined = []
     for pieces in groups.values():
-        pieces.sort(key=lambda one: one[0].piece[1])
-        for _, later in pieces[1:]:
-            pieces[0][1].extend(later)
-    return [pieces[0] for pieces in groups.values()]
+        pieces.sort(key=_time_of_piece)
+        whole = TrainingLog(
+            steps=StepTables.joined([log.steps for _, log in pieces]),
+            updates=[update for _, log in pieces for update in log.updates],
+            evaluated_after=[count for _, log in pieces for count in log.evaluated_after],
+            iteration_of={key: value for _, log in pieces for key, value in log.iteration_of.items()},
+            hyperparameters=next((log.hyperparameters for _, log in pieces if log.hyperparameters), None),
+            world=next((log.world for _, log in pieces if log.world), None),
+            worker=next((log.worker for _, log in pieces if log.worker is not None), None),
+            job=next((log.job for _, log in pieces if log.job), None),
+            checkpoints=[one for _, log in pieces for one in log.checkpoints],
+            saved=[name for _, log in pieces for name in log.saved],
+        )
+        joined.append(([file for file, _ in pieces], whole))
+    return joined
+
+
+def _time_of_piece(piece: tuple[LogFile, TrainingLog]) -> tuple[int, int, int]:
+    file, log = piece
+    _, age = piece_of(file.name)
+    if log.steps.rows:
+        first = log.steps.whole.slice(0, 1)
+        return first["episode"][0].as_py(), first["steps"][0].as_py(), age
+    return (next(iter(log.iteration_of), -1), 0, age)

@@ -188,6 +188,17 @@ def test_any_option_file_is_taken_or_named_in_one_line(group, tmp_path, monkeypa
         _assert_one_line(complaint, f"file{at}")
 
 
+def test_an_option_file_leads_to_no_file_outside_of_its_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "stopping").mkdir(parents=True)
+    (tmp_path / "secret.yaml").write_text("kind: none\n")
+    for name in ("../../secret", str(tmp_path / "secret")):
+        (tmp_path / "conf" / "stopping" / "mine.yaml").write_text(f"defaults: ['{name}']\n")
+        complaint = _refusal(compose_experiment, ["stopping=mine"])
+        assert complaint is not None
+        _assert_one_line(complaint, "stopping", "secret")
+
+
 @pytest.mark.parametrize(
     "line",
     [

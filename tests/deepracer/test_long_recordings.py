@@ -7,15 +7,20 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from deepracer_exp.deepracer import sim_trace
+from deepracer_exp.deepracer import log_blocks, sim_trace
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.deepracer.trace import read_trace
-from deepracer_exp.deepracer.training_log import read_training_log
+from deepracer_exp.deepracer.training_log import TrainingLog, read_training_logs
 from deepracer_exp.runs.own_recording import read_own_recording
 
 from . import made_up_logs as made
 
 LINE = made.line(next(made.drives([0]).itertuples())) + "\n"
+
+
+def read_training_log(raw: bytes) -> TrainingLog:
+    (log,) = read_training_logs(io.BytesIO(raw))
+    return log
 
 
 @pytest.fixture
@@ -24,7 +29,7 @@ def most_steps(monkeypatch):
 
     def most(steps: int) -> None:
         monkeypatch.setattr(sim_trace, "MOST_STEPS", steps)
-        monkeypatch.setattr(sim_trace, "BLOCK_BYTES", 2**16)
+        monkeypatch.setattr(log_blocks, "SIZE", 2**16)
 
     return most
 
@@ -33,10 +38,10 @@ def test_of_a_log_longer_than_memory_the_last_steps_are_held_and_the_others_coun
     raw = "".join(made.log_text(made.drives([episode], seed=episode)) for episode in range(4000)).encode()
     assert len(raw) > 2**21
     lines = raw.count(b"SIM_TRACE_LOG")
-    whole = read_training_log(io.BytesIO(raw)).steps
+    whole = read_training_log(raw).steps
     assert (whole.rows, whole.left_out) == (lines, 0)
     most_steps(lines // 3)
-    last = read_training_log(io.BytesIO(raw)).steps
+    last = read_training_log(raw).steps
     assert last.rows + last.left_out == lines
     assert lines // 6 < last.rows <= lines // 3
     rows = whole.whole.to_pandas()[last.left_out :].reset_index(drop=True)
@@ -48,7 +53,7 @@ def peak_of_arrow(raw: bytes) -> int:
     counting = pa.proxy_memory_pool(before)
     pa.set_memory_pool(counting)
     try:
-        read_training_log(io.BytesIO(raw))
+        read_training_log(raw)
         return counting.max_memory()
     finally:
         pa.set_memory_pool(before)

@@ -57,13 +57,41 @@ def test_archives_in_a_folder_are_read_as_what_they_hold(tmp_path):
     assert len(streams) == made.EVALUATIONS["console"]
 
 
-@pytest.mark.parametrize("copy", ["archive", "unpacked"])
-def test_a_copy_of_the_same_drives_is_reported_and_left_out(copy, tmp_path):
-    made.write_archive(made.console(), tmp_path / "week.tar.gz")
-    if copy == "archive":
-        made.write_archive(made.console(), tmp_path / "week (1).tar.gz")
-    else:
-        made.write_folder(made.console(), tmp_path / "week")
+@pytest.mark.parametrize("beside", ["week-one", "model"])
+def test_what_lies_unpacked_beside_an_archive_is_read_once(beside, tmp_path):
+    # The members' own folder is called model.
+    files = made.console()
+    made.write_archive(files, tmp_path / "week-one.tar.gz")
+    made.write_folder(files, tmp_path / beside)
+    recording = read_recording(tmp_path)
+    assert len(made.training(recording)) == made.ROWS["console"]
+    (problem,) = recording.problems
+    told = f"{len(files)} of {len(files)} files are not read: the same are unpacked beside it"
+    assert str(problem) == f"{tmp_path / 'week-one.tar.gz'}: {told}"
+
+
+def test_what_is_missing_beside_an_archive_is_read_out_of_it(tmp_path):
+    files = made.drfc_single()
+    made.write_archive(files, tmp_path / "week-one.tar.gz")
+    some = {name: text for name, text in files.items() if "training-simtrace/0-" in name}
+    other = {name: text + "\n" for name, text in files.items() if "training-simtrace/2-" in name}
+    assert len(some) == len(other) == 1
+    made.write_folder(some | other, tmp_path / "elsewhere" / "model")
+    whole = read_recording(tmp_path / "week-one.tar.gz")
+    for name in some | other:
+        (tmp_path / "model" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "model" / name).write_text((some | other)[name])
+    recording = read_recording(tmp_path / "week-one.tar.gz")
+    assert len(recording.steps) == len(whole.steps)
+    rest = read_recording(tmp_path)
+    assert any(f"1 of {len(files)} files are not read" in problem.reason for problem in rest.problems), (
+        rest.problems
+    )
+
+
+def test_a_copy_of_the_same_drives_is_told_and_left_out(tmp_path):
+    for name in ("week.tar.gz", "week (1).tar.gz"):
+        made.write_archive(made.console(), tmp_path / name)
     recording = read_recording(tmp_path)
     once = read_recording(tmp_path / "week.tar.gz")
     for table in ("steps", "updates", "metrics"):
@@ -72,7 +100,16 @@ def test_a_copy_of_the_same_drives_is_reported_and_left_out(copy, tmp_path):
     assert any("steps are left out: copies of" in problem.reason for problem in recording.problems)
 
 
-def test_archives_in_a_folder_are_not_workers_of_one_training(tmp_path):
+def test_names_of_members_count_as_unpacked_and_archives_are_no_workers(tmp_path):
+    path = tmp_path / "a.tar"
+    with tarfile.open(path, "w") as archive:
+        for name, seed in (("x/0-iteration.csv", 1), ("./x/0-iteration.csv", 2)):
+            raw = made.csv_text(made.drives([0], seed=seed)).encode()
+            member = tarfile.TarInfo(name)
+            member.size = len(raw)
+            archive.addfile(member, io.BytesIO(raw))
+    last = made.drives([0], seed=2)
+    assert read_recording(path).steps["X"].tolist() == last["X"].tolist()
     for number in (1, 2):
         csv = {"training-simtrace/0-iteration.csv": made.csv_text(made.drives([0], seed=number))}
         made.write_archive(csv, tmp_path / "two" / f"{number}.tar.gz")
@@ -143,17 +180,17 @@ def test_logs_that_were_packed_one_by_one_are_read(pack, alone, tmp_path):
     assert recording.steps["episode"].tolist() == sorted([0, 1] * 6 if alone else [0, 1, 2, 3] * 6)
 
 
-def test_a_model_for_the_car_is_not_a_log_and_a_corrupt_archive_is_reported(tmp_path):
+def test_a_model_for_the_car_is_no_log_and_a_torn_archive_is_told(tmp_path):
     made.write_folder(made.drfc_single(), tmp_path)
     made.write_archive({"agent/model.pb": "weights"}, tmp_path / "carfile.tar.gz")
     assert not read_recording(tmp_path).problems
-    corrupt = tmp_path / "week-one.tar.gz"
+    torn = tmp_path / "week-one.tar.gz"
     model = tmp_path / "my-model.tar.gz"
     made.write_archive({"a.pb": "weights" * 9999, "z/0-iteration.csv": "x" * 9999}, model)
     model.write_bytes(model.read_bytes()[:90])
-    made.write_archive(made.console(), corrupt)
-    corrupt.write_bytes(corrupt.read_bytes()[:20])
+    made.write_archive(made.console(), torn)
+    torn.write_bytes(torn.read_bytes()[:20])
     recording = read_recording(tmp_path)
     assert len(made.training(recording)) == made.ROWS["drfc_single"]
-    for path in (corrupt, model):
+    for path in (torn, model):
         assert str(path) in "\n".join(map(str, recording.problems))

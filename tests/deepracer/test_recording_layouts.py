@@ -117,10 +117,20 @@ def test_episodes_of_several_workers_are_numbered_by_iteration_and_worker(place)
     assert rows["iteration"].is_monotonic_increasing
 
 
-def test_text_logs_of_several_workers_are_one_training_with_the_iterations_of_its_checkpoints(tmp_path):
-    for worker in range(3):
-        file = tmp_path / f"deepracer-0_robomaker.{worker + 1}.ab{worker}c.log"
-        file.write_text(made.worker_text(worker))
+@pytest.mark.parametrize("how", ["files", "one after the other", "line by line"])
+def test_text_logs_of_several_workers_are_one_training_with_the_iterations_of_its_checkpoints(tmp_path, how):
+    tags = [f"robomaker.{worker + 1}.ab{worker}@host    | " for worker in range(3)]
+    texts = [
+        made.worker_text(worker, tag=tags[worker] if how == "line by line" else "") for worker in range(3)
+    ]
+    if how == "files":
+        for worker, text in enumerate(texts):
+            (tmp_path / f"deepracer-0_robomaker.{worker + 1}.ab{worker}c.log").write_text(text)
+    elif how == "one after the other":
+        (tmp_path / "all.log").write_text("".join(texts))
+    else:
+        mixed = zip(*(text.splitlines(keepends=True) for text in texts), strict=True)
+        (tmp_path / "all.log").write_text("".join(one for lines in mixed for one in lines))
     recording = read_recording(tmp_path)
     rows = made.training(recording)
     of = rows.groupby("episode")[["iteration", "worker"]].first()
@@ -167,6 +177,19 @@ def test_races_that_begin_with_the_same_rows_are_both_kept(tmp_path):
     assert not recording.problems
 
 
+def test_an_iteration_of_the_log_alone_is_used_though_the_job_ended_within_its_last_episode(tmp_path):
+    drives = [made.drives(range(4 * number, 4 * number + 4), seed=number + 1) for number in range(3)]
+    files = {f"training-simtrace/{number}-iteration.csv": made.csv_text(drives[number]) for number in (0, 1)}
+    lines = []
+    for number, rows in enumerate((*drives[:2], drives[2].iloc[:-3])):
+        lines.append(f"Checkpoint> Restoring from path=./agent/{number}_Step-{24 * number}.ckpt")
+        lines += [made.line(row) for row in rows.itertuples()]
+    files["logs/training/x-robomaker.log"] = "\n".join(lines) + "\n"
+    recording = read_recording(made.write_folder(files, tmp_path))
+    assert made.training(recording).groupby("iteration")["episode"].nunique().tolist() == [4, 4, 4]
+    assert not recording.problems
+
+
 def test_metrics_tell_the_iterations_of_episodes_whose_traces_are_missing(place):
     files = made.drfc_single()
     for number in (0, 2):
@@ -201,19 +224,20 @@ def test_clones_go_on_where_the_one_before_ended(place):
     assert (recording.metrics.set_index("episode")["reward"] == reward).all()
 
 
-def test_steps_that_only_the_log_of_a_training_with_csvs_has_are_listed(place):
+def test_drives_that_are_in_the_log_only_are_added_but_for_the_iteration_that_was_not_finished(place):
     files = made.console()
     del files["sim-trace/training/training-simtrace/1-iteration.csv"]
+    name = next(name for name in files if "training" in name and name.endswith("robomaker.log"))
+    more = made.drives([6, 7], seed=4).iloc[:9]
+    files[name] = "".join(made.trainer_text(3)) + made.log_text(pd.concat([made.whole_training(), more]))
     recording = read_recording(place(files))
-    assert set(made.training(recording)["iteration"]) == {0, 2}
+    rows = made.training(recording)
+    assert len(rows) == 36
+    assert rows["iteration"].tolist() == (np.arange(36) // 12).tolist()
+    np.testing.assert_allclose(rows["X"], made.whole_training()["X"], rtol=0, atol=6e-5)
     (problem,) = recording.problems
-    assert problem.lines == 12
-    assert "12 steps of episodes 2 to 3 are left out: they are in the log only" in problem.reason
-
-
-def test_one_text_of_two_workers_is_reported(tmp_path):
-    (tmp_path / "all.log").write_text(made.worker_text(0) + made.worker_text(1))
-    assert "give each worker a log of its own" in str(read_recording(tmp_path).problems[0])
+    assert problem.lines == 9
+    assert "9 steps of episodes 6 to 7 are left out: they are in the log only" in problem.reason
 
 
 def test_a_rolled_log_is_read_in_the_order_of_its_episodes(tmp_path):

@@ -62,6 +62,10 @@ def test_every_generation_of_lines_with_any_prefix_has_the_same_columns(tmp_path
     assert steps["obstacle_crash_counter"].notna().all() == (fields == 19)
     assert steps["wall_clock"].notna().all() == (fields >= 18)
     assert steps["speed_mps"].isna().all()
+
+
+@pytest.mark.parametrize("fields", GENERATIONS)
+def test_every_generation_of_csv_goes_by_its_names(tmp_path, fields):
     file = tmp_path / "0-iteration.csv"
     file.write_text(made.csv_text(ROWS, fields))
     steps = read_recording(file).steps
@@ -88,8 +92,10 @@ def test_the_radians_of_2019_become_degrees_and_later_degrees_stay(tmp_path):
         np.testing.assert_allclose(steps["steer"], ROWS["steer"], rtol=0, atol=0.4)
 
 
-@pytest.mark.parametrize("action", ["[-6.65667057  0.65535903]", "[ 5.  1.]"])
-def test_a_continuous_action_has_no_number(tmp_path, action):
+@pytest.mark.parametrize(
+    "action", ["[-6.65667057  0.65535903]", "[ 5.  1.]", "[1.5875086159594005 1.7339787686700332]"]
+)
+def test_a_continuous_action_is_no_number(tmp_path, action):
     rows = ROWS.assign(action=action)
     (tmp_path / "a.log").write_text(made.log_text(rows, 19))
     (tmp_path / "b").mkdir()
@@ -100,14 +106,22 @@ def test_a_continuous_action_has_no_number(tmp_path, action):
         assert recording.steps["action"].isna().all()
 
 
-def test_csvs_one_after_the_other_in_one_file_are_all_read(tmp_path):
-    (tmp_path / "all.csv").write_text("\n".join(made.csv_text(ROWS.assign(episode=at)) for at in range(3)))
-    recording = read_recording(tmp_path / "all.csv")
+def test_generations_one_after_the_other_in_one_file_are_all_read(tmp_path):
+    text = "".join(
+        made.log_text(ROWS.assign(episode=ROWS["episode"] + 3 * at), f) for at, f in enumerate(GENERATIONS)
+    )
+    (tmp_path / "a.log").write_text(text)
+    recording = read_recording(tmp_path)
     assert not recording.problems
-    assert len(recording.steps) == 3 * len(ROWS)
+    assert len(recording.steps) == len(ROWS) * len(GENERATIONS)
+    tables = [
+        made.csv_text(ROWS.assign(episode=ROWS["episode"] + 3 * at), f) for at, f in enumerate(GENERATIONS)
+    ]
+    (tmp_path / "all.csv").write_text("\n".join(tables))
+    assert len(read_recording(tmp_path / "all.csv").steps) == len(ROWS) * len(GENERATIONS)
 
 
-def test_incomplete_lines_are_listed_with_their_numbers_and_the_others_are_read(tmp_path):
+def test_torn_lines_are_listed_with_their_numbers_and_the_others_are_read(tmp_path):
     lines = [made.line(row) for row in ROWS.itertuples()]
     lines[2] = lines[2].rsplit(",", 2)[0]  # as many values as a line of 2019
     lines[7] = lines[7].replace("False", "Fal", 1)
@@ -118,9 +132,9 @@ def test_incomplete_lines_are_listed_with_their_numbers_and_the_others_are_read(
     recording = read_recording(log)
     assert len(recording.steps) == len(ROWS) - 4
     assert [problem.line for problem in recording.problems] == [4, 9, 11, 19]
-    reasons = [problem.reason for problem in recording.problems]
-    assert reasons[0] == "15 values; accepted: 17"
-    assert reasons[1] == "done is 'Fal'; accepted: True or False"
+    told = [problem.reason for problem in recording.problems]
+    assert "incomplete" in told[0]
+    assert told[1] == "done is 'Fal'; accepted: True or False"
     assert all(str(problem).startswith(f"{log}:") for problem in recording.problems)
 
 
@@ -168,6 +182,24 @@ def test_policy_updates_that_diverged_are_read_and_torn_ones_listed(tmp_path):
     assert problem.line == len(good.splitlines()) + 1
 
 
+def test_a_truncated_archive_gives_what_can_be_read(tmp_path):
+    rng = np.random.default_rng(0)
+    files = made.console() | {"z.log": rng.bytes(200_000).hex()}
+    path = made.write_archive(files, tmp_path / "model.tar.gz")
+    raw = path.read_bytes()
+    whole = len(read_recording(path).steps)
+    seen = set()
+    for share in (0.02, 0.3, 0.9):
+        path.write_bytes(raw[: int(share * len(raw))])
+        recording = read_or_refused(path)
+        if recording is None:
+            continue
+        seen.add(len(recording.steps))
+        assert any("cannot be read to its end" in problem.reason for problem in recording.problems)
+    assert seen
+    assert max(seen) <= whole
+
+
 def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
     log = tmp_path / "large.log"
     noise = (
@@ -187,15 +219,23 @@ def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
     assert peak < 60e6
 
 
-def test_the_rest_of_a_line_without_end_is_reported(tmp_path):
-    text = made.log_text(ROWS)
-    (tmp_path / "a.log").write_bytes(text.encode() + b"\0" * 2**25)
-    recording = read_recording(tmp_path / "a.log")
-    assert len(recording.steps) == len(ROWS)
-    (problem,) = recording.problems
-    assert (problem.line, "a line of more than 16 MiB" in problem.reason) == (text.count("\n") + 1, True)
+def test_a_line_without_end_is_skipped_and_told(tmp_path):
+    log = tmp_path / "a.log"
+    with log.open("wb") as file:
+        file.write(made.log_text(ROWS).encode())
+        for _ in range(40):
+            file.write(b"\0" * 2**20)
+        file.write(
+            b"\n" + made.log_text(ROWS.assign(episode=ROWS["episode"] + 9)).encode() + b"SIM_TRACE_LOG:1\n"
+        )
+    recording = read_recording(log)
+    assert len(recording.steps) == 2 * len(ROWS)
+    first = len(ROWS) + 4
+    assert [problem.line for problem in recording.problems] == [2 * first, first]
+    assert "a line of more than 16 MiB" in recording.problems[1].reason
 
 
+FILES = ("a.log", "0-iteration.csv", "a.tar.gz", "TrainingMetrics.json")
 characters = st.sampled_from(list("0123456789.,-[]\"'\\\r\t :TFaex_\0é\x1b"))
 edits = st.lists(
     st.tuples(st.floats(0, 1, exclude_max=True), st.sampled_from(["put", "cut", "over"]), characters),
@@ -211,25 +251,33 @@ def damaged(text: str, changes: list[tuple[float, str, str]]) -> str:
     return text
 
 
-@given(
-    fields=st.sampled_from(GENERATIONS),
-    changes=edits,
-    cut=st.floats(0.1, 1),
-    name=st.sampled_from(["a.log", "0-iteration.csv"]),
-)
-@settings(max_examples=250)
-def test_every_line_of_a_log_or_csv_is_read_or_listed(tmp_path_factory, fields, changes, cut, name):
-    is_csv = name.endswith("csv")
-    text = made.csv_text(ROWS, fields) if is_csv else made.log_text(ROWS, fields)
-    head, end, body = text.partition("\n") if is_csv else ("", "", text)
+@given(fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
+@settings(max_examples=150)
+def test_every_trace_line_is_read_or_listed(tmp_path_factory, fields, changes, cut):
+    text = damaged(made.log_text(ROWS, fields), changes)
+    text = text[: int(cut * len(text))]
+    log = tmp_path_factory.mktemp("fuzz") / "a.log"
+    log.write_text(text, newline="")
+    present = sum("SIM_TRACE_LOG:" in line for line in text.split("\n"))
+    recording = read_or_refused(log)
+    if recording is None:
+        return
+    assert len(recording.steps) + sum(problem.lines for problem in recording.problems) == present
+
+
+@given(fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
+@settings(max_examples=150)
+def test_every_line_of_a_csv_is_read_or_listed(tmp_path_factory, fields, changes, cut):
+    head, _, body = made.csv_text(ROWS, fields).partition("\n")
     body = damaged(body, changes)
     body = body[: int(cut * len(body))]
-    file = tmp_path_factory.mktemp("fuzz") / name
-    file.write_text(f"{head}{end}{body}", newline="")
-    present = sum(bool(line.strip()) if is_csv else "SIM_TRACE_LOG:" in line for line in body.split("\n"))
+    file = tmp_path_factory.mktemp("fuzz") / "0-iteration.csv"
+    file.write_text(f"{head}\n{body}", newline="")
+    present = sum(bool(line.strip()) for line in body.split("\n"))
     recording = read_or_refused(file)
-    if recording is not None:
-        assert len(recording.steps) + sum(problem.lines for problem in recording.problems) == present
+    if recording is None:
+        return
+    assert len(recording.steps) + sum(problem.lines for problem in recording.problems) == present
 
 
 @given(

@@ -1,0 +1,92 @@
+"""Large files read in blocks of whole lines."""
+
+import codecs
+import lzma
+import tarfile
+import zlib
+from collections.abc import Iterator
+from typing import IO
+
+from deepracer_exp.files import LOG_BYTES
+
+READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError)
+"""Errors of reading a file or a member of an archive."""
+SIZE = 2**23
+"""Size of a block in bytes."""
+_PIECE = 2**16
+_LONGEST_LINE = 2**24
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+class Blocks:
+    """Reads a stream in blocks of whole lines, so that memory does not grow with the file.
+
+    A file with the byte order mark of UTF-16, as PowerShell writes logs, is converted to UTF-8.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self.stream = stream
+        self.size = SIZE
+        self._ended = False
+        self._bytes = 0
+        self.lines = 0
+        """Lines before the current block."""
+        self.refused: list[tuple[int | None, str]] = []
+        """Line (None: from here on) and reason of what could not be read."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Yield blocks; only the last may end without a line break."""
+        rest, skipping = b"", False
+        for chunk in self._chunks():
+            if skipping:
+                _, found, chunk = chunk.partition(b"\n")
+                if not found:
+                    continue
+                skipping = False
+                self.lines += 1
+            end = chunk.rfind(b"\n") + 1
+            if not end:
+                rest += chunk
+                if len(rest) > _LONGEST_LINE:
+                    self.refused.append((self.lines + 1, f"a line of more than {_LONGEST_LINE // 2**20} MiB"))
+                    rest, skipping = b"", True
+                continue
+            block = rest + chunk[:end]
+            yield block
+            self.lines += block.count(b"\n")
+            rest = chunk[end:]
+        if rest:
+            yield rest
+
+    def _chunks(self) -> Iterator[bytes]:
+        decoder = None
+        chunk = self._read()
+        if chunk[:2] in _UTF_16:
+            decoder = codecs.getincrementaldecoder("utf-16")(errors="replace")
+        elif chunk.startswith(codecs.BOM_UTF8):
+            chunk = chunk[len(codecs.BOM_UTF8) :]
+        while chunk:
+            yield chunk if decoder is None else decoder.decode(chunk).encode("utf-8", "replace")
+            chunk = self._read()
+
+    def _read(self) -> bytes:
+        # In pieces: a truncated archive loses only the piece that fails, not what was read before.
+        pieces, size = [], 0
+        while size < self.size and not self._ended:
+            if self._bytes > LOG_BYTES:
+                self.refused.append((None, f"longer than {LOG_BYTES // 2**30} GiB; the rest is not read"))
+                self._ended = True
+                break
+            try:
+                piece = self.stream.read(min(_PIECE, self.size - size))
+            except READ_ERRORS as error:
+                reason = " ".join(str(error).split()) or type(error).__name__
+                self.refused.append((None, f"cannot be read to its end ({reason})"))
+                self._ended = True
+                break
+            if not piece:
+                break
+            pieces.append(piece)
+            size += len(piece)
+            self._bytes += len(piece)
+        return b"".join(pieces)
