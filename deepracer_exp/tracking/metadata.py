@@ -176,6 +176,9 @@ WORKFLOW = "workflowType=machine_learning"
 """Part of an address that opens MLflow's pages for trainings: by default they open for language models, and no tag of
 an experiment changes that."""
 
+OURS = "Trainings of `deepracer-exp`."
+"""Beginning of an experiment's description that was not edited."""
+
 _RACE = {
     "score_s": "race score {:.2f} s",
     "lap_time_s": "lap {:.2f} s",
@@ -202,6 +205,12 @@ def result_note(summary: Mapping[str, Any], run_id: str, files: Mapping[str, Any
     if REPORT in files:
         lines.append(f"Report: `{REPORT}` among the artifacts.")
     return "\n\n".join(lines)
+
+
+def experiment_note(best_run: str, run_id: str, experiment_id: str, metrics: Mapping[str, float]) -> str:
+    """Return an experiment's description with its best run."""
+    link = f"[{best_run}](#/experiments/{experiment_id}/runs/{run_id}?{WORKFLOW})"
+    return f"{OURS} Lowest race score so far: {link}, {race_result(metrics)}.\n\n{picture(run_id)}"
 
 
 def picture(run_id: str) -> str:

@@ -21,8 +21,8 @@ from mlflow.utils.validation import (
     MAX_TAG_VAL_LENGTH,
 )
 
-from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, PARENT, result_note
-from .metrics import Point, best_metrics, points_at
+from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, OURS, PARENT, experiment_note, result_note
+from .metrics import BEST, Point, best_metrics, points_at
 from .store import Store, StoreRefusedError, client_of, pages, silence_mlflow, store_errors
 from .tracking_file import TrackedRun
 
@@ -142,7 +142,10 @@ class MLflowRun:
                     self._client.set_tag(run.info.run_id, PARENT, self.run_id)
 
     def conclude(self, tracked: TrackedRun, summary: Mapping[str, Any]) -> None:
-        """Record the best checkpoint, in the metrics and the description of the run; an edited description is kept."""
+        """Record the best checkpoint, in the metrics and the descriptions of the run and of its experiment.
+
+        An edited description is kept.
+        """
         if best := summary.get("best"):
             self.log_metrics(
                 points_at(best_metrics(summary), best["env_steps"], tracked.end_ms or tracked.start_ms)
@@ -153,6 +156,19 @@ class MLflowRun:
             if now.endswith(begun):
                 note = result_note(summary, run.info.run_id, tracked.files)
                 self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
+            self._describe_experiment(run.info.experiment_id)
+
+    def _describe_experiment(self, experiment_id: str) -> None:
+        tags = self._client.get_experiment(experiment_id).tags
+        score = f"metrics.`{BEST}score_s`"
+        found = self._client.search_runs(
+            [experiment_id], f"{score} > 0", max_results=1, order_by=[f"{score} ASC"]
+        )
+        if found and tags.get(NOTE, OURS).startswith(OURS):
+            (run,) = found
+            best = {key: value for key, value in run.data.metrics.items() if key.startswith(BEST)}
+            note = experiment_note(run.info.run_name, run.info.run_id, experiment_id, best)
+            self._client.set_experiment_tag(experiment_id, NOTE, note)
 
     def log_artifact(self, path: Path, folder: str | None) -> None:
         """Copy a file, or all files of a folder, to the run's artifacts under `folder`."""

@@ -202,20 +202,37 @@ def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
     assert str(identity) in str(refused.value)
 
 
-def test_the_result_of_a_run_heads_its_description(store, client, tmp_path):
-    tracker = MLflowTracker(store)
-    tracker.start("fast", "race", {}, {"mlflow.note.content": "as it began"}, tmp_path / "tracking.json")
-    (tmp_path / "best_lap.png").write_bytes(b"picture")
-    tracker.log_artifact(tmp_path / "best_lap.png")
-    best = {"iteration": 4, "env_steps": 400, "metric": "race_score", "rank": [1.0, -8.7654321]}
-    best |= {"eval_lap_time_s": 8.7654321, "eval_race_score_s": 8.7654321, "eval_completion": 100.0}
-    summary = {"status": "finished", "reason": "converged: all", "best": best}
-    (tmp_path / "summary.json").write_text(json.dumps(summary))
-    assert tracker.finish("FINISHED", 60) == 0
-    data = client.get_run(tracker.run_id).data
-    note = data.tags["mlflow.note.content"]
-    assert note.startswith("**finished**: converged: all")
-    assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0 % of the lap" in note
-    assert f"(get-artifact?path=best_lap.png&run_uuid={tracker.run_id})" in note
-    assert note.endswith("as it began")
-    assert data.metrics["race/best/lap_time_s"] == 8.7654321
+def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(store, client, tmp_path):
+    def train(name: str, lap_s: float) -> str:
+        folder = tmp_path / name
+        folder.mkdir()
+        tracker = MLflowTracker(store)
+        tags = {"mlflow.note.content": "as it began"}
+        tracker.start(name, "race", {}, tags, folder / "tracking.json")
+        (folder / "best_lap.png").write_bytes(b"picture")
+        tracker.log_artifact(folder / "best_lap.png")
+        best = {"iteration": 4, "env_steps": 400, "metric": "race_score", "rank": [1.0, -lap_s]}
+        best |= {"eval_lap_time_s": lap_s, "eval_race_score_s": lap_s, "eval_completion": 100.0}
+        summary = {"status": "finished", "reason": "converged: all", "best": best}
+        (folder / "summary.json").write_text(json.dumps(summary))
+        assert tracker.finish("FINISHED", 60) == 0
+        return str(tracker.run_id)
+
+    def notes(run_id: str) -> tuple[str, str]:
+        run = client.get_run(run_id)
+        return run.data.tags["mlflow.note.content"], client.get_experiment(run.info.experiment_id).tags[
+            "mlflow.note.content"
+        ]
+
+    slow, fast = train("slow", 12.3456789), train("fast", 8.7654321)
+    of_run, of_experiment = notes(fast)
+    assert of_run.startswith("**finished**: converged: all")
+    assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0 % of the lap" in of_run
+    assert f"(get-artifact?path=best_lap.png&run_uuid={fast})" in of_run
+    assert of_run.endswith("as it began")
+    assert "[fast]" in of_experiment
+    assert "8.77 s" in of_experiment
+    assert client.get_run(fast).data.metrics["race/best/lap_time_s"] == 8.7654321
+    experiment_id = client.get_run(slow).info.experiment_id
+    client.set_experiment_tag(experiment_id, "mlflow.note.content", "mine")
+    assert notes(train("fastest", 7.0))[1] == "mine"
