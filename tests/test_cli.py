@@ -1,5 +1,4 @@
 import json
-import re
 import subprocess
 import sys
 
@@ -130,12 +129,12 @@ def test_tracks_lists_each_family_once_with_its_variants(call):
     assert named["reinvent_base"][-1] == "reinvent_wood"
 
 
-def test_tracks_draws_one_with_its_waypoint_numbers_and_writes_nothing_unasked(call, tmp_path):
+def test_tracks_draws_one_and_writes_nothing_unasked(call, tmp_path):
     text = call("tracks", "Circuit de Barcelona-Catalunya").stdout
     assert text.startswith(
         "Circuit de Barcelona-Catalunya (Spain_track): 60.00 m, 0.91 m wide, 259 waypoints"
     )
-    assert len(re.findall(r"\b\d{1,2}0\b", text.partition("\n")[2])) > 5
+    assert text.count("\n") > 12
     assert not list(tmp_path.iterdir())
 
 
