@@ -201,7 +201,7 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--traces", "nowhere"], "nowhere: cannot be read"),
+        (["--traces", "nowhere"], "nowhere: no such file or folder"),
         (["--traces", "empty"], "empty: no recorded steps"),
         (["--traces", "few"], "few: "),
         (["--traces", "few", "--car", "lorry"], "lorry"),

@@ -91,7 +91,7 @@ def test_figures_are_drawn_of_what_is_held_out(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--traces", "nowhere"], "nowhere: cannot be read"),
+        (["--traces", "nowhere"], "nowhere: no such file or folder"),
         (["--traces", ".", "--car", "lorry"], "lorry"),
     ],
 )
