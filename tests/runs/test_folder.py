@@ -56,12 +56,12 @@ def test_secrets_of_a_uri_are_not_written(folder):
 def test_a_file_is_there_whole_or_not_at_all(folder, monkeypatch):
     folder.write("summary.json", "old")
 
-    def full(self, text, encoding):
-        with self.open("w") as file:
-            file.write(text[:2])
+    def full(self, content):
+        with self.open("wb") as file:
+            file.write(content[:2])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
 
-    monkeypatch.setattr("pathlib.Path.write_text", full)
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
     with pytest.raises(OSError, match="No space"):
         folder.write("summary.json", "new")
     assert (folder.path / "summary.json").read_text() == "old"
