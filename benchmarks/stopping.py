@@ -71,7 +71,11 @@ def trained(folder: Path, overrides: Sequence[str]) -> Path:
     for summary in sorted(folder.glob("runs/*/*/summary.json")):
         run = summary.parent
         told = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
-        if told == list(overrides) and read_summary(run)["status"] in ("finished", "hopeless"):
+        if told == list(overrides) and read_summary(run)["status"] in (
+            "finished",
+            "stopped early",
+            "hopeless",
+        ):
             return run
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()

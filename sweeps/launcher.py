@@ -18,7 +18,7 @@ _log = logging.getLogger("deepracer_exp")
 
 
 class LocalLauncher:
-    """Starts workers as processes of this machine, one per core unless told how many."""
+    """Starts workers as processes of this machine, one per core by default."""
 
     def __init__(self, workers: int | None):
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

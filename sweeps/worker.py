@@ -251,7 +251,7 @@ class TrialRun(Callback):
                 run = self._made(index, overrides)
             if run["status"] == "failed":
                 return self._with_attrs("FAIL", None, overrides)
-            if run["status"] == STOPPED_EARLY:
+            if run["status"] in (STOPPED_EARLY, "hopeless"):  # the second in older studies
                 return self._with_attrs("PRUNED", None, overrides)
             so_far = [run["value"][0] for run in self._runs]
             is_last = len(so_far) == config.seeds

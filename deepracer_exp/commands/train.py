@@ -210,7 +210,7 @@ def _clone(args: argparse.Namespace) -> int:
     with warnings_on_stderr():
         clone = prepare_clone([f"run={run}", *given], stores.runs_dir, stores.uri)
     args.debug = clone.experiment.debug
-    for line in clone.told:
+    for line in clone.notes:
         print(line, file=sys.stderr)
     outcome = train(clone.experiment, clone.composition, Console(stderr=True), clone.start)
     print_result(outcome, clone.experiment.runs_dir if clone.experiment.tracking.kind == "mlflow" else None)

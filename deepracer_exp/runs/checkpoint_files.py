@@ -1,4 +1,4 @@
-"""What stands beside the tensors of checkpoints: hashes of their files, and which of them nobody may remove."""
+"""What stands beside the tensors of checkpoints: hashes of their files, and which of them must stay."""
 
 import hashlib
 import json
@@ -81,7 +81,7 @@ def pin(checkpoints: Path, name: str, why: str) -> None:
     Args:
         checkpoints: `checkpoints/` of a run.
         name: of the checkpoint's own folder, e.g. ``000120``.
-        why: told to who wants to remove it.
+        why: shown by `runs clean`.
     """
     pins = pinned(checkpoints)
     if why in pins.setdefault(name, []):
@@ -94,7 +94,7 @@ def pinned(checkpoints: Path) -> dict[str, list[str]]:
     """Return the checkpoints that must stay, with the reasons.
 
     Raises:
-        BadInput: the file that tells cannot be read.
+        BadInput: their file cannot be read.
     """
     file = checkpoints / _PINNED
     if not file.exists():

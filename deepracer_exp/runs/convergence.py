@@ -54,7 +54,7 @@ POOR = 50.0
 """Completion below which a training that no longer grows has not learned to drive, per cent."""
 LOG_OVERFITTING = OverfittingRule(warmup=0, patience=3, held_out_drop=10.0, return_drop=0.05)
 """Likewise; such a log has an evaluation after each iteration."""
-UNDECIDED = {"stopping.rule": "none", "stopping.hopeless": "false"}
+UNDECIDED = {"stopping.rule": "none", "stopping.stopped_early": "false"}
 """Tags of a run that is resumed after a rule had ended it; the values by which it did stay beside them."""
 
 
@@ -70,8 +70,8 @@ class Decision:
     """What was compared; entropy as a share, see `entropy_share`."""
     thresholds: dict[str, Any] = field(default_factory=dict)
     """The keys of the rule."""
-    hopeless: bool = False
-    """Whether more training would have led nowhere: the run is stopped early, and its result is of no use."""
+    stopped_early: bool = False
+    """Whether more training would have led nowhere, and the result is of no use."""
 
     def __str__(self) -> str:
         """Return rule and reason, e.g. ``reliable: 94% of the last 50 episodes completed the lap``."""
@@ -86,7 +86,7 @@ class Decision:
         numbers = [("value", self.values), ("threshold", self.thresholds)]
         return {
             "stopping.rule": self.rule,
-            "stopping.hopeless": str(self.hopeless).lower(),
+            "stopping.stopped_early": str(self.stopped_early).lower(),
             **{
                 f"stopping.{kind}.{key}": f"{value:.4g}" if isinstance(value, float) else str(value)
                 for kind, found in numbers
@@ -382,7 +382,7 @@ def _decision(rule: str, why: str, values: dict[str, float], config: Any) -> Dec
         why=why,
         values={key: round(value, 6) for key, value in values.items()},
         thresholds=thresholds,
-        hopeless=rule in ("collapsed", "not_learning"),
+        stopped_early=rule in ("collapsed", "not_learning"),
     )
 
 

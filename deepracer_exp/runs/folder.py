@@ -48,7 +48,7 @@ class RunFolder:
     """`runs_dir/<experiment>/<run>/` and the files that lie directly in it."""
 
     def __init__(self, path: Path):
-        """Open a folder that is there; nobody else may write into it until this process lets go of it.
+        """Open a folder that is there; no other process may write into it until this one releases it.
 
         Raises:
             BadInput: another process trains in it.
@@ -191,7 +191,7 @@ def git_commit() -> str | None:
         commit = _git(root, "rev-parse", "HEAD")
         return f"{commit}-dirty" if _git(root, "status", "--porcelain") else commit
     except (OSError, subprocess.CalledProcessError):
-        # No git, a checkout without a commit, or one owned by somebody else.
+        # No git, a checkout without a commit, or one of another owner.
         return None
 
 

@@ -41,7 +41,7 @@ _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
 
 def is_own_run(folder: Path) -> bool:
-    """Tell whether a folder is that of a run of ours with its trace."""
+    """Return whether a folder is that of a run of ours with its trace."""
     return is_run(folder) and (folder / TRACE).is_dir()
 
 

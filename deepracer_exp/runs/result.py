@@ -1,4 +1,4 @@
-"""How good a run's best checkpoint is, as its summary tells."""
+"""How good a run's best checkpoint is, by its summary."""
 
 import math
 from collections.abc import Mapping

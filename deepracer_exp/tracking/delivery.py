@@ -17,7 +17,12 @@ from .tracking_file import Status, TrackedRun, TrackingFile
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
 
-ENDS: dict[str, Status] = {"finished": "FINISHED", "hopeless": "FINISHED", "failed": "FAILED"}
+ENDS: dict[str, Status] = {
+    "finished": "FINISHED",
+    "stopped early": "FINISHED",
+    "hopeless": "FINISHED",  # as "stopped early" was called
+    "failed": "FAILED",
+}
 """MLflow's word for the `status` in a run's summary; any other is KILLED."""
 
 _log = logging.getLogger(__name__)

@@ -164,7 +164,7 @@ class StoppingCallback(Callback):
     def _observe(self, trainer: Trainer) -> None:
         self._decision = self._rule.observe(trainer.row)
         if self._decision is not None:
-            status = STOPPED_EARLY if self._decision.hopeless else FINISHED
+            status = STOPPED_EARLY if self._decision.stopped_early else FINISHED
             trainer.request_stop(str(self._decision), status)
 
 

@@ -38,7 +38,7 @@ class Clone:
     composition: Composition
     start: tuple[ActorCritic, Lineage]
     """The networks to begin with, and whose they were."""
-    told: tuple[str, ...]
+    notes: tuple[str, ...]
     """What the user is to know of it, a line each."""
 
 

@@ -239,7 +239,7 @@ class RunMetrics:
         return {"mean_return": _mean(finished.returns), **figures}
 
     def row_of_tracks(self, finished: Finished) -> dict[str, float | None]:
-        """Return the figures of each track, empty with one track; None where an iteration has nothing to tell."""
+        """Return the figures of each track, empty with one track; None where none is known."""
         row: dict[str, float | None] = {}
         for number, label in enumerate(self.labels):
             figures = _figures(finished.on(number), self._book.tracks[number])
@@ -320,7 +320,7 @@ class Ranking:
             finished: what ended in this iteration.
 
         Returns:
-            None as long as too few episodes have ended to tell, or if none did in this iteration.
+            None as long as too few episodes have ended, or if none did in this iteration.
         """
         for track in np.unique(finished.track):
             here = finished.track == track

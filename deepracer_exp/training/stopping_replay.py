@@ -98,7 +98,7 @@ def table(replays: Sequence[Replay]) -> Table:
     for one in replays:
         grid.add_row(
             one.run,
-            f"{one.rule}\n{one.decision or 'goes on to the end'}",
+            f"{one.rule}\n{one.decision or 'continues to the end'}",
             f"{one.iteration} of {one.iterations}",
             f"{one.env_steps:,}",
             f"{one.saved:.0%}, {one.saved_s:.0f} s" if one.decision else NOTHING,
@@ -145,7 +145,7 @@ def action_count(record: RunRecord) -> int | None:
     """Return how many actions a run's policy chooses between, None for a continuous one.
 
     Raises:
-        BadInput: its configuration does not tell.
+        BadInput: its configuration names no rule.
     """
     try:
         adapter: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
@@ -162,7 +162,7 @@ def _ended_with(rows: Sequence[Row]) -> float | None:
 
 
 def _fastest(rows: Sequence[Row], every: Sequence[Row]) -> float | None:
-    """Return the fastest lap in `rows`; `every` row of the run tells which columns have lap times."""
+    """Return the fastest lap in `rows`; `every` row of the run decides which columns have lap times."""
     if any(row.get("eval_lap_time_s") is not None for row in every):
         columns = ["eval_lap_time_s"]
     else:

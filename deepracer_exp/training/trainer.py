@@ -35,7 +35,7 @@ from .signals import Interruption
 
 logger = logging.getLogger("deepracer_exp")
 
-FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "hopeless", "interrupted", "failed"
+FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "stopped early", "interrupted", "failed"
 """`status` of a run that has ended, as in summary.json."""
 _LAST_EVERY, _LAST_EVERY_S = 10, 5.0
 """Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
@@ -50,7 +50,7 @@ class TrainResult:
     """How a training ended."""
 
     status: str
-    """`finished`, `hopeless` (stopped early: more training would not have helped), `interrupted` or `failed`."""
+    """`finished`, `stopped early` (more training would not have helped), `interrupted` or `failed`."""
     reason: str
     exit_code: int
     folder: Path
@@ -319,10 +319,10 @@ class Trainer:
     def end(
         self, status: str, reason: str, exit_code: int, error: BaseException | None = None
     ) -> TrainResult:
-        """Write summary.json and let go of the run.
+        """Write summary.json and release the run.
 
         Raises:
-            OSError: the folder takes no more; not if the run failed, so that nobody waits for it.
+            OSError: the folder takes no more; not if the run failed.
         """
         summary = {
             "status": status,

@@ -40,7 +40,7 @@ def run(folder, callback, *overrides, **options):
 def test_a_run_that_a_callback_stops_early_keeps_a_best_policy(tmp_path):
     callback = At(3, lambda trainer: trainer.request_stop("median: slower than the others", STOPPED_EARLY))
     outcome = run(tmp_path, callback)
-    assert (outcome.status, outcome.reason) == ("hopeless", "median: slower than the others")
+    assert (outcome.status, outcome.reason) == ("stopped early", "median: slower than the others")
     rows = read_metrics(outcome.folder / "metrics.jsonl")
     assert [row["eval_completion"] is not None for row in rows] == [False, True, True]
     assert (outcome.folder / "checkpoints" / "best").exists()

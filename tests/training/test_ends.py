@@ -16,29 +16,29 @@ from deepracer_exp.runs.files import read_run
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.training.stopping_replay import replay
 
-HOPELESS = (
+NOT_LEARNING = (
     *("stopping=entropy", "stopping.window=1", "stopping.converged=null", "stopping.collapsed=null"),
     *("stopping.not_learning.warmup=0", "stopping.not_learning.patience=2", "algorithm.lr=1e-9"),
     *("stopping.not_learning.completion_gain=50", "stopping.not_learning.completion_poor=100"),
 )
 
 
-def test_a_run_that_does_not_learn_is_ended_and_called_hopeless(trained):
-    ended = trained(*HOPELESS)
+def test_a_run_that_does_not_learn_is_stopped_early(trained):
+    ended = trained(*NOT_LEARNING)
     assert ended.code == 0, ended.stderr
-    assert ended.summary["status"] == "hopeless"
+    assert ended.summary["status"] == "stopped early"
     assert ended.summary["reason"].startswith("not learning: entropy still at 100.0%")
     assert ended.summary["iteration"] == 3
-    assert ended.stdout.startswith("\nhopeless: not learning: ")
+    assert ended.stdout.startswith("\nstopped early: not learning: ")
     stopping = ended.summary["stopping"]
-    assert (stopping["rule"], stopping["hopeless"]) == ("not_learning", True)
+    assert (stopping["rule"], stopping["stopped_early"]) == ("not_learning", True)
     assert stopping["thresholds"]["patience"] == 2
     assert 0.99 < stopping["values"]["entropy"] <= 1
 
 
 def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained):
-    ended = trained(*HOPELESS)
-    found = replay(read_run(ended.folder), compose_experiment(HOPELESS)[0].stopping, "")
+    ended = trained(*NOT_LEARNING)
+    found = replay(read_run(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
     assert found.iteration == ended.summary["iteration"]
     assert found.decision.as_dict() == ended.summary["stopping"]
     assert found.saved_steps == 0

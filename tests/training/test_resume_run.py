@@ -196,10 +196,10 @@ def test_a_run_ended_by_its_stopping_rule_uses_its_budget_up_without_it(trained,
     assert (summary["reason"], summary["stopping"]) == ("budget reached: iterations", None)
 
 
-def test_a_run_that_others_have_beaten_goes_on_if_it_is_told_which_rule_counts(trained, stopped, call):
+def test_a_run_that_others_have_pruned_goes_on_if_it_is_told_which_rule_counts(trained, stopped, call):
     summary = json.loads((stopped / "summary.json").read_text())
-    beaten = {"status": "hopeless", "reason": "median: 9.1 is worse", "stopping": None}
-    (stopped / "summary.json").write_text(json.dumps(summary | beaten))
+    pruned = {"status": "stopped early", "reason": "median: 9.1 is worse", "stopping": None}
+    (stopped / "summary.json").write_text(json.dumps(summary | pruned))
     config = yaml.safe_load((stopped / "config.yaml").read_text())
     (stopped / "config.yaml").write_text(yaml.safe_dump(config | {"stopping": {"kind": "none"}}))
     ended = call("resume", stopped.name)

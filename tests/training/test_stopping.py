@@ -93,7 +93,7 @@ def converging(until: int, **more) -> list[dict]:
 def test_a_run_that_has_learned_ends_as_converged_when_patience_is_over(until, noise):
     number, decision = stopped_at(converging(until, noise=noise), rule())
     assert decision.rule == "converged"
-    assert not decision.hopeless
+    assert not decision.stopped_early
     assert number == pytest.approx(until + 80, abs=10)
 
 
@@ -129,7 +129,7 @@ def test_a_run_that_drives_worse_than_it_did_has_not_converged():
 def test_a_policy_that_stays_random_is_not_learning():
     number, decision = stopped_at(history(completion=11.0, entropy=0.999, laps_per_iteration=0.0), rule())
     assert decision.rule == "not_learning"
-    assert decision.hopeless
+    assert decision.stopped_early
     assert number == pytest.approx(42, abs=3)
 
 
@@ -146,7 +146,7 @@ def test_a_policy_that_shows_any_sign_of_learning_goes_on(sign):
 def test_a_policy_without_entropy_that_drives_badly_has_collapsed():
     number, decision = stopped_at(history(completion=20.0, entropy=lambda i: max(0.01, 1 - 0.1 * i)), rule())
     assert decision.rule == "collapsed"
-    assert decision.hopeless
+    assert decision.stopped_early
     assert number == pytest.approx(31, abs=3)
 
 
@@ -170,7 +170,7 @@ def falling(best_at: int = 50, **more) -> list[dict]:
 def test_a_fall_on_held_out_conditions_while_the_return_rises_is_overfitting():
     number, decision = stopped_at(falling(), rule())
     assert decision.rule == "overfitting"
-    assert not decision.hopeless
+    assert not decision.stopped_early
     assert decision.values["held_out_completion_before"] > 85
     assert 90 < number < 130
 

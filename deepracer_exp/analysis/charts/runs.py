@@ -85,7 +85,7 @@ def runs_compared(views: Sequence[LogView]) -> Chart | None:
     return Chart(
         name="runs_compared",
         title="Runs compared",
-        caption=f"{words}. Where bands of two colours overlap, more seeds are needed to tell them apart.",
+        caption=f"{words}. Where bands of two colours overlap, more seeds are needed to distinguish them.",
         rows=in_rows(panels),
     )
 

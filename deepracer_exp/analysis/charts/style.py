@@ -7,13 +7,13 @@ from typing import Any
 BLUE, ORANGE, GREEN, VERMILION = "#0072b2", "#e69f00", "#009e73", "#d55e00"
 PURPLE, SKY, YELLOW, BLACK = "#cc79a7", "#56b4e9", "#f0e442", "#000000"
 CATEGORIES = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK, YELLOW)
-"""Colours that colour-blind readers can tell apart (Okabe and Ito, 2008)."""
+"""Colours that colour-blind readers can distinguish (Okabe and Ito, 2008)."""
 INK, FAINT, PALE, PAPER = "#22262b", "#6b727d", "#b9bfc8", "#ffffff"
 ROAD_FILL, ROAD_EDGE, ROAD_CENTER, GRID, SPINE = "#e6e9ed", "#8d949e", "#a9b0b9", "#e9ecef", "#cdd2d8"
 VEIL = "rgba(255,255,255,0.7)"
 """Behind text that stands on data."""
 DIVERGING = "PuOr"
-"""Readers who do not see red or green can tell its ends apart."""
+"""Readers who do not see red or green can distinguish its ends."""
 SCALE = (
     *("#440154", "#482878", "#3e4a89", "#31688e", "#26828e"),
     *("#1f9e89", "#35b779", "#6dcd59", "#b4de2c", "#dde318"),
