@@ -78,7 +78,7 @@ def test_a_new_continuous_policy_is_centred_with_the_initial_std(shared):
 
 
 @pytest.mark.parametrize(("shared", "actions"), KINDS)
-def test_the_policy_explores_unless_told_otherwise(shared, actions):
+def test_the_policy_explores_unless_asked_not_to(shared, actions):
     policy = build(shared, actions).policy
     assert not torch.equal(policy(steps(50))["action"], policy(steps(50))["action"])
 

@@ -227,7 +227,7 @@ def test_a_gradient_gone_bad_is_named_by_its_parameter():
 
 
 @pytest.mark.parametrize(("shared", "actions"), KINDS)
-def test_a_restored_learner_goes_on_bit_for_bit(shared, actions, tmp_path):
+def test_a_restored_learner_continues_bit_for_bit(shared, actions, tmp_path):
     networks, ppo = make(shared, actions)
     train(networks, ppo, 3)
     torch.save(ppo.state_dict(), tmp_path / "state.pt")

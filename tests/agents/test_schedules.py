@@ -84,7 +84,7 @@ def test_only_the_adaptive_rate_listens_to_the_kl():
     assert schedule.factor(0, 0) == 1
 
 
-def test_a_restored_adaptive_rate_goes_on_where_it_was():
+def test_a_restored_adaptive_rate_continues_where_it_was():
     one, other = make("adaptive_kl"), make("adaptive_kl")
     one.observe(1.0)
     other.load_state_dict(one.state_dict())

@@ -227,7 +227,7 @@ class Replayed:
     )
 
 
-def test_another_reward_is_told_with_the_ranks_of_laps_and_places(view):
+def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
     told = compare_rewards(view, Replayed())
     assert told.sentences[0] == (
         "Of 3 complete laps mine would have paid best the one of episode 0 (10.00 s, 1st by time, 3rd by the recorded "

@@ -44,7 +44,7 @@ def test_lap_times_statuses_and_waypoints_are_those_of_the_drives(view: LogView)
     assert table["last_waypoint"].iloc[2] == 40
 
 
-def test_iterations_sum_up_their_episodes_and_take_what_the_update_told(view: LogView) -> None:
+def test_iterations_sum_up_their_episodes_and_take_what_the_update_logged(view: LogView) -> None:
     first, second = view.iterations.to_dict("records")
     assert (first["episodes"], first["complete"], first["lap_share"]) == (2, 2, 1.0)
     assert first["lap_time_best_s"] == pytest.approx(LENGTH_M / 2)

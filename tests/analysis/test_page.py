@@ -121,7 +121,7 @@ def test_figures_follow_when_the_reader_goes_from_light_to_dark(page, tab):
     tab.wait_for(f"{paper} !== '#ffffff'")
 
 
-def test_a_printed_page_has_every_figure_and_what_was_folded_though_nobody_scrolled(page, tab):
+def test_a_printed_page_has_every_figure_and_what_was_folded_without_scrolling(page, tab):
     tab.prefer("dark")
     tab.open(page, height=300)
     drawn = "document.querySelectorAll('[data-state=drawn]').length"

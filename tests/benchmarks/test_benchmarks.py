@@ -48,7 +48,7 @@ def test_the_scalar_reward_is_the_experiments_without_its_batch_form(experiment:
     assert "reward_batch" not in text
 
 
-def test_throughput_tells_the_documented_figures_and_holds_the_training_against_the_faster_peer(
+def test_throughput_reports_the_documented_figures_and_holds_the_training_against_the_faster_peer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rates = {

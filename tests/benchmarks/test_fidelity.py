@@ -61,7 +61,7 @@ def test_fitting_the_formula_finds_the_formula_that_drove():
 
 
 @pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of the AWS console are not here")
-def test_the_benchmark_tells_the_documented_figures_for_any_folder_and_draws(tmp_path, capsys):
+def test_the_benchmark_reports_the_documented_figures_for_any_folder_and_draws(tmp_path, capsys):
     file = tmp_path / "figures.json"
     arguments = ["--traces", str(TRACES / "evaluation"), "--json", str(file), "--threads", "1"]
     assert fidelity.main(arguments) == 0

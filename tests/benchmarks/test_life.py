@@ -239,7 +239,7 @@ def test_a_point_twice_or_not_at_all_is_a_difference() -> None:
         assert (different_points(rows, history | {key: points}) or "").startswith(f"{key}: ")
 
 
-def test_the_first_failure_of_many_calls_is_told_and_ends_the_rest() -> None:
+def test_the_first_failure_of_many_calls_is_reported_and_ends_the_rest() -> None:
     made = []
 
     def call(number: int) -> int:

@@ -78,7 +78,7 @@ def test_the_median_ends_what_is_worse_than_the_median_of_the_complete_trials_at
     assert found[3].began_s == found[2].ended_s == 35 + 35 + 25
 
 
-def test_hyperband_lets_a_third_of_a_rung_go_on() -> None:
+def test_hyperband_lets_a_third_of_a_rung_continue() -> None:
     courses = [course(number, [value] * 3) for number, value in enumerate([5.0, 6.0, 7.0, 4.0, 4.5])]
     pruner = HyperbandPruner(
         min_resource=1, max_resource=2, reduction_factor=3
@@ -143,7 +143,7 @@ def test_the_pace_is_that_of_all_steps_and_of_the_usual_trial() -> None:
     assert found == Pace(step_s=0.01, trial_s=4.0)
 
 
-def test_a_whole_run_tells_what_the_sweep_would_report_at_each_evaluation(
+def test_a_whole_run_reports_what_the_sweep_would_report_at_each_evaluation(
     trained: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = trained("budget.iterations=5", "budget.env_steps=null", "checkpoints.every=2").folder

@@ -99,7 +99,7 @@ def test_nothing_is_left_when_it_is_closed(collect, tmp_path):
     assert not (tmp_path / ".heartbeat").exists()
 
 
-def test_nobody_is_waited_for_when_an_error_leaves_the_block(collect):
+def test_no_worker_is_waited_for_when_an_error_leaves_the_block(collect):
     before = set(multiprocessing.active_children())
     collection = collect("collector=async", "collector.processes=2")
     next(iter(collection))
@@ -115,7 +115,7 @@ class _Broken(EnvFactory):
         raise ValueError("no engine\nin this car")
 
 
-def test_workers_that_do_not_start_are_told_in_one_line_and_gone(collect, monkeypatch):
+def test_workers_that_do_not_start_are_reported_in_one_line_and_gone(collect, monkeypatch):
     before = set(multiprocessing.active_children())
     monkeypatch.setattr("deepracer_exp.collectors.collector.EnvFactory", _Broken)
     with pytest.raises(RunFailed, match="collector workers did not start: no engine") as error:

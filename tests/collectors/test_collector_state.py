@@ -108,7 +108,7 @@ def assert_same(batches, expected) -> None:
 
 @pytest.mark.parametrize("collector", [IN_PROCESS, SYNC], ids=["in_process", "sync"])
 @pytest.mark.parametrize("space", ["discrete", "continuous"])
-def test_a_collection_goes_on_bit_for_bit_from_a_stored_state(driver_of, tmp_path, collector, space):
+def test_a_collection_continues_bit_for_bit_from_a_stored_state(driver_of, tmp_path, collector, space):
     driver = driver_of(*collector, *EVERYTHING, f"action_space={space}")
     uninterrupted = driver.open()
     before = driver.collect(uninterrupted, range(3))
@@ -149,7 +149,7 @@ def test_before_the_first_batch_the_state_is_the_one_it_began_from(driver_of):
     assert_same(driver.collect(driver.open(again), range(1, 2)), expected)
 
 
-def test_the_cars_of_one_worker_go_on_in_the_training_process(driver_of):
+def test_the_cars_of_one_worker_continue_in_the_training_process(driver_of):
     one = driver_of("collector=sync", "collector.processes=1", "collector.cars=6")
     collection = one.open()
     one.collect(collection, range(1))

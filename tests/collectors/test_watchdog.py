@@ -95,7 +95,7 @@ def test_what_arrived_is_no_excuse_for_the_next_batch(watch, beats, processes):
     assert list(dog.verdict) == [0]
 
 
-def test_nobody_is_ended_while_nothing_is_waited_for(watch, beats, processes):
+def test_no_worker_is_ended_while_none_is_waited_for(watch, beats, processes):
     dog = watch(lockstep=False)
     dog.workers_started(processes)
     beats()[:] = 1

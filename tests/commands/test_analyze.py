@@ -26,7 +26,7 @@ def findings_told(page: Path) -> str:
     return Html(page.read_text(encoding="utf-8")).text
 
 
-def test_a_run_is_analysed_into_its_folder_and_the_terminal_tells_what_stands_on_the_page(run_dir, call):
+def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_on_the_page(run_dir, call):
     ended = call("analyze", str(run_dir))
     assert ended.code == 0, ended.stderr
     assert f"page  {run_dir / 'report.html'}" in ended.stdout
@@ -114,7 +114,7 @@ def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not
         (["RUN", "--compare", "nowhere"], ["nowhere"]),
     ],
 )
-def test_bad_input_is_told_in_one_line(run_dir, call, tmp_path, arguments, words):
+def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.txt").write_text("hello\n")
     ended = call("analyze", *(str(run_dir) if word == "RUN" else word for word in arguments))
@@ -145,7 +145,7 @@ def test_the_page_of_a_training_stands_in_its_mlflow_run(call):
     assert {"report.html", "learning.png"} <= found
 
 
-def test_a_fault_of_the_page_is_told_and_leaves_the_training_finished(train_here, monkeypatch):
+def test_a_fault_of_the_page_is_reported_and_leaves_the_training_finished(train_here, monkeypatch):
     def fault(*_):
         raise ZeroDivisionError("a bug\nof two lines")
 

@@ -135,7 +135,7 @@ def test_quotes_home_and_environment_variables_are_understood(monkeypatch, tmp_p
         ("~reward.constants.X", ["reward.constants.X"]),
     ],
 )
-def test_an_unknown_name_is_told_the_nearest_known_one(override, parts):
+def test_an_unknown_name_is_answered_with_the_nearest_known_one(override, parts):
     message = refusal(override)
     for part in parts:
         assert part in message
@@ -212,7 +212,7 @@ def test_values_that_contradict_each_other_are_both_named(overrides, both):
 
 
 @pytest.mark.parametrize("override", ["seed", "", "=3", "seed=1=2", "--multirun", "name=ü"])
-def test_what_is_no_override_is_told_how_to_write_one(override):
+def test_what_is_no_override_is_answered_with_how_to_write_one(override):
     assert "GROUP=OPTION or KEY=VALUE" in refusal(override)
 
 
@@ -224,13 +224,13 @@ def test_quotes_are_suggested_where_they_are_needed():
 @pytest.mark.parametrize(
     "override", ["seed=1,2", "network=mlp,mlp_small", "seed=range(3)", "seed=choice(1,2)"]
 )
-def test_several_values_without_m_are_told_of_m(override):
+def test_several_values_without_m_are_answered_with_m(override):
     message = refusal(override)
     assert message.startswith(override)
     assert "-m" in message
 
 
-def test_an_unknown_group_is_told_the_groups():
+def test_an_unknown_group_is_answered_with_the_groups():
     with pytest.raises(BadInput, match=r"did you mean track\?.*network"):
         options_of("trak")
     assert "Monaco" in options_of("track")

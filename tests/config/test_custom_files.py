@@ -90,7 +90,7 @@ def test_one_file_is_enough_and_leaves_the_rest_as_it_was(custom_files, left):
     assert experiment != default
 
 
-def test_a_missing_hyperparameter_is_the_services_and_told(custom_files):
+def test_a_missing_hyperparameter_is_the_services_and_reported(custom_files):
     experiment, composition = composed(custom_files({"lr": 1e-4}))
     algorithm = experiment.algorithm
     assert (algorithm.lr, algorithm.batch_size, algorithm.epochs, algorithm.discount) == (1e-4, 64, 10, 0.999)

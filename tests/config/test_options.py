@@ -37,7 +37,7 @@ def test_options_of_the_working_folder_stand_beside_the_projects(here):
     assert (budget.env_steps, budget.iterations) == (200_000, 3)
 
 
-def test_the_nearest_of_all_options_is_told(here):
+def test_the_nearest_of_all_options_is_reported(here):
     own(here, "budget/mine_all.yaml", BUDGET)
     with pytest.raises(BadInput, match=r"did you mean mine_all\?.*long, mine_all, short"):
         compose_experiment(["budget=mine_al"])

@@ -139,5 +139,5 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
         ),
     ],
 )
-def test_what_is_not_accepted_is_told_in_one_line(overrides, says):
+def test_what_is_not_accepted_is_one_line(overrides, says):
     assert re.search(says, refusal(*overrides))

@@ -127,7 +127,7 @@ def test_of_several_workers_the_first_iterations_go(tmp_path, most_steps):
     assert set(short.steps["worker"]) == set(whole.steps["worker"])
 
 
-def test_what_is_told_of_steps_that_are_left_out_is_left_out_and_counted(tmp_path, most_steps):
+def test_what_is_known_of_steps_that_are_left_out_is_left_out_and_counted(tmp_path, most_steps):
     rounds = {
         name: {
             **{

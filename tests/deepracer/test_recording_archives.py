@@ -89,7 +89,7 @@ def test_what_is_missing_beside_an_archive_is_read_out_of_it(tmp_path):
     )
 
 
-def test_a_copy_of_the_same_drives_is_told_and_left_out(tmp_path):
+def test_a_copy_of_the_same_drives_is_reported_and_left_out(tmp_path):
     for name in ("week.tar.gz", "week (1).tar.gz"):
         made.write_archive(made.console(), tmp_path / name)
     recording = read_recording(tmp_path)
@@ -180,7 +180,7 @@ def test_logs_that_were_packed_one_by_one_are_read(pack, alone, tmp_path):
     assert recording.steps["episode"].tolist() == sorted([0, 1] * 6 if alone else [0, 1, 2, 3] * 6)
 
 
-def test_a_model_for_the_car_is_no_log_and_a_torn_archive_is_told(tmp_path):
+def test_a_model_for_the_car_is_no_log_and_a_incomplete_archive_is_reported(tmp_path):
     made.write_folder(made.drfc_single(), tmp_path)
     made.write_archive({"agent/model.pb": "weights"}, tmp_path / "carfile.tar.gz")
     assert not read_recording(tmp_path).problems

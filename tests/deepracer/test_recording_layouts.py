@@ -96,7 +96,7 @@ def test_policy_updates_stand_with_their_iterations(place, layout):
 
 
 @pytest.mark.parametrize("layout", ["drfc_single", "drfc_workers", "console", "droa"])
-def test_metrics_tell_the_episodes_of_the_trace(place, layout):
+def test_metrics_report_the_episodes_of_the_trace(place, layout):
     recording = read_recording(place(LAYOUTS[layout]()))
     told = recording.metrics[recording.metrics["stream"] == "training"].set_index("episode")
     driven = made.training(recording).groupby("episode")
@@ -190,7 +190,7 @@ def test_an_iteration_of_the_log_alone_is_used_though_the_job_ended_within_its_l
     assert not recording.problems
 
 
-def test_metrics_tell_the_iterations_of_episodes_whose_traces_are_missing(place):
+def test_metrics_report_the_iterations_of_episodes_whose_traces_are_missing(place):
     files = made.drfc_single()
     for number in (0, 2):
         del files[f"training-simtrace/{number}-iteration.csv"]
@@ -204,7 +204,7 @@ def test_metrics_tell_the_iterations_of_episodes_whose_traces_are_missing(place)
     assert told["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
 
 
-def test_clones_go_on_where_the_one_before_ended(place):
+def test_clones_continue_where_the_one_before_ended(place):
     files = {}
     for number, name in enumerate(("first", "first-1", "first-2", "first-10")):
         files |= made.training_csvs(f"{name}/training-simtrace", iterations=2, seed=5 * number + 1)
@@ -272,7 +272,7 @@ def test_a_single_file_is_enough(tmp_path, name):
     assert set(steps["iteration"]) == ({3} if "3-" in name else {0})
 
 
-def test_the_same_file_twice_is_read_once_and_told(tmp_path):
+def test_the_same_file_twice_is_read_once_and_reported(tmp_path):
     text = made.csv_text(made.drives([0, 1]))
     (tmp_path / "0-iteration.csv").write_text(text)
     (tmp_path / "0-iteration (copy).csv").write_text(text)

@@ -121,7 +121,7 @@ def test_generations_one_after_the_other_in_one_file_are_all_read(tmp_path):
     assert len(read_recording(tmp_path / "all.csv").steps) == len(ROWS) * len(GENERATIONS)
 
 
-def test_torn_lines_are_listed_with_their_numbers_and_the_others_are_read(tmp_path):
+def test_incomplete_lines_are_listed_with_their_numbers_and_the_others_are_read(tmp_path):
     lines = [made.line(row) for row in ROWS.itertuples()]
     lines[2] = lines[2].rsplit(",", 2)[0]  # as many values as a line of 2019
     lines[7] = lines[7].replace("False", "Fal", 1)
@@ -172,7 +172,7 @@ def test_other_encodings_are_read(tmp_path, encoding):
         assert (len(recording.steps), recording.problems) == (len(ROWS), ())
 
 
-def test_policy_updates_that_diverged_are_read_and_torn_ones_listed(tmp_path):
+def test_policy_updates_that_diverged_are_read_and_incomplete_ones_listed(tmp_path):
     good = made.trainer_text(2).replace("1.900", "nan")
     (tmp_path / "sagemaker.log").write_text(good + "Policy training> Surrogate loss=0.1, KL diver\n")
     recording = read_recording(tmp_path)
@@ -219,7 +219,7 @@ def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
     assert peak < 60e6
 
 
-def test_a_line_without_end_is_skipped_and_told(tmp_path):
+def test_a_line_without_end_is_skipped_and_reported(tmp_path):
     log = tmp_path / "a.log"
     with log.open("wb") as file:
         file.write(made.log_text(ROWS).encode())

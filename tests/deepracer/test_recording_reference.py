@@ -47,7 +47,7 @@ def test_the_best_lap_took_what_the_service_says(recording, training):
     assert sorted(told.loc[told["episode"] < 560, "episode"]) == sorted(laps.index)
 
 
-def test_the_text_log_tells_the_same_rows_and_the_iteration_that_was_not_finished(
+def test_the_text_log_reports_the_same_rows_and_the_iteration_that_was_not_finished(
     recording, training, from_log
 ):
     finished = from_log[from_log["iteration"] < 28]
@@ -77,7 +77,7 @@ def test_the_entropy_begins_at_that_of_a_policy_that_knows_nothing(recording):
     assert set(updates["lr"]) == {0.0003}
 
 
-def test_metrics_and_trace_tell_the_same_episodes(recording, training):
+def test_metrics_and_trace_report_the_same_episodes(recording, training):
     told = recording.metrics[
         (recording.metrics["stream"] == "training") & (recording.metrics["phase"] == "training")
     ]
@@ -110,7 +110,7 @@ def test_settings_are_those_of_the_training(recording):
     assert recording.hyperparameters["num_epochs"] == 3
 
 
-def test_the_archive_of_the_folder_tells_the_same(recording, tmp_path):
+def test_the_archive_of_the_folder_reports_the_same(recording, tmp_path):
     path = tmp_path / "logs.tar.gz"
     with tarfile.open(path, "w:gz", compresslevel=1) as archive:
         archive.add(REFERENCE, "EHNgTNY2T9")

@@ -93,7 +93,7 @@ def test_each_car_drives_bit_for_bit_as_alone_on_its_course(setup_of):
         np.testing.assert_array_equal(seen[:, car], own_seen[:, 0])
 
 
-def test_the_trace_tells_course_and_length(setup_of):
+def test_the_trace_reports_course_and_length(setup_of):
     race = Race(setup_of(*THREE), 4)
     rows, _ = drive(race, np.zeros((2, 4), np.int64))
     lengths = [course.tracks[0].length_m for course in race.setup.courses]
@@ -101,7 +101,7 @@ def test_the_trace_tells_course_and_length(setup_of):
     np.testing.assert_array_equal(rows[1, :, PACKED["track_len"]], np.array(lengths)[[0, 1, 2, 0]])
 
 
-def test_a_reward_function_is_told_of_its_cars_own_course(setup_of, tmp_path):
+def test_a_reward_function_gets_its_cars_own_course(setup_of, tmp_path):
     (tmp_path / "spy.py").write_text(SPY)
     race = Race(setup_of(*THREE, f"reward.file={tmp_path / 'spy.py'}"), 6)
     drive(race, np.zeros((3, 6), np.int64))

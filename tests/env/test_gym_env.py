@@ -95,7 +95,7 @@ def test_one_batch_of_cars_is_as_good_as_gymnasiums_row_of_single_cars():
 
 
 @pytest.mark.parametrize("seed", [4, [4, 9, None]])
-def test_a_seed_begins_the_vector_environment_anew(seed):
+def test_a_seed_begins_the_vector_environment_again(seed):
     env = DeepRacerVectorEnv(3, ["randomization=aws", "episode.max_steps=20"])
     actions = np.random.default_rng(0).integers(0, env.single_action_space.n, (40, 3))
 

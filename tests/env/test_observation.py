@@ -42,7 +42,7 @@ def test_left_is_positive(race_of, direction):
         np.testing.assert_allclose(mirrored[name], seen[name], atol=0.02)
 
 
-def test_the_road_ahead_is_where_the_centre_line_goes_on(race_of):
+def test_the_road_ahead_is_where_the_centre_line_continues(race_of):
     race = race_of("observation.lookahead_m=[0.5,1.5]", "observation.lookahead_scale_m=3", n_cars=20)
     now, track, seen = race.rules.now, race.setup.track, features(race)
     for distance in (0.5, 1.5):

@@ -44,7 +44,7 @@ def test_a_car_drives_the_same_whatever_drives_beside_it(race_of):
     np.testing.assert_array_equal(together[:, 6:], some)
 
 
-def test_the_seed_decides_the_noise_and_seeding_begins_anew(race_of):
+def test_the_seed_decides_the_noise_and_seeding_begins_again(race_of):
     actions = random_actions(60, 2)
     first, other = race_of(*NOISY, n_cars=2), race_of(*NOISY, "seed=1", n_cars=2)
     driven = drive(first, actions)

@@ -64,7 +64,7 @@ def test_the_floors_differ(everything):
 
 
 @pytest.mark.parametrize("space", ["discrete", "continuous"])
-def test_a_race_goes_on_from_a_state_as_the_race_it_was_taken_of(everything, space):
+def test_a_race_continues_from_a_state_as_the_race_it_was_taken_of(everything, space):
     setup = dataclasses.replace(everything, actions=make_setup(f"action_space={space}").actions)
     race, used = Race(setup, 5, first_car=3), Race(setup, 5, first_car=3)
     race.reset()
@@ -97,7 +97,7 @@ def test_the_seed_that_was_set_goes_with_the_state(everything):
 
 
 @pytest.mark.parametrize("off", ["randomization=none", "randomization=aws"])
-def test_a_race_with_little_or_no_randomization_goes_on_as_well(off):
+def test_a_race_with_little_or_no_randomization_continues_as_well(off):
     setup = make_setup(off, "episode.max_steps=30")
     race, other = Race(setup, 4), Race(setup, 4)
     race.reset()

@@ -102,7 +102,7 @@ def test_without_randomization_nothing_is_drawn(monkeypatch):
     np.testing.assert_array_equal(trace[:, :, DRAWN], np.broadcast_to(list(OFF.values()), (12, 2, len(OFF))))
 
 
-def test_an_episode_keeps_what_it_drew_and_the_next_one_draws_anew():
+def test_an_episode_keeps_what_it_drew_and_the_next_one_draws_again():
     drawn = by_episode(drive(race_of("sim2real", n_cars=4), random_actions(100, 4)))
     assert len(drawn) > 12
     values, ranges = (
@@ -116,7 +116,7 @@ def test_an_episode_keeps_what_it_drew_and_the_next_one_draws_anew():
             assert len(np.unique(values[:, column])) == len(drawn), name
 
 
-def test_a_written_trace_tells_the_draws_as_they_were():
+def test_a_written_trace_reports_the_draws_as_they_were():
     values = race_of("sim2real", n_cars=4).randomization.values
     np.testing.assert_array_equal(values.astype(np.float32).astype(np.float64), values)
 
@@ -141,7 +141,7 @@ def test_an_episode_draws_the_same_whatever_happened_before():
         np.testing.assert_array_equal(long[key], short[key])
 
 
-def test_seeding_begins_the_draws_anew_and_another_seed_draws_others():
+def test_seeding_begins_the_draws_again_and_another_seed_draws_others():
     race, actions = race_of("sim2real", n_cars=2), random_actions(50, 2)
     first = drive(race, actions)
     race.seed(1)

@@ -59,7 +59,7 @@ def test_the_numbers_are_standard_normal():
 
 
 @pytest.mark.parametrize("steps", [1, 127, 128, 300])
-def test_noise_goes_on_from_the_number_of_steps_drawn(steps):
+def test_noise_continues_from_the_number_of_steps_drawn(steps):
     whole = draw(noise(2, range(3)), steps + 140)
     later = noise(2, range(3))
     later.steps = steps

@@ -136,7 +136,7 @@ def test_the_prepare_step_is_not_paid(own, reward):
     assert set(steps["new_reward"][steps["steps"] > 1]) == {1.0}
 
 
-def test_an_off_track_step_is_told_to_the_function(own, reward):
+def test_the_function_sees_an_off_track_step(own, reward):
     text = "def reward_function(params):\n    return float(params['is_offtrack'])\n"
     steps = replay_reward(own, reward(text)).steps
     assert ((steps["new_reward"] == 1.0) == (steps["episode_status"] == "off_track")).all()

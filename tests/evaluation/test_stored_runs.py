@@ -67,12 +67,12 @@ def test_a_beginning_that_several_runs_have_is_refused(run_dir, read):
     assert read(run_dir.name).path.parents[1] == run_dir
 
 
-def test_a_missing_run_is_told_the_nearest(run_dir, read):
+def test_a_missing_run_is_answered_with_the_nearest(run_dir, read):
     assert run_dir.name in refusal(read, run_dir.name.replace("seed0", "seed1"))
     assert "mlflow.db" in refusal(read, "0" * 32)
 
 
-def test_a_missing_checkpoint_is_told_those_that_are_there(run_dir, read):
+def test_a_missing_checkpoint_is_answered_with_those_that_are_there(run_dir, read):
     assert "best, last" in refusal(read, run_dir, "77")
 
 

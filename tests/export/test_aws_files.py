@@ -58,7 +58,7 @@ def test_values_beyond_the_console_are_clipped_and_reported(tmp_path, override, 
     assert any(note.startswith(f"hyperparameters.json: {key}={value}, the nearest to") for note in notes)
 
 
-def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_told():
+def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_reported():
     texts, notes = files("algorithm.batch_size=64")
     assert json.loads(texts["hyperparameters.json"])["num_episodes_between_training"] == 20
     assert "num_episodes_between_training=20" in notes[0]

@@ -171,7 +171,7 @@ def test_the_trainers_log_has_a_line_for_each_update(run, exported):
     assert f"KL divergence={run.metrics[-1]['kl']}, " in lines[-1]
 
 
-def test_what_is_left_out_is_told(run, exported):
+def test_what_is_left_out_is_reported(run, exported):
     _, said = exported["console"]
     missing = len(read_trace(run.folder / "trace", ["steps"])) - len(finished(run.folder))
     assert f"{missing:,} rows of unfinished episodes are left out" in said

@@ -24,7 +24,7 @@ def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
     assert "batch_size=512, the nearest to 1000 that the AWS console accepts" in ended.stdout
 
 
-def test_what_the_console_would_refuse_of_a_reward_is_told(trained, call, tmp_path):
+def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tmp_path):
     reward = tmp_path / "mine.py"
     reward.write_text("import os\n\n\ndef reward_function(params):\n    return 1.0\n")
     ended = call("export", str(trained(f"reward.file={reward}").folder), "format=aws", "-o", "files")

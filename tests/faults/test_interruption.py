@@ -47,7 +47,7 @@ def test_an_interruption_while_the_workers_start_ends_after_one_iteration(start_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0])
-def test_an_interruption_before_the_run_has_a_folder_is_told_by_the_exit_code(start_training, after_s):
+def test_an_interruption_before_the_run_has_a_folder_is_reported_by_the_exit_code(start_training, after_s):
     training = start_training()
     training.wait_for(lambda: "starting" in (training.cwd / "stderr.txt").read_text(), "sign of life")
     time.sleep(after_s)

@@ -43,7 +43,7 @@ MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1]))).connect()
 
 
 @pytest.mark.slow
-def test_a_store_whose_creation_was_killed_is_created_anew(tmp_path):
+def test_a_store_whose_creation_was_killed_is_created_again(tmp_path):
     command = [sys.executable, "-c", _CREATES, str(tmp_path)]
     killed = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert killed.stdout is not None

@@ -85,7 +85,7 @@ def test_a_reward_that_leaves_the_process_never_ends_a_command_with_0(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("when", WHEN)
-def test_what_is_found_is_still_told_when_the_reward_has_closed_its_stream(run_at, tmp_path, when):
+def test_what_is_found_is_still_reported_when_the_reward_has_closed_its_stream(run_at, tmp_path, when):
     ended = run_at(tmp_path, "validate", f"reward.file={write_hostile(tmp_path, 'closes', when)}")
     assert ended.code == 2
     assert ZOO["closes"][1] in ended.stderr

@@ -118,7 +118,7 @@ def test_a_fork_server_that_is_killed_ends_the_run(start_training):
 
 
 @pytest.mark.slow
-def test_a_run_stopped_as_a_whole_goes_on_afterwards(start_training):
+def test_a_run_stopped_as_a_whole_continues_afterwards(start_training):
     """Ctrl-Z and fg: no worker is to blame for the pause."""
     training = start_training(
         "collector.hang_timeout_s=2",

@@ -87,7 +87,7 @@ def test_what_the_training_needs_besides_comes_back_as_it_was(store):
     assert np.array_equal(cars["poses"], wanted["poses"], equal_nan=True)
 
 
-def test_best_is_what_was_said_to_be_and_last_what_a_training_can_go_on_from(store):
+def test_best_is_what_was_said_to_be_and_last_what_a_training_can_continue_from(store):
     agents = [make_agent(seed) for seed in range(4)]
     store.save(agents[0], {"iteration": 0}, TRAINING, best=True)
     store.save(agents[1], {"iteration": 1}, None, best=True)
@@ -147,7 +147,7 @@ def test_going_back_forgets_what_came_later(tmp_path):
     assert [str((store.folder / label).readlink()) for label in ("best", "last")] == ["000002", "000003"]
 
 
-def test_the_hashes_tell_a_changed_checkpoint(store):
+def test_the_hashes_report_a_changed_checkpoint(store):
     store.save(make_agent(0), {"iteration": 0}, TRAINING)
     folder = store.folder / "000000"
     verify(folder)

@@ -83,7 +83,7 @@ def test_a_folder_that_cannot_be_made_is_bad_input(tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_nobody_else_may_train_in_a_folder_until_it_is_let_go(folder):
+def test_no_other_process_may_train_in_a_folder_until_it_is_released(folder):
     with pytest.raises(BadInput, match="a process is training in it"):
         RunFolder(folder.path)
     folder.release()

@@ -71,7 +71,7 @@ def test_iterations_of_updates_evaluations_and_trace_are_those_of_the_metrics(tr
     assert recording.metrics.empty
 
 
-def test_what_was_trained_with_is_told_in_the_services_words(trained):
+def test_what_was_trained_with_is_reported_in_the_services_words(trained):
     recording = read_own_recording(trained().folder)
     assert recording.problems == ()
     assert recording.hyperparameters["batch_size"] == 256
@@ -94,7 +94,7 @@ def test_the_action_space_is_that_of_the_environment(trained, space):
     assert recording.steps["action"].isna().all() == (space == "continuous")
 
 
-def test_a_torn_file_of_the_trace_is_left_out_and_told(folder):
+def test_a_incomplete_file_of_the_trace_is_left_out_and_reported(folder):
     torn = folder / "trace" / "00002-iteration.parquet"
     torn.write_bytes(torn.read_bytes()[:-100])
     recording = read_own_recording(folder)
@@ -105,7 +105,7 @@ def test_a_torn_file_of_the_trace_is_left_out_and_told(folder):
     assert torn not in recording.files
 
 
-def test_a_file_of_another_kind_among_the_trace_is_left_out_and_told(folder):
+def test_a_file_of_another_kind_among_the_trace_is_left_out_and_reported(folder):
     other = folder / "trace" / "00003-iteration.parquet"
     pd.DataFrame({"episode": np.arange(10)}).to_parquet(other)
     recording = read_own_recording(folder)
@@ -113,7 +113,7 @@ def test_a_file_of_another_kind_among_the_trace_is_left_out_and_told(folder):
     assert [problem.file for problem in recording.problems] == [str(other)]
 
 
-def test_a_line_of_the_metrics_cut_off_by_a_kill_is_told(folder):
+def test_a_line_of_the_metrics_cut_off_by_a_kill_is_reported(folder):
     file = folder / "metrics.jsonl"
     file.write_text(file.read_text()[:-40])
     recording = read_own_recording(folder)
@@ -122,7 +122,7 @@ def test_a_line_of_the_metrics_cut_off_by_a_kill_is_told(folder):
     assert (problem.file, problem.line) == (str(file), 4)
 
 
-def test_missing_files_beside_the_trace_are_told(folder):
+def test_missing_files_beside_the_trace_are_reported(folder):
     for name in ("metrics.jsonl", "config.yaml", "reward_function.py"):
         (folder / name).unlink()
     recording = read_own_recording(folder)

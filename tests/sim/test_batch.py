@@ -106,7 +106,7 @@ def test_driving_does_not_depend_on_place_and_heading():
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 1.0, 2.0, 3.0, 4.0])
-def test_a_car_steering_straight_goes_straight_at_about_the_speed_it_was_told(speed):
+def test_a_car_steering_straight_goes_straight_at_about_the_speed_it_was_sent(speed):
     for car in (EVEN, IDEAL):
         state = drive(CarBatch(car, 1, 1), speed, 0.0, 60)
         assert abs(state.y_m[0]) < 1e-3
@@ -114,7 +114,7 @@ def test_a_car_steering_straight_goes_straight_at_about_the_speed_it_was_told(sp
         assert 0.95 < state.speed_mps[0] / speed < 1.06
 
 
-def test_a_car_told_straight_pulls_to_where_its_wheels_are_trimmed():
+def test_a_car_steering_straight_pulls_to_where_its_wheels_are_trimmed():
     state = drive(CarBatch(CAR, 1, 1), 1.0, 0.0, 30)
     straight = drive(CarBatch(CAR, 1, 1), 1.0, -CAR.steering_trim_deg, 30)
     assert state.y_m[0] > 0.05
@@ -159,7 +159,7 @@ def test_the_fitted_car_turns_wider_than_the_ideal_one():
     assert fitted.yaw_rate_radps[0] / fitted.speed_mps[0] < 0.7 * ideal.yaw_rate_radps[0] / ideal.speed_mps[0]
 
 
-def test_a_moved_car_goes_on_from_its_new_place_with_its_new_motion():
+def test_a_moved_car_continues_from_its_new_place_with_its_new_motion():
     cars = CarBatch(EVEN, 2, 1)
     drive(cars, 1.0, 0.0, 20)
     # The first is left as it is, the second is the first seen from elsewhere.
@@ -254,7 +254,7 @@ def test_a_weak_servo_steers_late():
     assert 0.0 < rate[1] < 0.7 * rate[0]
 
 
-def test_a_restored_state_goes_on_bit_for_bit():
+def test_a_restored_state_continues_bit_for_bit():
     speed, steering = random_commands(3, 20)
     cars, other = CarBatch(CAR, 3, 1), CarBatch(CAR, 3, 1)
     for t in range(10):
@@ -292,7 +292,7 @@ def test_a_command_that_is_not_a_number_ends_the_run_and_names_the_car(speed, st
         cars.drive(np.array([1.0, speed, 1.0]), np.array([0.0, steering, 0.0]))
 
 
-def test_a_held_car_stays_at_its_place_whatever_it_is_told():
+def test_a_held_car_stays_at_its_place_whatever_it_is_sent():
     cars = CarBatch(CAR, 2, 1)
     for _ in range(15):
         cars.drive([2.0, 2.0], [0.5, 0.5], moving=np.array([False, True]))

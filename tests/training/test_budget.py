@@ -77,12 +77,12 @@ def test_minutes_and_costs_are_summed_at_each_runs_own_price(run):
     assert minutes.used(0, 0, 300.0) == ("experiment_minutes", 0.5)
 
 
-def test_a_run_that_goes_on_or_was_killed_counts_with_its_last_whole_row(run):
+def test_a_run_that_continues_or_was_killed_counts_with_its_last_whole_row(run):
     sibling(run, "goes on", ended=False, env_steps=500)
     assert Budget(limits(experiment_env_steps=1000), run).used(250, 0, 0.0)[1] == 0.5
 
 
-def test_other_runs_are_looked_at_again_while_this_one_goes_on(run, monkeypatch):
+def test_other_runs_are_looked_at_again_while_this_one_continues(run, monkeypatch):
     monkeypatch.setattr(module, "_REFRESH_S", 0.0)
     budget = Budget(limits(experiment_env_steps=1000), run)
     assert budget.used(100, 0, 0.0)[1] == 0.1
@@ -92,7 +92,7 @@ def test_other_runs_are_looked_at_again_while_this_one_goes_on(run, monkeypatch)
     assert budget.used(100, 0, 0.0)[1] == 1.0
 
 
-def test_what_is_no_run_and_what_is_torn_count_nothing(run):
+def test_what_is_no_run_and_what_is_incomplete_count_nothing(run):
     (run.parent / "notes.txt").write_text("of mine")
     (run.parent / "empty").mkdir()
     (run.parent / "torn").mkdir()
@@ -111,7 +111,7 @@ def test_an_experiment_that_has_used_everything_starts_no_run(run):
         refuse_spent(limits(experiment_env_steps=1000), run.parent)
 
 
-def test_each_share_of_a_limit_is_told_once():
+def test_each_share_of_a_limit_is_reported_once():
     budget = Budget(limits(env_steps=1000))
     told = [[alert.percent for alert in budget.alerts(steps, 0, 0.0)] for steps in range(0, 1200, 100)]
     assert [percent for alerts in told for percent in alerts] == [50, 80, 100]
@@ -127,7 +127,7 @@ def test_shares_that_are_passed_together_are_one_alert():
     assert steps.message == "80 % of budget.env_steps used: 950 steps of 1,000 steps"
 
 
-def test_what_was_passed_before_a_run_began_is_not_told_by_it(run):
+def test_what_was_passed_before_a_run_began_is_not_reported_by_it(run):
     sibling(run, "first", env_steps=600)
     budget = Budget(limits(experiment_env_steps=1000), run)
     assert budget.alerts(0, 0, 0.0) == []
@@ -141,7 +141,7 @@ def test_without_shares_there_are_no_alerts():
     assert [*budget.alerts(0, 0, 0.0), *budget.alerts(10, 0, 0.0)] == []
 
 
-def test_it_tells_the_limits_that_are_set():
+def test_it_reports_the_limits_that_are_set():
     assert str(Budget(limits(env_steps=3_000_000, minutes=1.5))) == "3,000,000 steps or 1.5 min"
     costs = limits(max_cost=2.0, experiment_max_cost=5.0, price_per_hour=1.0)
     assert str(Budget(costs)) == "2.00 in cost or 5.00 in cost of all runs"

@@ -17,7 +17,7 @@ PAGE = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
 OVERRIDES = ("randomization=sim2real", "reward=speed_on_track", "episode.max_steps=60")
 
 
-def test_a_policy_trains_under_randomization_and_the_trace_tells_each_episodes_draws(trained):
+def test_a_policy_trains_under_randomization_and_the_trace_reports_each_episodes_draws(trained):
     ended = trained(*OVERRIDES)
     assert ended.code == 0, ended.stderr
     assert all(np.isfinite(row["policy_loss"]) for row in ended.metrics)

@@ -74,7 +74,7 @@ def whole(trained, *overrides):
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )
-def test_a_run_that_goes_on_is_the_run_that_was_never_interrupted(trained, cut, call, overrides):
+def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, cut, call, overrides):
     run = cut(*overrides)
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 0, ended.stderr
@@ -83,7 +83,7 @@ def test_a_run_that_goes_on_is_the_run_that_was_never_interrupted(trained, cut, 
     assert "will not be that of an uninterrupted run" not in ended.stderr
 
 
-def test_what_was_written_after_the_checkpoint_is_written_anew(trained, cut, call):
+def test_what_was_written_after_the_checkpoint_is_written_again(trained, cut, call):
     run = cut()
     with (run / "metrics.jsonl").open("a") as metrics:
         metrics.write(json.dumps({"iteration": 4, "env_steps": 1}) + '\n{"iteration": 5, "en')
@@ -94,7 +94,7 @@ def test_what_was_written_after_the_checkpoint_is_written_anew(trained, cut, cal
     assert_same_run(run, whole(trained))
 
 
-def test_a_torn_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trained, cut, call):
+def test_a_incomplete_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trained, cut, call):
     run = cut()
     archives = (run / "checkpoints" / "000003").rglob("state.tdz")
     (archive,) = (path for path in archives if "training" in path.parent.name)
@@ -196,7 +196,7 @@ def test_a_run_ended_by_its_stopping_rule_uses_its_budget_up_without_it(trained,
     assert (summary["reason"], summary["stopping"]) == ("budget reached: iterations", None)
 
 
-def test_a_run_that_others_have_pruned_goes_on_if_it_is_told_which_rule_counts(trained, stopped, call):
+def test_a_run_that_others_have_pruned_continues_if_asked_which_rule_counts(trained, stopped, call):
     summary = json.loads((stopped / "summary.json").read_text())
     pruned = {"status": "stopped early", "reason": "median: 9.1 is worse", "stopping": None}
     (stopped / "summary.json").write_text(json.dumps(summary | pruned))
@@ -272,7 +272,7 @@ def test_a_reward_function_changed_since_is_refused(trained, call, tmp_path):
     assert "reward mine has other contents" in ended.complaint
 
 
-def test_a_reward_function_with_a_memory_is_told_of(trained, call, tmp_path):
+def test_a_reward_function_with_a_memory_is_reported(trained, call, tmp_path):
     file = tmp_path / "memory.py"
     file.write_text(
         "seen = 0\ndef reward_function(params):\n    global seen\n    seen += 1\n    return 1.0\n"

@@ -202,7 +202,7 @@ def test_several_tracks_train_together_and_each_has_its_metrics(trained):
     assert " · least " in ended.stderr
 
 
-def test_a_run_on_one_track_tells_nothing_of_tracks(trained):
+def test_a_run_on_one_track_reports_nothing_of_tracks(trained):
     ended = trained(*OVERRIDES)
     assert not [key for key in ended.metrics[-1] if "/" in key]
     assert "tracks" not in ended.summary

@@ -138,7 +138,7 @@ def test_a_policy_that_stays_random_is_not_learning():
     [{"completion": lambda i: 11 + 0.3 * i}, {"entropy": lambda i: 1 - 0.005 * i}, {"completion": 60.0}],
     ids=["moves", "decides", "drives"],
 )
-def test_a_policy_that_shows_any_sign_of_learning_goes_on(sign):
+def test_a_policy_that_shows_any_sign_of_learning_continues(sign):
     rows = history(60, **{"completion": 11.0, "entropy": 0.999, "laps_per_iteration": 0.0} | sign)
     assert stopped_at(rows, rule()) == (None, None)
 
@@ -281,7 +281,7 @@ def every_decision() -> Iterator[Decision]:
     yield stopped_at(converging(30), rule(option="plateau"))[1]
 
 
-def test_a_decision_tells_rule_values_and_thresholds_as_json_and_tags():
+def test_a_decision_reports_rule_values_and_thresholds_as_json_and_tags():
     rules = set()
     for decision in every_decision():
         told = json.loads(json.dumps(decision.as_dict()))

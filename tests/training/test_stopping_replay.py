@@ -49,7 +49,7 @@ def replayed(folder: Path, *overrides: str) -> Replay:
     return replay(read_run(folder), compose_experiment(overrides)[0].stopping, " ".join(overrides))
 
 
-def test_it_tells_where_the_run_would_have_ended_and_what_that_saves_and_loses(make_run):
+def test_it_reports_where_the_run_would_have_ended_and_what_that_saves_and_loses(make_run):
     found = replayed(make_run(), "stopping=entropy")
     assert found.decision.rule == "converged"
     assert found.iteration == pytest.approx(112, abs=3)
@@ -61,7 +61,7 @@ def test_it_tells_where_the_run_would_have_ended_and_what_that_saves_and_loses(m
     assert found.lap_loss == pytest.approx(10.0 / 9.5 - 1)
 
 
-def test_a_rule_that_lets_the_run_go_on_saves_and_loses_nothing(make_run):
+def test_a_rule_that_lets_the_run_continue_saves_and_loses_nothing(make_run):
     found = replayed(make_run(), "stopping=none")
     assert found.decision is None
     assert (found.saved_steps, found.saved_s, found.lap_loss) == (0, 0.0, 0.0)

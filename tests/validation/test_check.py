@@ -20,7 +20,7 @@ def reward_function(params):
 GOOD = function('return params["speed"] - 5.0 * params["is_offtrack"] + params["progress"] / params["steps"]')
 
 
-def test_a_good_function_is_told_nothing(check_of):
+def test_a_good_function_gets_no_warning(check_of):
     check = check_of(GOOD)
     assert check.failures == []
     assert check.warnings == []
@@ -44,7 +44,7 @@ def test_a_good_function_is_told_nothing(check_of):
         ('return "1"', "line 2 returned '1'; accepted: a finite number"),
     ],
 )
-def test_what_would_end_a_training_is_told_with_its_line(check_of, body, words):
+def test_what_would_end_a_training_is_reported_with_its_line(check_of, body, words):
     check = check_of(function(body))
     assert words in check.failures[0]
     assert check.warnings == []
@@ -117,7 +117,7 @@ def test_a_constant_reward_is_reported_in_one_line(check_of):
     assert "always returns 1, whatever the car does" in told
 
 
-def test_a_reward_of_chance_is_told(check_of):
+def test_a_reward_of_chance_is_reported(check_of):
     told = check_of(function("return random.random()", "import random\n")).warnings
     assert any("draws random numbers" in line for line in told)
 

@@ -76,7 +76,7 @@ def test_code_beyond_140_000_characters_is_refused():
         (GOOD.replace("math.sqrt", ""), "'math' imported but unused"),
     ],
 )
-def test_style_codes_of_flake8s_e_and_f_are_told(text, code):
+def test_style_codes_of_flake8s_e_and_f_are_reported(text, code):
     assert any(code in finding.text for finding in style_findings(text))
 
 
@@ -90,7 +90,7 @@ def test_style_codes_of_flake8s_e_and_f_are_told(text, code):
         GOOD.replace("import math", "import math, random  # noqa: E401, F401"),
     ],
 )
-def test_what_the_console_does_not_look_at_is_not_told(text):
+def test_what_the_console_does_not_look_at_is_not_reported(text):
     assert style_findings(text) == []
 
 

@@ -53,7 +53,7 @@ def test_nothing_is_missed_once_every_branch_was_taken():
     assert missed(*calls) == []
 
 
-def test_the_tracer_that_was_at_work_goes_on_afterwards():
+def test_the_tracer_that_was_at_work_continues_afterwards():
     import sys
 
     before = sys.gettrace()
