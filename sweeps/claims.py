@@ -152,7 +152,12 @@ class TrialClaims:
         return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more}, (_CLAIMED,))
 
     def record(
-        self, claim: Claim, *, trial_id: int | None = None, runs: list[dict[str, Any]] | None = None
+        self,
+        claim: Claim,
+        *,
+        trial_id: int | None = None,
+        runs: list[dict[str, Any]] | None = None,
+        progress: Mapping[str, Any] | None = None,
     ) -> bool:
         """Record what a later owner must know; return False if another worker has taken the trial over."""
         values: dict[sa.Column[Any], Any] = {}
@@ -160,6 +165,8 @@ class TrialClaims:
             values[_of.trial_id] = trial_id
         if runs is not None:
             values[_of.runs] = json.dumps(runs)
+        if progress is not None:
+            values[_of.progress] = json.dumps(dict(progress))
         return self._update_held(claim, values, (_CLAIMED,))
 
     def settle(self, claim: Claim, result: TrialResult) -> bool:
@@ -294,7 +301,8 @@ class Lease:
         """Hold a fresh claim, valid for `lease_s` seconds without renewal."""
         self.claim = claim
         self._claims, self._lease_s, self._patience_s = claims, lease_s, patience_s
-        self._progress: Mapping[str, Any] = {}
+        self.progress: Mapping[str, Any] = {}
+        """How far the trial is; the next renewal stores it."""
         self._renewed_at = time.monotonic()
         self._lost = False
         self._over = threading.Event()
@@ -308,10 +316,6 @@ class Lease:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
-
-    def show(self, progress: Mapping[str, Any]) -> None:
-        """Set how far the trial is; the next renewal stores it."""
-        self._progress = progress
 
     def confirm(self) -> None:
         """Return while the claim is held.
@@ -335,7 +339,7 @@ class Lease:
 
     def _renew(self) -> bool:
         began = time.monotonic()
-        held = self._claims.renew(self.claim, self._lease_s, dict(self._progress) or None)
+        held = self._claims.renew(self.claim, self._lease_s, dict(self.progress) or None)
         if held:
             self._renewed_at = began
         return held

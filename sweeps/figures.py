@@ -225,7 +225,12 @@ def _slices(
     figure.update_layout(height=round(body + 120), margin={"r": 90})
     figure.update_xaxes(tickangle=0, nticks=4, exponentformat="power")
     figure.for_each_xaxis(
-        lambda one: one.update(range=[-0.5, len(one.categoryarray) - 0.5]), {"type": "category"}
+        lambda one: one.update(
+            range=[-0.5, len(one.categoryarray) - 0.5],
+            tickvals=one.categoryarray,
+            ticktext=[parameter(value) for value in one.categoryarray],
+        ),
+        {"type": "category"},
     )
     figure.for_each_xaxis(lambda one: one.title.update(text=_plain(keys[one.title.text], 40)))
     figure.update_yaxes({**axis, "title_text": ""})

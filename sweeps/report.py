@@ -108,7 +108,12 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
         run = read_head(best_run(study))
     except BadInput:  # moved or removed since
         return found
-    return [pair for pair in outcome_of_run(run) if pair[0] in ("Track", "Reward")] + found
+    known = {name.lower() for name, _ in found}
+    return [
+        pair
+        for pair in outcome_of_run(run)
+        if pair[0] in ("Track", "Reward") and pair[0].lower() not in known
+    ] + found
 
 
 def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:

@@ -229,7 +229,8 @@ class TrialRun(Callback):
     def _show(self, spent: float, row: dict[str, Any]) -> None:
         """Set what the live view shows, after this share of the present run's budget."""
         share = (self._seed + min(spent, 1.0)) / self._config.config.seeds
-        self._lease.show({**row, "number": self._number, "params": self._trial.params, "share": share})
+        known = {"number": self._number, "params": self._trial.params, "share": share}
+        self._lease.progress = {**row, **known}
 
     def _asked(self, value: float) -> PruneDecision | None:
         """Report an evaluation to Optuna, and return what the pruners decide."""
@@ -422,7 +423,9 @@ class TrialRun(Callback):
         """Store the present run for a later owner."""
         self._runs[self._seed :] = [run]
         claim = self._lease.claim
-        self._lease.held(lambda: self._claims.record(claim, runs=self._runs))
+        # With what was drawn: a short trial ends before the first renewal.
+        progress = self._lease.progress or None
+        self._lease.held(lambda: self._claims.record(claim, runs=self._runs, progress=progress))
 
     def _with_attrs(self, state: str, values: list[float] | None, overrides: list[str]) -> TrialResult:
         """Return a result with attributes: sums and means over the runs; the last one gives outcome and reason."""

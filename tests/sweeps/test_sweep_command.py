@@ -67,6 +67,11 @@ def swept(tmp_path_factory, run_at):
     return ended
 
 
+def test_a_trial_that_ends_is_a_line_with_what_it_drew(swept):
+    lines = [line for line in swept.stderr.splitlines() if line.startswith("trial ")]
+    assert [line.split()[2:4] for line in lines] == [["with", "lr"]] * 2
+
+
 def test_the_printed_line_trains_the_winner(swept):
     (line,) = [line for line in swept.stdout.splitlines() if line.startswith("  deepracer-exp train ")]
     study = load(swept.cwd, "s")
