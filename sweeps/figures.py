@@ -175,7 +175,9 @@ def _history(
 ) -> go.Figure:
     figure = plot_optimization_history(study, target=target, target_name=MEASURES[objective].title)
     _styled(figure, f"Values of the complete trials{title}", 440)
-    return figure.update_xaxes(title_text="trial", tickformat="d").update_yaxes(**axis)
+    # Few trials would have ticks between them.
+    every = 1 if len(study.trials) <= 10 else None
+    return figure.update_xaxes(title_text="trial", tickformat="d", dtick=every).update_yaxes(**axis)
 
 
 def _pareto(
@@ -228,7 +230,7 @@ def _slices(
         lambda one: one.update(
             range=[-0.5, len(one.categoryarray) - 0.5],
             tickvals=one.categoryarray,
-            ticktext=[parameter(value) for value in one.categoryarray],
+            ticktext=[value.strip("'") for value in one.categoryarray],
         ),
         {"type": "category"},
     )
