@@ -131,7 +131,7 @@ def test_the_command_prints_a_line_a_run_and_rule_and_their_means(make_run, call
 def test_the_command_replays_a_real_run(trained, call):
     ended = call("stopping", "replay", str(trained().folder), "stopping=plateau")
     assert ended.code == 0, ended.stderr
-    assert "goes on to the end" in ended.stdout
+    assert "continues to the end" in ended.stdout
     assert "4 of 4" in ended.stdout
 
 
