@@ -139,8 +139,8 @@ def write_long_log(source: Path, target: Path, size_bytes: int) -> int:
                 prefix, episode, values = line
                 time = values[_TIME]
                 later = b"%.3f%b" % (float(time) + turn * lasting_s, time[len(time.rstrip()) :])
-                told = [*values[:_TIME], later, *values[_TIME + 1 :]]
-                written += file.write(b"%b%d,%b" % (prefix, episode + turn * episodes, b",".join(told)))
+                fields = [*values[:_TIME], later, *values[_TIME + 1 :]]
+                written += file.write(b"%b%d,%b" % (prefix, episode + turn * episodes, b",".join(fields)))
                 steps += 1
             turn += 1
     return steps

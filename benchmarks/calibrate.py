@@ -95,7 +95,7 @@ def fit(
         parameters: which keys of the car to fit.
         evaluations: at most this many steps of scipy's least_squares, each of which drives every window once for each
             parameter and once more.
-        report: told the cost after every improvement.
+        report: called with the cost after every improvement.
 
     Raises:
         RunFailed: the physics of the car to begin with blew up.

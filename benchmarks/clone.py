@@ -127,8 +127,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ]
     summary = summarize(seeds)
     print(f"\n{markdown(seeds, summary)}")
-    told = {"steps": options.steps, "more": options.more, "trials": TRIALS, "overrides": options.overrides}
-    result = {**summary, **told, "seeds": seeds}
+    given = {"steps": options.steps, "more": options.more, "trials": TRIALS, "overrides": options.overrides}
+    result = {**summary, **given, "seeds": seeds}
     write_json(options.json, result)
     print(json.dumps(result))
 

@@ -47,13 +47,13 @@ class SB3Cars(VecEnv):
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
         observation, reward, terminated, truncated, infos = self.cars.step(self._actions)
         ended = terminated | truncated
-        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        per_car: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for car in np.flatnonzero(ended):
-            told[car] = {
+            per_car[car] = {
                 "terminal_observation": infos["final_obs"][car],
                 "TimeLimit.truncated": bool(truncated[car]),
             }
-        return observation, reward, ended, told
+        return observation, reward, ended, per_car
 
     def close(self) -> None:
         self.cars.close()

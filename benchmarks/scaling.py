@@ -87,7 +87,7 @@ class Relay:
 
 
 def commits(storage: Storage) -> int:
-    """Return how many transactions the database has seen end; what is told late has been told after a second."""
+    """Return how many transactions the database has seen end; what it reports late is there after a second."""
     time.sleep(1.2)
     seen = sa.text(
         "SELECT xact_commit + xact_rollback FROM pg_stat_database WHERE datname = current_database()"
@@ -188,7 +188,7 @@ def fill(storage: Storage, study: str, trials: int) -> None:
         "value": [10.0],
         "fate": "finished",
     }
-    told = json.dumps({"overrides": ["x" * 40] * 8, "runs": [run], "env_steps": 10**6, "reason": "x" * 60})
+    attrs = json.dumps({"overrides": ["x" * 40] * 8, "runs": [run], "env_steps": 10**6, "reason": "x" * 60})
     row = {"attempt": 1, "owner": "bench:1:a", "state": "told", "expires_s": 0.0, "outcome": "COMPLETE"}
     TrialClaims(storage.engine, study)
     there = sa.Table("deepracer_slots", sa.MetaData(), autoload_with=storage.engine)
@@ -199,7 +199,7 @@ def fill(storage: Storage, study: str, trials: int) -> None:
             "slot": index,
             "runs": json.dumps([run]),
             "objective_values": "[10.0]",
-            "attrs": told,
+            "attrs": attrs,
         }
         for index in range(trials)
     ]

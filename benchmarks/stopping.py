@@ -60,7 +60,7 @@ _MEANS = ("completion", "held_out_completion", "lap_share")
 
 
 def training_overrides(track: str, seed: int, steps: int, overrides: Sequence[str], rule: str) -> list[str]:
-    """Return what is told to `deepracer-exp train`."""
+    """Return the overrides of `deepracer-exp train`."""
     # Every checkpoint stays: the best of the beginning is not the best of the whole run.
     keep = ("checkpoints.keep=1000", "tracking=off", f"budget.env_steps={steps}")
     return [f"track={track}", *overrides, rule, *keep, f"seed={seed}"]
@@ -70,8 +70,8 @@ def trained(folder: Path, overrides: Sequence[str]) -> Path:
     """Return a finished run of these overrides in `folder`; train if there is none."""
     for summary in sorted(folder.glob("runs/*/*/summary.json")):
         run = summary.parent
-        told = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
-        if told == list(overrides) and read_summary(run)["status"] in (
+        stored = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
+        if stored == list(overrides) and read_summary(run)["status"] in (
             "finished",
             "stopped early",
             "hopeless",
@@ -238,11 +238,11 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     runs = []
     for (track, seed), run in zip(places, full, strict=True):
         runs.append({"track": track, "seed": seed, **measure(run, rule, options.trials)})
-        told = {key: runs[-1][key] for key in ("rule", "iteration", "saved", "lap_time_loss")}
-        print(f"{track} seed {seed}: {told}", flush=True)
+        last = {key: runs[-1][key] for key in ("rule", "iteration", "saved", "lap_time_loss")}
+        print(f"{track} seed {seed}: {last}", flush=True)
     proof = prove(full[0], stopped, runs[0]["iteration"], checkpoint_name(runs[0]["kept"]))
-    told = {"steps": options.steps, "trials": options.trials, "overrides": options.overrides}
-    return {**summarize(runs), "wanted": WANTED, **told, "really_stopped": proof, "runs": runs}
+    given = {"steps": options.steps, "trials": options.trials, "overrides": options.overrides}
+    return {**summarize(runs), "wanted": WANTED, **given, "really_stopped": proof, "runs": runs}
 
 
 if __name__ == "__main__":
