@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector as TorchRLCollector
 from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
+from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
@@ -133,15 +134,8 @@ class LocalCollector(Collector):
             self._collector.shutdown()
             # TorchRL gives this process the workers' threads, and with other threads sums have other last digits.
             torch.set_num_threads(threads)
-        if not self._workers:
-            return
-        # TorchRL closes what weights travelled through when its collector is garbage: after a failure that is never,
-        # and the interpreter's end would wait without end for a queue that is never emptied.
-        for scheme in (self._collector._weight_sync_schemes or {}).values():
-            for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
-                for queue in (getattr(scheme, name, None) or {}).values():
-                    queue.cancel_join_thread()
-            scheme.shutdown()
+        if self._workers:
+            self._close_weights()
 
     def _start(self, envs: list[EnvFactory], policy: torch.nn.Module, options: dict[str, Any]) -> Any:
         if self._mode == "sync":
@@ -149,6 +143,9 @@ class LocalCollector(Collector):
         else:
             kind, more = MultiAsyncCollector, {}
         others = len(multiprocessing.active_children())
+        # What TorchRL would take itself; ours can be closed even if no collector is returned.
+        self._weights = SharedMemWeightSyncScheme()
+        options = options | {"weight_sync_schemes": {"policy": self._weights}}
         with contextlib.ExitStack() as undo:
             undo.callback(self._give_up_starting)
             try:
@@ -169,6 +166,18 @@ class LocalCollector(Collector):
         for process in multiprocessing.active_children():
             process.kill()
             process.join()
+        self._close_weights()
+
+    def _close_weights(self) -> None:
+        """Close the queues through which workers hear of new weights.
+
+        TorchRL does it when its collector is garbage. After a failure that is at the interpreter's end, which would
+        then wait without end: for a queue that is never emptied, or for a thread, which can no longer start.
+        """
+        for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
+            for queue in getattr(self._weights, name).values():
+                queue.cancel_join_thread()
+        self._weights.shutdown()
 
     def _restore_cars(self) -> None:
         """Put the cars where those of the given state were.
