@@ -12,6 +12,8 @@ from rich.table import Table
 
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.deepracer.routes import recognise
+from deepracer_exp.deepracer.worlds import UNITS_PER_M
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.files import METRICS, read_metrics
 
@@ -46,8 +48,9 @@ def validate_reward(
     setup = check.setup
     out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
     _print_console_findings(out, check)
-    (track,) = experiment.tracks.values()
-    if track.file is not None or track.knots is not None:
+    waypoints = setup.track.waypoints
+    same = recognise(waypoints, np.arange(len(waypoints)))[:1]
+    if not same or same[0].distance_m > 1 / UNITS_PER_M:
         _line(
             out, "Waypoints: numbered as in the track's own file or knots, not as in a track of the service"
         )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.rewards.source import zoo_names
 from deepracer_exp.validation import check as checking
 from deepracer_exp.validation.check import read
@@ -29,9 +30,13 @@ def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
     assert imread(picture).shape[1] > 400
 
 
-@pytest.mark.parametrize(("track", "own"), [("track=Oval_track", False), ("track.file=square.yaml", True)])
+@pytest.mark.parametrize(
+    ("track", "own"),
+    [("track=Oval_track", False), ("track.file=oval.npy", False), ("track.file=square.yaml", True)],
+)
 def test_waypoint_numbers_that_no_world_has_are_noted(call, tmp_path, track, own):
     (tmp_path / "square.yaml").write_text("width_m: 0.8\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
+    np.save(tmp_path / "oval.npy", world_rows("Oval_track") + 4e-5)
     ended = call("validate", "reward=speed_on_track", track)
     assert ("not as in a track of the service" in ended.stdout) == own
     assert {path.parent.name for path in tmp_path.rglob("*.png")} == {"validate"}
