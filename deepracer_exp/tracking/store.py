@@ -6,6 +6,7 @@ MLflow takes seconds to import, so that only what opens a store imports it.
 import logging
 import os
 import re
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -150,8 +151,13 @@ def check_database_file(file: Path, shown: str) -> None:
         raise BadInput(f"{shown}: folder {file.parent} cannot be created: {error.strerror}") from None
     if file.is_dir():
         raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
-    # SQLite keeps two files beside it, so the folder must be writable, too.
-    if not all(os.access(path, os.W_OK) for path in (file, file.parent) if path.exists()):
+    try:
+        # SQLite keeps two files beside it. Permissions alone do not tell: root has all of them, even in /proc.
+        tempfile.TemporaryFile(dir=file.parent).close()
+        writable = not file.exists() or os.access(file, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
         raise BadInput(f"{shown}: {file} cannot be written; choose a writable place")
 
 

@@ -42,6 +42,7 @@ def assert_nothing_begun(ended):
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
         ((LR, "--storage", "sqlite:///x.db"), ("--storage", "sweep.storage=sqlite:///x.db")),
         ((LR, "reward.file=missing.py"), ("missing.py",)),
+        ((LR, "sweep.storage=sqlite:////proc/x.db"), ("sweep.storage=", "/proc/x.db cannot be written")),
         (
             (LR, "sweep.storage=postgresql+psycopg://me:secret@127.0.0.1:1/none"),
             ("sweep.storage=postgresql+psycopg://", "127.0.0.1"),

@@ -22,6 +22,7 @@ from deepracer_exp.tracking.tracker import open_tracker
         ("sqlite:///", "names no file"),
         ("sqlite:///:memory:", "names no file"),
         ("sqlite:////proc/none/mlflow.db", "folder /proc/none cannot be created"),
+        ("sqlite:////proc/x.db", "/proc/x.db cannot be written"),
         ("sqlite:////proc", "is a folder"),
     ],
 )
