@@ -7,6 +7,8 @@ from contextlib import contextmanager
 _LONGEST_LINE = 4000
 """Characters of a message; the longest lists of options have fewer."""
 
+NO_MEMORY = "needs more memory than there is"
+
 
 class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise site
     """Something the user gave cannot be used; the message is one line that says what would be accepted."""
@@ -43,11 +45,16 @@ def reading(what: object, accepted: str = "") -> Iterator[None]:
         raise BadInput(f"{what}: {_reason(error)}{hint}") from error
 
 
+def is_refused_memory(error: BaseException) -> bool:
+    """Return whether an allocation was refused, for which torch raises a RuntimeError."""
+    return isinstance(error, MemoryError) or "can't allocate memory" in str(error)
+
+
 def _reason(error: Exception) -> str:
     if isinstance(error, RecursionError):
         return "nested too deeply"
-    if isinstance(error, MemoryError):
-        return "needs more memory than there is"
+    if is_refused_memory(error):
+        return NO_MEMORY
     if isinstance(error, UnicodeDecodeError):
         return f"is not UTF-8 text (byte {error.start} is 0x{error.object[error.start]:02x})"
     if isinstance(error, OSError) and error.strerror:

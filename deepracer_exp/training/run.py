@@ -21,7 +21,7 @@ from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.errors import BadInput, RunFailed, reading
+from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.convergence import UNDECIDED
 from deepracer_exp.runs.files import (
@@ -299,6 +299,13 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
         # No checkpoint, which might be of a half-made update, and no pictures.
         return trainer.end(INTERRUPTED, "ended at once by a second signal", interruption.exit_code or 130)
     except Exception as error:
+        if is_refused_memory(error):
+            cars, frames = (
+                trainer.experiment.collector.cars,
+                trainer.experiment.algorithm.frames_per_iteration,
+            )
+            what = f"collector.cars={cars}, algorithm.frames_per_iteration={frames}: {NO_MEMORY}"
+            return trainer.fail(what, error, RunFailed.exit_code if trainer.row else BadInput.exit_code)
         # A bug: its traceback is shown, but the run must not look as if it were running.
         trainer.fail(f"{type(error).__name__}: {error}", error)
         raise

@@ -347,10 +347,10 @@ class Trainer:
         self.folder.release()
         return result
 
-    def fail(self, reason: str, error: BaseException) -> TrainResult:
+    def fail(self, reason: str, error: BaseException, exit_code: int = RunFailed.exit_code) -> TrainResult:
         """Write a crash dump and end the run as failed."""
         write_crash_dump(self.folder.path, error)
-        return self.end(FAILED, reason, RunFailed.exit_code, error)
+        return self.end(FAILED, reason, exit_code, error)
 
     def release(self) -> None:
         """Leave the run to the process that continues it: nothing more is written into its folder."""

@@ -2,9 +2,11 @@
 
 import json
 import pickle
+import resource
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
@@ -33,6 +35,20 @@ SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
 )
 def test_values_that_cannot_be_used_are_refused_in_one_line(train_here, overrides, words):
     train_here(*overrides).assert_bad_input(*words)
+
+
+def test_cars_that_do_not_fit_into_memory_are_refused_in_one_line(train_here):
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + 2**30, hard))
+    try:
+        refused = train_here("collector.cars=100", "algorithm.frames_per_iteration=10000000")
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    assert refused.code == 2, refused.stderr
+    words = "collector.cars=100, algorithm.frames_per_iteration=10000000: needs more memory than there is"
+    assert words in refused.complaint
+    assert "Traceback" not in refused.stderr
+    assert refused.summary["status"] == "failed"
 
 
 def _route(folder: Path, name: str, kind: str) -> str:
