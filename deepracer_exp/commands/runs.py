@@ -41,7 +41,7 @@ _LIST = "list"
 _EPILOG = """\
   deepracer-exp runs                                        list the runs, newest first
   deepracer-exp runs compare runs/default/*                 all runs of an experiment
-  deepracer-exp runs compare RUN RUN -o better.html         where the figure is written
+  deepracer-exp runs compare RUN RUN -o better.html         draw their learning curves and lap times, too
   deepracer-exp runs lineage RUN
   deepracer-exp runs promote RUN                            its best checkpoint, as EXPERIMENT@champion
   deepracer-exp runs promote best:default --alias rain      the best run of an experiment
@@ -89,11 +89,12 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "compare",
         _compare,
         help="show runs side by side",
-        description="Show how runs differ and what they achieved, and draw their learning curves and lap times.",
+        description="Show how runs differ and what they achieved; with --output, draw their learning curves and lap "
+        "times.",
     )
     add_run(compare, where, many=True)
     compare.add_argument(
-        "-o", "--output", default="compare.html", help="page of the figure (default: compare.html)"
+        "-o", "--output", metavar="PAGE.html", help="draw learning curves and lap times on this page"
     )
 
     lineage = add_command(
@@ -216,7 +217,7 @@ def _compare(args: argparse.Namespace) -> int:
     from deepracer_exp.runs.files import read_run
     from deepracer_exp.runs.resolve import resolve
 
-    if Path(args.output).suffix != ".html":
+    if args.output is not None and Path(args.output).suffix != ".html":
         raise BadInput(f"--output {args.output}: accepted: the name of a page (.html)")
     runs, overrides = runs_and_overrides(args)
     stores = read_stores(overrides)
@@ -228,21 +229,23 @@ def _compare(args: argparse.Namespace) -> int:
         if not record.rows:
             raise BadInput(f"{record.path / METRICS}: has no iteration; there is nothing to compare")
 
-    from deepracer_exp.analysis.charts.runs import learning_curves_compared
-    from deepracer_exp.analysis.page import write_chart
+    if args.output is not None:
+        from deepracer_exp.analysis.charts.runs import learning_curves_compared
+        from deepracer_exp.analysis.page import write_chart
 
-    chart = learning_curves_compared(dict(zip(ascii_uppercase, records, strict=False)))
-    try:
-        write_chart(Path(args.output), chart)
-    except OSError as error:
-        raise BadInput(f"--output {args.output}: cannot be written: {error}") from error
+        chart = learning_curves_compared(dict(zip(ascii_uppercase, records, strict=False)))
+        try:
+            write_chart(Path(args.output), chart)
+        except OSError as error:
+            raise BadInput(f"--output {args.output}: cannot be written: {error}") from error
     console = table_console()
     for letter, record in zip(ascii_uppercase, records, strict=False):
         console.print(f"{letter}  {record.path}", soft_wrap=True)
     for table in _tables(records):
         console.print()
         console.print(table)
-    console.print(f"\n{args.output}: learning curves and lap times", soft_wrap=True)
+    if args.output is not None:
+        console.print(f"\n{args.output}: learning curves and lap times", soft_wrap=True)
     return 0
 
 

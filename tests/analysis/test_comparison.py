@@ -135,16 +135,19 @@ def write(record: RunRecord) -> None:
     (record.path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in record.rows))
 
 
-def test_the_command_shows_differences_and_results_and_writes_the_picture(record, call, tmp_path):
+@pytest.mark.parametrize("output", [[], ["-o", "out.html"]])
+def test_the_command_shows_differences_and_results_and_writes_the_page_it_is_asked_for(
+    record, call, tmp_path, output
+):
     write(record("runs/e/first", "seed=1"))
     write(record("runs/e/second", "seed=2", lap_s=9.25))
-    ended = call("runs", "compare", "first", "second", "-o", "out.html")
+    ended = call("runs", "compare", "first", "second", *output)
     assert ended.code == 0, ended.stderr
     words = [line.split() for line in ended.stdout.splitlines()]
     assert ["A", "runs/e/first"] in words
     assert ["seed", "1", "2"] in words
     assert ["best", "lap", "in", "training,", "s", "10.00", "9.25"] in words
-    assert (tmp_path / "out.html").stat().st_size > 1_000_000
+    assert [page.name for page in tmp_path.rglob("*.html")] == output[1:]
 
 
 @pytest.mark.parametrize(
