@@ -96,8 +96,10 @@ class Driver:
                 continue
             self._losses += 1
             if self._losses > 2 * self._launcher.workers + _FEW:
+                logs = [str(log) for log in self._config.folder.glob("workers*.log") if log.stat().st_size]
+                why = f"see {' and '.join(logs)}" if logs else "a reward function can do that"
                 raise RunFailed(
-                    f"workers die again and again; see {self._config.folder}/workers*.log for the reason; "
+                    f"workers die again and again, the last with exit code {one.exitcode}; {why}; "
                     f"{self._how_to_resume()}"
                 )
             self._start()

@@ -84,6 +84,19 @@ def test_a_reward_that_leaves_the_process_never_ends_a_command_with_0(
 
 
 @pytest.mark.slow
+def test_workers_that_die_without_a_word_are_not_looked_for_in_an_empty_log(run_at, tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import multiprocessing, os\n"
+        "if multiprocessing.parent_process() is not None: os._exit(0)\n"
+        "def reward_function(params):\n    return 1.0\n"
+    )
+    tiny = ("experiment=tiny", "tracking=off", "sweep.trials=2", "sweep.workers=1")
+    ended = run_at(tmp_path, "sweep", *tiny, "algorithm.lr=1e-3,1e-4", "reward.file=mine.py")
+    assert ended.code == 3
+    assert "the last with exit code 0; a reward function can do that;" in ended.complaint
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("when", WHEN)
 def test_what_is_found_is_still_reported_when_the_reward_has_closed_its_stream(run_at, tmp_path, when):
     ended = run_at(tmp_path, "validate", f"reward.file={write_hostile(tmp_path, 'closes', when)}")
