@@ -1,7 +1,9 @@
 """Errors in a command line are reported at once, and in one line."""
 
+import contextlib
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 
@@ -32,6 +34,7 @@ CASES = {
     ("evaluate", "runs/a/run", "evaluation=sumit"): "did you mean summit?",
     ("evaluate", "evaluation=summit"): "RUN: missing; write deepracer-exp evaluate RUN",
     ("evaluate", "one", "two"): "one two: 2 runs given",
+    ("evaluate", "unknown", "runs_dir=recorded"): "unknown: no such run in recorded (0 there); no registered",
     ("resume", "unknown"): "unknown: no such run",
     ("resume", "~no_such_user"): "~no_such_user",
     ("resume", "a" * 300): "File name too long",
@@ -94,6 +97,9 @@ def refused(tmp_path_factory, call_at):
     folder = tmp_path_factory.mktemp("early")
     os.mkfifo(folder / "pipe")
     (folder / "log.txt").write_text("nothing\n")
+    (folder / "recorded").mkdir()
+    with contextlib.closing(sqlite3.connect(folder / "recorded" / "mlflow.db")) as store:
+        store.execute("CREATE TABLE registered_model_aliases (name, alias, version)")
     run = folder / "runs" / "a" / "run"
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.yaml").write_text(call_at(folder, "train", "name=a", "--cfg").stdout)

@@ -3,8 +3,10 @@
 import json
 import re
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +19,7 @@ from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, rea
 
 from .metadata import picture, race_result
 from .metrics import metric_names
-from .store import open_client, pages
+from .store import has_store, open_client, pages, resolve_store
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -81,13 +83,11 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
     check_alias(reference, alias)
     if at:
         check_model(reference, model)
-    with open_client(reference, uri, runs_dir) as client:
-        models = pages(client.search_registered_models)
-        known = [(found.name, name) for found in models for name in found.aliases]
-        matches = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
-        if len(matches) == 1:
-            version = client.get_model_version_by_alias(*matches[0])
-            return _registered(reference, version, alias)
+    known = _aliases(reference, uri, runs_dir)
+    matches = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
+    if len(matches) == 1:
+        with open_client(reference, uri, runs_dir) as client:
+            return _registered(reference, client.get_model_version_by_alias(*matches[0]), alias)
     names = [f"{name}@{given}" for name, given in known]
     if matches:
         raise BadInput(
@@ -97,6 +97,16 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
         f"{reference}: no registered model has this alias{nearest(reference, names)}; "
         f"known: {', '.join(names[:10]) or 'none'}; deepracer-exp runs promote registers one"
     )
+
+
+def _aliases(what: str, uri: str | None, runs_dir: Path) -> list[tuple[str, str]]:
+    """Return model and name of each alias; those of a file are read without MLflow, which takes seconds to import."""
+    if has_store(uri, runs_dir) and (file := resolve_store(uri, runs_dir).sqlite_file) is not None:
+        with suppress(sqlite3.Error), closing(sqlite3.connect(file)) as database:
+            return database.execute("SELECT name, alias FROM registered_model_aliases").fetchall()
+    with open_client(what, uri, runs_dir) as client:
+        models = pages(client.search_registered_models)
+        return [(found.name, name) for found in models for name in found.aliases]
 
 
 def promote(
