@@ -173,9 +173,9 @@ def _submit(view: LogView) -> Finding:
             f"the checkpoint {first['checkpoint']}, which" if first["checkpoint"] else "the checkpoint that"
         )
         sentence = (
-            f"Submit {which} drove iteration {first['iteration']:.0f}: a quarter of its laps are below "
-            f"{first['lap_time_p25_s']:.2f} s, and {first['complete']:.0f} of its {first['episodes']:.0f} episodes "
-            f"are complete laps ({_share(low)} to {_share(high)} with 95 % confidence)."
+            f"Submit {_checkpoint(first['checkpoint'], 'drove')} iteration {first['iteration']:.0f}: a quarter of "
+            f"its laps are below {first['lap_time_p25_s']:.2f} s, and "
+            f"{first['complete']:.0f} of its {first['episodes']:.0f} episodes are complete laps ({_share(low)} to {_share(high)} with 95 % confidence)."
         )
         others = [
             f"{row.checkpoint or row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
@@ -187,10 +187,11 @@ def _submit(view: LogView) -> Finding:
         values |= {"lap_share": float(first["lap_share"]), "laps": int(first["complete"])}
     elif len(evaluated):
         first = evaluated.iloc[0]
+        saved = view.recording.checkpoints.get(int(evaluated.index[0]) + 1, "")
         driven = int(first["laps"])
         did = {1: "completed its lap", 2: "completed both laps"}.get(driven, f"completed all {driven} laps")
         sentence = (
-            f"Submit the checkpoint saved after iteration {evaluated.index[0]}: its evaluation {did}, in "
+            f"Submit {_checkpoint(saved, 'was saved after')} iteration {evaluated.index[0]}: its evaluation {did}, in "
             f"{first['lap_time_s']:.2f} s{'' if driven == 1 else ' on average'}. The training itself has too few "
             f"complete laps to judge by ({laps})."
         )
@@ -208,6 +209,15 @@ def _submit(view: LogView) -> Finding:
         )
         values = {"laps": laps, "progress": float(farthest["progress"])}
     return Finding("submit", sentence, values, thresholds)
+def _checkpoint(name: str, did: str) -> str:
+    if name:
+        return f"the checkpoint {name}, which {did}"
+    return (
+        "the checkpoint (its name is not logged, and not all steps before it are recorded, whose number is in it) "
+        f"that {did}"
+    )
+
+
 
 
 def _chance(view: LogView, target_s: float | None) -> Finding | None:

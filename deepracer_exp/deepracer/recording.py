@@ -157,6 +157,7 @@ class Recording:
     decision: Mapping[str, Any] | None = None
     """The decision of its stopping rule, as in summary.json; None without one, or for a log of the service."""
     checkpoints: Mapping[int, str] = field(default_factory=dict)
-    """Name of the service's checkpoint that drove each iteration, from its text logs: `309_Step-8349`."""
+    """Name of the service's checkpoint that drove each iteration, from its text logs or, if every step before it is
+    recorded, their number: `309_Step-8349`."""
     rounds: tuple[Round, ...] = ()
     """The trainings in the order of `steps`; empty where there is only one."""

@@ -66,6 +66,21 @@ def read_recording(path: Path) -> Recording:
     return recording
 
 
+def _counted_checkpoints(steps: pd.DataFrame) -> dict[int, str]:
+    """Return the names of the checkpoints that drove iterations, as far as every step before them is recorded.
+
+    The service names a checkpoint by its number and the control steps before it.
+    """
+    episodes = steps.groupby("episode").agg(
+        iteration=("iteration", "last"), rows=("steps", "size"), last=("steps", "max")
+    )
+    episodes["whole"] = (episodes["rows"] == episodes["last"]) & (episodes.index == np.arange(len(episodes)))
+    iterations = episodes.groupby("iteration").agg({"rows": "sum", "whole": "all"})
+    before = iterations["rows"].cumsum() - iterations["rows"]
+    known = iterations["whole"].shift(fill_value=True) & (iterations.index == np.arange(len(iterations)))
+    return {number: f"{number}_Step-{count}" for number, count in before[known.cummin()].items()}
+
+
 class _Assembly:
     """Joins the parts of a recording."""
 
@@ -107,9 +122,14 @@ class _Assembly:
             for number, root in enumerate(self.rounds)
             if number in first
         ]
+        steps = steps_of([*rows, *self._evaluation_rows()])
+        named = self._checkpoints({number: begin[0] for number, begin in first.items()})
+        counted = _counted_checkpoints(steps[steps["stream"] == TRAINING])
+        if len(rounds) > 1 or any(counted.get(key, text) != text for key, text in named.items()):
+            counted = {}
         return Recording(
             name=name,
-            steps=steps_of([*rows, *self._evaluation_rows()]),
+            steps=steps,
             updates=self._updates({number: begin[0] for number, begin in first.items()}),
             metrics=self._metrics(numbers, {number: begin[0] for number, begin in first.items()}),
             metadata=_uppermost(parts.metadata),
@@ -118,7 +138,7 @@ class _Assembly:
             track=worlds[0] if worlds else parts.worlds.get(TRAINING),
             problems=tuple(self.problems),
             files=tuple(file.path for file in parts.files),
-            checkpoints=self._checkpoints({number: begin[0] for number, begin in first.items()}),
+            checkpoints=dict(sorted((counted | named).items())),
             rounds=tuple(rounds) if len(rounds) > 1 else (),
         )
 
@@ -284,7 +304,7 @@ class _Assembly:
                 for name in (*log.saved, *(name for _, name in log.checkpoints)):
                     if checkpoint_number(name) >= base:  # a clone's log names its parent, too
                         found[checkpoint_number(name) - base + begin] = name
-        return dict(sorted(found.items()))
+        return found
 
     def _evaluation_rows(self) -> list[Rows]:
         found = []

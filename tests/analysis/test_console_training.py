@@ -85,11 +85,17 @@ def test_laps_course_and_evaluations_are_those_that_the_service_reports(view: Lo
     assert races["lap_time_s"].between(15.0, 17.5).all()
 
 
+def test_a_checkpoint_that_no_log_names_is_named_by_the_steps_before_it(view: LogView) -> None:
+    traces = read_recording(CONSOLE / "sim-trace" / "training")
+    logged = view.recording.checkpoints
+    assert traces.checkpoints == {number: logged[number] for number in range(28)}
+
+
 def test_findings_name_the_iteration_and_the_places_that_the_tables_show(view: LogView) -> None:
     found = {one.rule: one for one in findings(view)}
     assert set(found) == {"converged", "submit", "chance", "time_lost", "runs_off", "steering", "overfits"}
     assert found["converged"].sentence.startswith("Not converged yet")
-    assert found["submit"].values["iteration"] == 25
+    assert "checkpoint 25_Step-33002, which drove iteration 25" in found["submit"].sentence
     assert found["chance"].values["laps"] == 47
     assert found["time_lost"].values["theoretical_best_s"] < found["time_lost"].values["best_lap_s"]
     assert found["overfits"].sentence.startswith("No sign of overfitting")
