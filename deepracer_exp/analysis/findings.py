@@ -120,7 +120,7 @@ def _converged(view: LogView) -> Finding:
     elif found.completion < found.completion_best - rule.completion_near:
         sentence = (
             f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f} %. "
-            "A lower learning rate or an earlier checkpoint may hold it."
+            f"A lower learning rate or {_instead(view, 'an earlier checkpoint')} may hold it."
         )
     elif found.completion > found.completion_before + rule.completion_gain:
         sentence = (
@@ -370,8 +370,8 @@ def _overfits(view: LogView) -> Finding | None:
     if found.decision is not None:
         sentence = (
             f"It overfits: completion in the {found.evaluated} fell from {found.best:.0f} % around iteration "
-            f"{found.best_iteration} to {found.now:.0f} % while the reward of the training holds. Take a checkpoint "
-            f"from about iteration {found.best_iteration}."
+            f"{found.best_iteration} to {found.now:.0f} % while the reward of the training holds. Take "
+            f"{_instead(view, f'a checkpoint from about iteration {found.best_iteration}')}."
         )
         values |= found.decision.values
     thresholds = {"held_out_drop": found.rule.held_out_drop, "return_drop": found.rule.return_drop}
@@ -380,6 +380,16 @@ def _overfits(view: LogView) -> Finding | None:
 
 def _share(share: float) -> str:
     """Return it in per cent, with a digit more where it is small."""
+def _instead(view: LogView, of_the_service: str) -> str:
+    """Return which checkpoint to take instead of the last; a run of ours keeps few, the best among them."""
+    best = view.recording.best
+    if best is None:
+        return of_the_service
+    if best.iteration is None:
+        return "one of the kept checkpoints"
+    return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"
+
+
     if share >= 0.1 or share == 0:
         return f"{share:.0%}"
     return f"{share:.1%}" if share >= 0.001 else "below 0.1%"
