@@ -75,15 +75,16 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
 
 
 def _now(view: LogView, least_laps: int = 0) -> tuple[pd.DataFrame, str]:
-    """Return the episodes that show how the car drives now, and which they are."""
+    """Return the finished episodes that show how the car drives now, and which they are."""
+    ended = view.episodes[view.episodes["ended"]]
     if not view.trained:
-        return view.episodes, "in the evaluations"
+        return ended, "in the evaluations"
     iterations = np.unique(view.episodes["iteration"])
     begin = iterations[-math.ceil(LATE_SHARE * len(iterations))]
-    late = view.episodes[view.episodes["iteration"] >= begin]
+    late = ended[ended["iteration"] >= begin]
     if late["lap_time_s"].notna().sum() < least_laps:
-        return view.episodes, "in the training"
-    return late, f"since iteration {begin}"
+        return ended, "in the traces" if view.untraced else "in the training"
+    return late, f"since iteration {begin}{' of the traces' if view.untraced else ''}"
 
 
 def _converged(view: LogView) -> Finding:
@@ -169,13 +170,11 @@ def _submit(view: LogView) -> Finding:
     if len(best):
         first = best.iloc[0]
         low, high = map(float, wilson(first["complete"], first["episodes"]))
-        which = (
-            f"the checkpoint {first['checkpoint']}, which" if first["checkpoint"] else "the checkpoint that"
-        )
         sentence = (
             f"Submit {_checkpoint(first['checkpoint'], 'drove')} iteration {first['iteration']:.0f}: a quarter of "
             f"its laps are below {first['lap_time_p25_s']:.2f} s, and "
-            f"{first['complete']:.0f} of its {first['episodes']:.0f} episodes are complete laps ({_share(low)} to {_share(high)} with 95 % confidence)."
+            f"{first['complete']:.0f} of its {first['episodes']:.0f} episodes are complete laps ({_share(low)} to "
+            f"{_share(high)} with 95 % confidence)."
         )
         others = [
             f"{row.checkpoint or row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
@@ -187,9 +186,9 @@ def _submit(view: LogView) -> Finding:
         values |= {"lap_share": float(first["lap_share"]), "laps": int(first["complete"])}
     elif len(evaluated):
         first = evaluated.iloc[0]
-        saved = view.recording.checkpoints.get(int(evaluated.index[0]) + 1, "")
         driven = int(first["laps"])
         did = {1: "completed its lap", 2: "completed both laps"}.get(driven, f"completed all {driven} laps")
+        saved = view.recording.checkpoints.get(int(evaluated.index[0]) + 1, "")
         sentence = (
             f"Submit {_checkpoint(saved, 'was saved after')} iteration {evaluated.index[0]}: its evaluation {did}, in "
             f"{first['lap_time_s']:.2f} s{'' if driven == 1 else ' on average'}. The training itself has too few "
@@ -209,15 +208,15 @@ def _submit(view: LogView) -> Finding:
         )
         values = {"laps": laps, "progress": float(farthest["progress"])}
     return Finding("submit", sentence, values, thresholds)
+
+
 def _checkpoint(name: str, did: str) -> str:
     if name:
         return f"the checkpoint {name}, which {did}"
     return (
-        "the checkpoint (its name is not logged, and not all steps before it are recorded, whose number is in it) "
-        f"that {did}"
+        "the checkpoint (its name is not logged, nor can it be counted, since steps before it are not recorded) that "
+        f"{did}"
     )
-
-
 
 
 def _chance(view: LogView, target_s: float | None) -> Finding | None:
@@ -269,7 +268,9 @@ def _time_lost(view: LogView) -> Finding | None:
         for name, seconds in lost.items()
     ]
     where = (
-        f"An ordinary lap loses most in {'; '.join(places)}" if places else "No sector loses time to its best"
+        f"To the best time of each sector the median time loses most in {'; '.join(places)}"
+        if places
+        else "No sector loses time to its best"
     )
     sentence = (
         f"The best sectors of {count(len(times), 'lap')} {when} add up to {possible_s:.2f} s; the fastest lap took "
@@ -283,15 +284,17 @@ def _time_lost(view: LogView) -> Finding | None:
 
 
 def _crashes(view: LogView) -> Finding | None:
-    """Say how many episodes of the whole log ended in a crash, and how many of them at one object."""
+    """Say in how many finished episodes of the whole log the car crashed, and how often at one object."""
+    episodes = view.episodes.loc[view.episodes["ended"], "episode"]
     status = view.steps["episode_status"].astype(str).to_numpy()
     rows = view.steps[(status == "crashed") & (np.append([""], status[:-1]) != "crashed")]
+    rows = rows[rows["episode"].isin(episodes)]
     if not len(rows):
         return None
     places = rows[["X", "Y"]].to_numpy(np.float64)
     near = np.linalg.norm(places[:, None] - places[None], axis=2) <= CRASH_PLACE_M
     here = rows[near[near.sum(axis=1).argmax()]]
-    crashed, episodes = rows["episode"].nunique(), len(view.episodes)
+    crashed = rows["episode"].nunique()
     waypoint = int(here["closest_waypoint"].median())
     x_m, y_m = here[["X", "Y"]].median()
     where = ", at no place often."
@@ -302,8 +305,8 @@ def _crashes(view: LogView) -> Finding | None:
         )
     return Finding(
         "crashes",
-        f"The car crashed in {crashed} of {count(episodes, 'episode')}{where}",
-        {"crashed": crashed, "episodes": episodes, "here": len(here), "waypoint": waypoint},
+        f"The car crashed in {crashed} of {count(len(episodes), 'episode')}{view.traced}{where}",
+        {"crashed": crashed, "episodes": len(episodes), "here": len(here), "waypoint": waypoint},
         {"place_m": CRASH_PLACE_M, "least": off_track.LEAST},
     )
 
@@ -378,8 +381,6 @@ def _overfits(view: LogView) -> Finding | None:
     return Finding("overfits", sentence, values, thresholds | {"patience": found.rule.patience})
 
 
-def _share(share: float) -> str:
-    """Return it in per cent, with a digit more where it is small."""
 def _instead(view: LogView, of_the_service: str) -> str:
     """Return which checkpoint to take instead of the last; a run of ours keeps few, the best among them."""
     best = view.recording.best
@@ -390,6 +391,8 @@ def _instead(view: LogView, of_the_service: str) -> str:
     return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"
 
 
+def _share(share: float) -> str:
+    """Return it in per cent, with a digit more where it is small."""
     if share >= 0.1 or share == 0:
         return f"{share:.0%}"
     return f"{share:.1%}" if share >= 0.001 else "below 0.1%"

@@ -17,7 +17,7 @@ MOST_PROBLEMS = 200
 _ITERATION_COLUMNS = {
     "iteration": ("Iteration", "d"),
     "episodes": ("Episodes", ",d"),
-    "steps": ("Steps", ",d"),
+    "steps": ("Steps", ",.0f"),
     "complete": ("Laps", ",d"),
     "completion_mean": ("Driven, %", ".1f"),
     "reward_mean": ("Reward", ".4g"),
@@ -79,7 +79,7 @@ def table_of(rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], left_ou
 
 def iteration_rows(view: LogView) -> Table:
     """Return results and metrics of each iteration; of very many, every second, third, ... and the last."""
-    table = view.iterations
+    table = view.iterations.replace({"steps": {0: math.nan}})  # those in metrics files only have no trace
     known = table.replace({"checkpoint": ""}, None).notna().any()
     every = math.ceil(len(table) / MOST_ITERATIONS) or 1
     shown = table.iloc[::-1].iloc[::every].iloc[::-1]
@@ -135,14 +135,15 @@ def facts(view: LogView) -> list[tuple[str, str]]:
 
 def headline(view: LogView) -> str:
     """Return in one sentence how much was driven and how well; episodes cut off by the end of the log do not count."""
-    ended = int(view.episodes["ended"].sum())
-    finished, steps = count(ended, "finished episode"), count(len(view.steps), "control step")
+    finished, steps = (
+        count(int(view.episodes["ended"].sum()), "finished episode"),
+        count(len(view.steps), "control step"),
+    )
     laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
     if view.trained:
         sentence = f"{steps} in {finished} and {count(len(view.iterations), 'iteration')}"
-        more = int(view.iterations["episodes"].sum()) - ended
-        if more > 0:
-            sentence += f"; {count(more, 'more episode')} known from metrics files only"
+        if view.untraced:
+            sentence += f"; {count(view.untraced, 'more episode')} known from metrics files only"
             laps = int(view.iterations["complete"].sum())
             best_s = view.iterations["lap_time_best_s"].min()
     else:

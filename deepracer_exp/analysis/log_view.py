@@ -58,6 +58,17 @@ class LogView:
         return len(metadata.actions if metadata is not None else ()) or int(self.steps["action"].max()) + 1
 
     @property
+    def untraced(self) -> int:
+        """Number of finished episodes of the training that are known from metrics files only."""
+        more = int(self.iterations["episodes"].sum() - self.episodes["ended"].sum())
+        return max(0, more) if self.trained else 0
+
+    @property
+    def traced(self) -> str:
+        """What to add to a number of episodes that are counted in the traces."""
+        return " with a trace" if self.untraced else ""
+
+    @property
     def waypoint_count(self) -> int:
         """Number of waypoints of the course, or where it is unknown of those in the log."""
         logged = int(self.steps["closest_waypoint"].max()) + 1 if len(self.steps) else 0

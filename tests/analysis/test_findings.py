@@ -9,14 +9,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from deepracer_exp.analysis.candidates import candidates
+from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.findings import Finding, findings
-from deepracer_exp.analysis.log_report import LogPage, draw_sections
-from deepracer_exp.analysis.log_tables import best_laps, headline
+from deepracer_exp.analysis.log_report import LogPage, draw_sections, html
+from deepracer_exp.analysis.log_tables import NONE, best_laps, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.convergence import LOG_RULE
+from deepracer_exp.runs.result import RunResult
 
 from .made_up import Drive, made_up_course, made_up_recording
 
@@ -91,7 +93,7 @@ def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
     view = laps_of((3, 7, 3.0), (10, 0, 2.0), (8, 2, 2.5), (2, 0, 3.0))
     assert candidates(view.iterations)["iteration"].tolist() == [2, 1]
     found = of(view, "submit")
-    assert found.sentence.startswith("Submit the checkpoint that drove iteration 2:")
+    assert found.sentence.startswith("Submit the checkpoint (its name is not logged")
     assert "8 of its 10 episodes are complete laps (49% to 94% with 95 % confidence)" in found.sentence
     named = replace(view.recording, checkpoints={2: "2_Step-4711"})
     assert of(prepare(named), "submit").sentence.startswith("Submit the checkpoint 2_Step-4711, which drove")
@@ -111,8 +113,10 @@ def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_su
     evaluated = pd.DataFrame(rows, columns=["iteration", "completion", "time_s"])
     evaluated = evaluated.assign(stream="training", phase="evaluation")
     metrics = evaluated.reindex(columns=view.recording.metrics.columns)
-    assert of(prepare(replace(view.recording, metrics=metrics)), "submit").sentence.startswith(
-        "Submit the checkpoint saved after iteration 4: its evaluation completed both laps, in 9.60 s on average."
+    recording = replace(view.recording, metrics=metrics, checkpoints={4: "4_Step-38", 5: "5_Step-47"})
+    assert of(prepare(recording), "submit").sentence.startswith(
+        "Submit the checkpoint 5_Step-47, which was saved after iteration 4: its evaluation completed both "
+        "laps, in 9.60 s on average."
     )
 
 
@@ -129,10 +133,14 @@ def test_laps_that_are_in_metrics_files_only_can_be_submitted() -> None:
     known |= {"completion": 100.0, "time_s": 9.5, "episode_status": "lap_complete", "resets": 0.0}
     metrics = pd.DataFrame({"episode": np.arange(100, 108)}).assign(**known)
     view = prepare(replace(recording, metrics=metrics))
-    assert of(view, "submit").sentence.startswith("Submit the checkpoint that drove iteration 7:")
+    assert of(view, "submit").sentence.startswith("Submit the checkpoint (its name is not logged")
     words = "8 more episodes known from metrics files only; 8 complete laps, the best in 9.50 s"
     assert words in headline(view)
-    assert draw_sections(LogPage(view, []))
+    charts = {one.name: one for one in charts_of(view)}
+    assert "a quarter of the 5 episodes with a trace" in charts["quarters"].caption
+    assert "5 of 5 episodes with a trace ended" in charts["episode_ends_map"].title
+    assert of(view, "runs_off").sentence.endswith("since iteration 0 of the traces.")
+    assert [row[2] for row in iteration_rows(view).rows] == [str(len(view.steps)), NONE]
 
 
 def test_the_chance_of_a_lap_is_measured_and_fitted_on_the_laps_of_the_last_third() -> None:
@@ -168,12 +176,13 @@ def test_time_is_lost_in_the_sectors_that_were_driven_slowly() -> None:
     assert names == sorted(lost, key=lambda name: -lost[name])
     assert {name: found.values[name] for name in lost} == pytest.approx(lost, abs=0.05)
     assert found.values["theoretical_best_s"] == pytest.approx(COURSE.length_m / 2.0, abs=0.05)
+    assert "To the best time of each sector the median time loses most in" in found.sentence
     assert f"waypoints {SECTORS[1].first_waypoint} to {SECTORS[1].last_waypoint}" in found.sentence
 
 
-def off_at(*places: tuple[int, int, bool]) -> LogView:
+def off_at(*places: tuple[int, int, bool], unfinished: int = 0) -> LogView:
     """Prepare drives that run off at waypoints, so and so often, spinning or not, among complete laps."""
-    drives = [Drive()] * 6
+    drives = [Drive()] * 6 + [Drive(until=0.3)] * unfinished
     for waypoint, times, spins in places:
         drives += [Drive(off_at=waypoint + k % 3 - 1, spins=spins) for k in range(times)]
     return prepare(made_up_recording(drives))
@@ -219,11 +228,13 @@ def test_logs_without_episode_status_show_where_the_car_runs_off() -> None:
 
 
 def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
-    recording = off_at((35, 6, False), (85, 2, False)).recording
+    recording = off_at((35, 6, False), (85, 2, False), unfinished=1).recording
     status = recording.steps["episode_status"].astype(str).replace("off_track", "crashed")
     view = prepare(replace(recording, steps=recording.steps.assign(episode_status=status.astype("category"))))
     found = of(view, "crashes")
     assert found.sentence.startswith("The car crashed in 8 of 14 episodes, 6 times at one place: waypoint 3")
+    assert headline(view).split("; ")[0].endswith("14 finished episodes and 1 iteration")
+    assert of(view, "chance").values["complete"] == 6 / 14
     assert "crashes" not in [one.rule for one in findings(off_at((35, 6, False)))]
 
 
@@ -263,6 +274,32 @@ def test_a_run_of_ours_is_judged_by_its_own_rules_and_its_decision_is_what_the_r
     assert "overfits" not in [one.rule for one in findings(ended)]
 
 
+def test_a_run_of_ours_is_advised_to_take_a_checkpoint_that_it_has() -> None:
+    best = RunResult(measure="race_score", rank=(0.0, 0.0), iteration=10, completion=90.0, lap_time_s=None)
+    for completions, rule in ((LEARNED, "overfits"), ([*LEARNED, 0.4, 0.4, 0.4], "converged")):
+        view = training(completions, evaluated=FALLING)
+        assert "000010" not in of(view, rule).sentence
+        own = replace(view, recording=replace(view.recording, best=best))
+        assert "checkpoint 000010 (the best by race score)" in of(own, rule).sentence
+        assert "enough laps" not in "".join(one.caption for one in charts_of(own))
+
+
+def charts_of(view: LogView) -> list[Chart]:
+    return [chart for some in draw_sections(LogPage(view, [])).values() for chart in some]
+
+
+@pytest.mark.parametrize(
+    "decision", [None, {"rule": "converged", "why": "it", "values": {}, "thresholds": {}}]
+)
+def test_the_figure_says_of_convergence_what_the_finding_says(decision) -> None:
+    view = training([0.2] * LOG_RULE.patience)
+    view = replace(view, recording=replace(view.recording, decision=decision))
+    (chart,) = (one for one in charts_of(view) if one.name == "training_progress")
+    words = "too short to say" if decision is None else "stopping rule ended it"
+    assert words in chart.caption
+    assert words in of(view, "converged").sentence.lower()
+
+
 def test_a_race_without_training_is_judged_by_its_laps() -> None:
     races = {"race": [Drive(speed_mps=v) for v in (1.5, 2.0, 1.8)]}
     view = prepare(made_up_recording([], evaluations=races))
@@ -270,7 +307,8 @@ def test_a_race_without_training_is_judged_by_its_laps() -> None:
     assert of(view, "chance").sentence.startswith("3 of 3 episodes in the evaluations are complete laps")
     assert headline(view).startswith("No training; ")
     assert "3 complete laps, the best in 8.85 s" in headline(view)
-    drawn = {chart.name for some in draw_sections(LogPage(view, [])).values() for chart in some}
+    drawn = {chart.name for chart in charts_of(view)}
+    assert "of the training" not in html(LogPage(view, findings(view)))
     assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn
     assert [row[:2] for row in best_laps(view).rows] == [("race", s) for s in ("8.85", "9.84", "11.81")]
 

@@ -121,7 +121,11 @@ def lap_time_percentile(view: LogView) -> Chart | None:
         layers.append(points(*stars, symbol="star", size=24))
     scale, colors = "complete laps, per cent of the episodes", (0.0, max(float(share.max()), 1.0))
     layers.append(colored_points(x, y, share, scale, value_range=colors, hover=hover))
-    which = f"Candidates, the best first: {', '.join(map(str, best['iteration']))}."
+    which = "No iteration has enough laps to be judged by them."
+    if view.recording.best is not None:
+        which = "A run of ours races with its best kept checkpoint."
+    elif len(best):
+        which = f"Candidates, the best first: {', '.join(map(str, best['iteration']))}."
     # The laps of an iteration may be in metrics files only.
     times_s = np.concatenate([shown["lap_time_s"], y])
     low, high = float(times_s.min()), max(float(np.percentile(times_s, 99)), float(y.max()))
@@ -131,7 +135,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
         name="lap_time_percentile",
         title="25th percentile of the lap time",
         caption="Each coloured point is an iteration: low ones are fast, bright ones often complete the lap. "
-        + (which if len(best) else "No iteration has enough laps to be submitted."),
+        + which,
         rows=[[Panel(x_label=ITERATION, y_label="lap time, s", layers=layers, y_range=y_range)]],
     )
 
@@ -204,12 +208,12 @@ def _along(view: LogView, lap: int) -> pd.DataFrame:
 
 def _loss_in_words(sectors: Sequence[Sector], delta: pd.DataFrame) -> str:
     at, lost_s = (delta[name].to_numpy(np.float64) for name in ("lap_position", "delta_s"))
-    slower = f"The ordinary lap is {lost_s[-1]:.2f} s slower"
+    slower = f"The ordinary lap is {lost_s[-1]:.2f} s slower than the fastest"
     if not sectors:
         return f"{slower}."
     lost = {part.name: float(np.diff(np.interp([part.begin, part.end], at, lost_s))[0]) for part in sectors}
     worst = max(lost, key=lambda name: lost[name])
-    return f"{slower} and loses most in sector {worst}: {lost[worst]:.2f} s."
+    return f"{slower} and loses most to it in sector {worst}: {lost[worst]:.2f} s."
 
 
 def correlations(view: LogView) -> Chart | None:

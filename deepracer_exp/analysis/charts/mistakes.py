@@ -80,9 +80,10 @@ def episode_ends_map(view: LogView) -> Chart | None:
     rows = [[waypoint_panel(counted, "episodes that ended here", n)]]
     if view.course is not None:
         rows.insert(0, [map_panel(view.course, [*placed, *_worst_notes(ends, view.course)])])
+    of = f"{view.episodes['ended'].sum()} episodes{view.traced}"
     return Chart(
         name="episode_ends_map",
-        title=f"Where {len(ends)} of {view.episodes['ended'].sum()} episodes ended before the lap was complete",
+        title=f"Where {len(ends)} of {of} ended before the lap was complete",
         caption=f"Each symbol is the last recorded position of an episode; the {_WORST} waypoints with most ends "
         "carry their number and count. Many ends behind a corner mean that the car enters it too fast or turns in "
         "too late.",

@@ -44,6 +44,10 @@ def training_progress(view: LogView) -> Chart | None:
             ("Entropy of the policy", "nats", curve(table, "entropy", PURPLE, "mean over the update"))
         )
     when = "It has not converged yet." if at is None else f"It converged at iteration {at}."
+    if view.recording.decision is not None:
+        when = "The run's stopping rule ended it."
+    elif found is None:
+        when = "It is too short to say whether it has converged."
     return Chart(
         name="training_progress",
         title="Training progress",
@@ -119,8 +123,8 @@ def quarters(view: LogView) -> Chart | None:
     return Chart(
         name="quarters",
         title="Quarters of the training",
-        caption=f"Each bar is a quarter of the {len(episodes)} episodes in their order. Complete laps per quarter: "
-        f"{', '.join(map(str, complete))}.",
+        caption=f"Each bar is a quarter of the {len(episodes)} episodes{view.traced} in their order. "
+        f"Complete laps per quarter: {', '.join(map(str, complete))}.",
         rows=in_rows(
             [Panel(title=title, y_label=unit, layers=layers, **axis) for title, unit, layers in shown]
         ),
@@ -147,20 +151,21 @@ def evaluations(view: LogView) -> Chart | None:
     panels = [("Progress", "per cent of the lap", progress, (0.0, 104.0))]
     if episodes["lap_time_s"].notna().any():
         laps: list[Layer] = [points(x, episodes["lap_time_s"], BLUE, size=8)]
-        best_s = float(view.episodes["lap_time_s"].min())
+        best_s = float(view.episodes["lap_time_s"].min()) if view.trained else np.nan
         if np.isfinite(best_s):
             laps.append(mark(best_s, "best of the training", GREEN, horizontal=True))
         low, high = episodes["lap_time_s"].min(), episodes["lap_time_s"].max()
         low, high = np.nanmin([low, best_s]), np.nanmax([high, best_s])
         rim = max(0.1 * (high - low), 0.1)
         panels.append(("Lap time", "lap time, s", laps, (low - rim, high + rim)))
+    slower = " Most laps are slower than the best of the training, which is the fastest of many."
     short = [name if len(name) <= 26 else f"{name[:17]}…{name[-8:]}" for name in names]
     axis: dict[str, Any] = {"x_names": short, "x_range": (-0.5, len(names) - 0.5)}
     return Chart(
         name="evaluations",
         title="Evaluations and races",
         caption=f"Each point is an episode of one of {len(names)} evaluations or races on this course, in the order "
-        "in which they were driven. Most laps are slower than the best of the training, which is the fastest of many.",
+        f"in which they were driven.{slower if view.trained else ''}",
         rows=[
             [Panel(title=title, y_label=unit, layers=layers, y_range=y_range, **axis)]
             for title, unit, layers, y_range in panels
