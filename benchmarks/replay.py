@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numba import njit
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.sim.tyres import DRIVE, car_record, send, tyre_forces
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
@@ -19,6 +20,12 @@ _FIRST_MOVING_ROW = 1
 """Row 0 of an episode is the prepare step: the car stands until the action of row 1 is sent."""
 _JUMP_M, _JUMP_RAD = 0.5, 1.0
 """Neighbouring rows are further apart than this only where the car was put elsewhere: 7.5 m/s, 15 rad/s."""
+PERIOD_S = 1.0 / 15.0
+"""The service sends an action 15 times a second."""
+_MOST_JITTER = 0.8
+_LEAST_DRIVEN_M = 0.02
+_LEAST_STEADY = 300
+"""Steps from which on the share of the time stamps' jitter is worth estimating."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,8 @@ class Windows:
     """Chassis origin x_m, y_m and heading yaw_rad, (M, WARM_UP_STEPS + 1 + steps, 3)."""
     action: Floats
     """Commanded speed_mps and steering_rad, (M, WARM_UP_STEPS + steps, 2)."""
+    duration_s: Floats
+    """How long each of these steps took, (M, WARM_UP_STEPS + steps)."""
     first: Ids
     """The row from which on a window is recorded; the rows before it repeat it, (M,)."""
     standing: NDArray[np.bool_]
@@ -65,6 +74,7 @@ class Windows:
         return Windows(
             self.pose[chosen],
             self.action[chosen],
+            self.duration_s[chosen],
             self.first[chosen],
             self.standing[chosen],
             self.iteration[chosen],
@@ -123,11 +133,49 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
     return Windows(
         pose=np.stack([x[at_rows], y[at_rows], np.unwrap(yaw[at_rows], axis=1)], axis=-1),
         action=np.stack([speed, steering], axis=-1)[at_rows[:, :-1]],
+        duration_s=_durations(recorded, x, y)[at_rows[:, :-1]],
         first=np.array(first, np.intp),
         standing=np.array(standing, bool),
         iteration=recorded["iteration"].to_numpy(np.int64)[at_rows[:, -1]],
         left_out=left_out,
     )
+
+
+def _durations(recorded: pd.DataFrame, x_m: Floats, y_m: Floats) -> Floats:
+    """Return how long the step from each row to the next took, (rows,).
+
+    The service sends an action 15 times a second, more or less: in some recordings the distance from row t to t + 1
+    is longer where the time between rows t - 1 and t is, in others it is not. How much so is found by regression; that
+    share of the recorded jitter is taken.
+    """
+    stamp = recorded["tstamp"].to_numpy(np.float64)
+    relative = np.zeros(len(stamp))
+    relative[1:] = np.diff(stamp) / PERIOD_S - 1.0
+    group = recorded.groupby(["stream", "worker", "iteration", "episode"], sort=False, observed=True).ngroup()
+    same = np.zeros(len(stamp), bool)
+    same[1:] = group.to_numpy()[1:] == group.to_numpy()[:-1]
+    relative[~same | (np.abs(relative) > _MOST_JITTER)] = 0.0
+    driven = np.zeros(len(stamp))
+    driven[:-1] = np.hypot(np.diff(x_m), np.diff(y_m))
+    around = 0.25 * sum(np.roll(driven, shift) for shift in (-2, -1, 1, 2))
+    # Within an episode, away from its ends and moving.
+    steady = same & (around > _LEAST_DRIVEN_M)
+    for shift in (-3, -2, -1, 1, 2):
+        steady &= np.roll(same, shift)
+    longer = driven / np.maximum(around, _LEAST_DRIVEN_M) - 1.0
+    steady &= (np.abs(longer) < _MOST_JITTER) & (relative != 0.0)
+    if steady.sum() < _LEAST_STEADY:
+        return np.full(len(stamp), PERIOD_S)
+    # Neighbours take part, since jitter alternates.
+    columns = [
+        np.roll(relative, 1)[steady],
+        relative[steady],
+        np.roll(relative, -1)[steady],
+        np.ones(steady.sum()),
+    ]
+    share = np.linalg.lstsq(np.stack(columns, axis=1), longer[steady], rcond=None)[0][1]
+    durations: Floats = PERIOD_S * (1.0 + np.clip(share, 0.0, 1.0) * relative)
+    return durations
 
 
 class Observer(NamedTuple):
@@ -146,8 +194,8 @@ class Observer(NamedTuple):
     steering_per_turn: float
 
 
-OBSERVER = Observer(0.186, 0.29, 7.733, 0.034, 0.267, 0.051)
-"""Found by least squares together with the car of conf/car/deepracer.yaml, on the same windows."""
+OBSERVER = Observer(0.33, 0.7, 0.04, 0.9, 0.04, 0.07)
+"""Found together with the car of conf/car/deepracer.yaml, on the same windows."""
 
 
 class Errors(NamedTuple):
@@ -171,66 +219,97 @@ def errors(predicted: Floats, windows: Windows) -> Errors:
     return Errors(off[..., 0], off[..., 1], _turn(off[..., 2]))
 
 
-def replay(car: CarConfig, windows: Windows, observer: Observer = OBSERVER, threads: int = 1) -> Floats:
+def replay(car: CarConfig, windows: Windows, observer: Observer = OBSERVER) -> Floats:
     """Drive one car through each window: the warm-up along the recording, from its start on with the actions alone.
+
+    The car is the one of `sim.batch`, without MuJoCo: a physics step is a share of the time that was recorded.
 
     Args:
         car: the simulated car.
         windows: M windows.
         observer: how the warm-up corrects the car.
-        threads: physics threads; 0 means one per core. The result does not depend on it.
 
     Returns:
-        x_m, y_m and yaw_rad after each step of the windows, (M, steps, 3).
-
-    Raises:
-        RunFailed: the physics blew up.
+        x_m, y_m and yaw_rad after each step of the windows, (M, steps, 3); not finite where the physics blew up.
     """
-    cars = CarBatch(car, len(windows), threads)
-    cars.place(np.arange(len(windows)), *windows.pose[:, 0].T)
+    commands = windows.action.copy()
+    limit = np.deg2rad(car.max_steering_deg)
+    np.clip(commands[..., 0], car.min_speed_mps, car.max_speed_mps, out=commands[..., 0])
+    np.clip(commands[..., 1], -limit, limit, out=commands[..., 1])
     driven = np.empty((len(windows), windows.steps, 3))
-    for step in range(windows.action.shape[1]):
-        known = step >= windows.first
-        if step < WARM_UP_STEPS:
-            _set_off(cars, np.flatnonzero(windows.first == step), windows.pose[:, step : step + 2])
-        speed, steering = windows.action[:, step].T
-        cars.drive(speed, steering, moving=known)
-        if step >= WARM_UP_STEPS:
-            state = cars.read()
-            driven[:, step - WARM_UP_STEPS] = np.stack([state.x_m, state.y_m, state.yaw_rad], axis=-1)
-            continue
-        if step == WARM_UP_STEPS - 1:
-            put_down = np.flatnonzero(windows.standing)
-            cars.lift(put_down, *windows.start[put_down].T)
-            known = known & ~windows.standing
-        _correct(cars, np.flatnonzero(known), windows.pose[:, step + 1], observer)
+    _replay(
+        car_record(car)[None],
+        np.zeros(1, DRIVE),
+        np.array(observer),
+        car.substeps,
+        windows.pose,
+        commands,
+        windows.duration_s,
+        windows.first,
+        windows.standing,
+        driven,
+    )
     return driven
 
 
-def _set_off(cars: CarBatch, ids: Ids, recorded: Floats) -> None:
-    """Let cars move as their first two recorded poses, (N, 2, 3), tell."""
-    before, after = recorded[ids, 0], recorded[ids, 1]
-    velocity = (after - before) / cars.car.control_period_s
-    cos, sin = np.cos(before[:, 2]), np.sin(before[:, 2])
-    speed, lateral = cos * velocity[:, 0] + sin * velocity[:, 1], cos * velocity[:, 1] - sin * velocity[:, 0]
-    cars.move(ids, before, np.stack([speed, lateral, velocity[:, 2]], axis=-1))
-
-
-def _correct(cars: CarBatch, ids: Ids, recorded: Floats, observer: Observer) -> None:
-    """Put cars at their recorded poses, (N, 3), and correct what the error says about their motion."""
-    state, pose = cars.read(), recorded[ids]
-    yaw, period = state.yaw_rad[ids], cars.car.control_period_s
-    dx, dy = (pose[:, 0] - state.x_m[ids]) / period, (pose[:, 1] - state.y_m[ids]) / period
-    ahead, left = np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx
-    turn = _turn(pose[:, 2] - yaw) / period
-    motion = [
-        state.speed_mps[ids] + observer.speed_per_ahead * ahead,
-        state.lateral_mps[ids] + observer.lateral_per_left * left,
-        state.yaw_rate_radps[ids] + observer.rate_per_left * left + observer.rate_per_turn * turn,
-    ]
-    cars.move(ids, pose, np.stack(motion, axis=-1))
-    steering = cars.steering_rad[ids]
-    cars.steer(ids, steering + observer.steering_per_left * left + observer.steering_per_turn * turn)
+@njit(cache=True)
+def _replay(cars, drives, observer, substeps, pose, commands, duration_s, first, standing, driven):  # type: ignore[no-untyped-def]
+    car = cars[0]
+    com_m = car["com_x_m"]
+    for window in range(len(pose)):
+        drives[:] = np.zeros(1, DRIVE)
+        drive = drives[0]
+        at = first[window]
+        x, y, yaw = pose[window, at]
+        ahead = left = rate = 0.0
+        if at < WARM_UP_STEPS:
+            # It sets off as its first two recorded poses say.
+            lasted = duration_s[window, at]
+            dx, dy = (pose[window, at + 1, 0] - x) / lasted, (pose[window, at + 1, 1] - y) / lasted
+            rate = (pose[window, at + 1, 2] - yaw) / lasted
+            ahead, left = np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx
+            drive["sent_speed_mps"], drive["sent_steering_rad"] = commands[window, at]
+            drive["steering_rad"] = commands[window, at, 1]
+            drive["wheel_mps"][:] = ahead
+        for step in range(at, commands.shape[1]):
+            dt = duration_s[window, step] / substeps
+            # The centre of mass in the world.
+            cos, sin = np.cos(yaw), np.sin(yaw)
+            x, y, left = x + com_m * cos, y + com_m * sin, left + com_m * rate
+            vx, vy = cos * ahead - sin * left, sin * ahead + cos * left
+            for physics_step in range(substeps):
+                speed, steering = commands[window, step]
+                send(car, drive, speed, steering, physics_step, substeps, dt)
+                ahead, left = cos * vx + sin * vy, cos * vy - sin * vx
+                ahead_n, left_n, torque_nm = tyre_forces(car, drive, ahead, left, rate, dt)
+                vx += dt * (cos * ahead_n - sin * left_n) / car["mass_kg"]
+                vy += dt * (sin * ahead_n + cos * left_n) / car["mass_kg"]
+                rate += dt * torque_nm / car["yaw_inertia_kgm2"]
+                x, y, yaw = x + dt * vx, y + dt * vy, yaw + dt * rate
+                cos, sin = np.cos(yaw), np.sin(yaw)
+            x, y = x - com_m * cos, y - com_m * sin
+            ahead, left = cos * vx + sin * vy, cos * vy - sin * vx - com_m * rate
+            if step >= WARM_UP_STEPS:
+                driven[window, step - WARM_UP_STEPS, 0] = x
+                driven[window, step - WARM_UP_STEPS, 1] = y
+                driven[window, step - WARM_UP_STEPS, 2] = yaw
+                continue
+            dx, dy = (pose[window, step + 1, 0] - x), (pose[window, step + 1, 1] - y)
+            turn = np.pi - np.remainder(np.pi - pose[window, step + 1, 2] + yaw, 2.0 * np.pi)
+            lasted = duration_s[window, step]
+            off_ahead, off_left = (cos * dx + sin * dy) / lasted, (cos * dy - sin * dx) / lasted
+            x, y, yaw = pose[window, step + 1]
+            if standing[window] and step == WARM_UP_STEPS - 1:
+                # Put down, at rest; its wheels stay turned.
+                steering, sent = drive["steering_rad"], drive["sent_steering_rad"]
+                drives[:] = np.zeros(1, DRIVE)
+                drive["steering_rad"], drive["sent_steering_rad"] = steering, sent
+                ahead = left = rate = 0.0
+                continue
+            ahead += observer[0] * off_ahead
+            left += observer[1] * off_left
+            rate += observer[2] * off_left + observer[3] * turn / lasted
+            drive["steering_rad"] += observer[4] * off_left + observer[5] * turn / lasted
 
 
 def _turn(angle: Floats) -> Floats:

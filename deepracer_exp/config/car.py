@@ -1,11 +1,11 @@
 """The car's dimensions, masses, drives and physics settings (`conf/car/`)."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
-from .bounds import Finite, NonNegative, Positive, UpTo100, UpTo1000
+from .bounds import Finite, NonNegative, Positive, UpTo100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,24 +31,27 @@ class CarConfig:
     camera_z_m: Finite
     camera_pitch_deg: Finite
 
-    chassis_mass_kg: Positive
-    chassis_com_m: tuple[Finite, Finite, Finite]
-    chassis_inertia_kgm2: tuple[Positive, Positive, Positive]
-    front_hub_mass_kg: NonNegative
-    wheel_mass_kg: Positive
+    mass_kg: Positive
+    com_x_m: Finite
+    com_z_m: Positive
+    inertia_kgm2: tuple[Positive, Positive, Positive]
     wheel_spin_inertia_kgm2: Positive
-    wheel_turn_inertia_kgm2: Positive
 
     tyre_friction: Positive
+    front_tyre_along_ns_per_m: Positive
+    rear_tyre_along_ns_per_m: Positive
+    front_tyre_across_ns_per_m: Positive
+    rear_tyre_across_ns_per_m: Positive
 
     drive_radius_m: Positive
+    max_wheel_speed_radps: Positive
     front_motor_gain_nms: NonNegative
     rear_motor_gain_nms: NonNegative
     motor_torque_nm: Positive
-    servo_gain_nm: Positive
-    servo_damping_nms: Positive
-    servo_torque_nm: Positive
-    servo_kick: Annotated[float, Field(ge=0, lt=1)]
+    speed_delay_s: NonNegative
+    steering_time_s: Positive
+    steering_kick: Annotated[float, Field(ge=-0.95, lt=1)]
+    steering_delay_s: NonNegative
     steering_trim_deg: Finite
     ackermann: bool
 
@@ -58,16 +61,6 @@ class CarConfig:
 
     control_hz: Annotated[float, Field(ge=1, le=1000)]
     substeps: UpTo100
-    integrator: Literal["euler", "implicitfast", "discrete"]
-    solver: Literal["newton", "cg"]
-    solver_iterations: UpTo1000
-    line_search_iterations: UpTo1000
-    solver_tolerance: NonNegative
-    wheel_contact: Literal["sphere", "ellipsoid", "cylinder"]
-    contact_time_s: Positive
-    contact_impedance: Annotated[float, Field(gt=0, lt=1)]
-    front_slip_time_s: Positive
-    rear_slip_time_s: Positive
 
     def __post_init__(self) -> None:
         """Refuse limits that contradict each other."""
@@ -79,7 +72,11 @@ class CarConfig:
             raise ValueError(
                 f"rear_axle_x_m ({self.rear_axle_x_m}) is not behind front_axle_x_m ({self.front_axle_x_m})"
             )
-
+        if not self.rear_axle_x_m < self.com_x_m < self.front_axle_x_m:
+            raise ValueError(f"com_x_m ({self.com_x_m}) is not between the axles")
+        for key in ("speed_delay_s", "steering_delay_s"):
+            if getattr(self, key) >= self.control_period_s:
+                raise ValueError(f"{key} ({getattr(self, key)}) is not below a control period")
         if self.front_motor_gain_nms == self.rear_motor_gain_nms == 0.0:
             raise ValueError(
                 "front_motor_gain_nms and rear_motor_gain_nms are both 0: nothing drives the car"

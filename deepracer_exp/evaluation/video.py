@@ -56,6 +56,7 @@ class LapRenderer:
         self._low, self._high = _extent(track)
         self._model = _build(track, car, view, (self._low, self._high), width, height)
         self._data = mujoco.MjData(self._model)
+        self._place = [self._model.joint(name).qposadr[0] for name in ("x", "y", "yaw")]
         self._steer = [self._model.joint(f"{name}_steer").qposadr[0] for name in STEERED]
         self._spin = [self._model.joint(f"{name}_spin").qposadr[0] for name in WHEELS]
         self._renderer = mujoco.Renderer(self._model, height, width)
@@ -83,8 +84,8 @@ class LapRenderer:
         """
         qpos, car = self._data.qpos, self._car
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-        qpos[:3] = x_m - car.front_point_m * cos, y_m - car.front_point_m * sin, 0.0
-        qpos[3:7] = np.cos(yaw_rad / 2), 0.0, 0.0, np.sin(yaw_rad / 2)
+        to_com_m = car.com_x_m - car.front_point_m
+        qpos[self._place] = x_m + to_com_m * cos - car.com_x_m, y_m + to_com_m * sin, yaw_rad
         qpos[self._steer] = steering_rad
         qpos[self._spin] = driven_m / car.wheel_radius_m
         mujoco.mj_kinematics(self._model, self._data)

@@ -11,13 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
 
-from .car import STEERED, WHEELS, build_model
+from .car import build_model
+from .tyres import DRIVE, car_record, push_cars
 
 Floats = NDArray[np.float64]
-Ids = NDArray[np.intp]
-
-_SETTLE_PERIODS = 60
-"""Control periods (4 s) for the car to come to rest after being put down: contacts are damped within 0.1 s."""
 
 
 class CarState(NamedTuple):
@@ -51,32 +48,25 @@ class CarBatch:
         self.car = car
         self.n_cars = n_cars
         self.model = build_model(car)
-        self._contacts = np.array([self.model.pair(name).id for name in WHEELS])
-        self._motors = np.array([self.model.actuator(f"{name}_motor").id for name in WHEELS])
-        self._servos = np.array([self.model.actuator(f"{name}_servo").id for name in STEERED])
-        steered = [self.model.joint(f"{name}_steer") for name in STEERED]
-        self._steer_qpos = np.array([joint.qposadr[0] for joint in steered])
-        self._trim_rad = np.deg2rad(car.steering_trim_deg)
-        self._rest_row, self._rest_qpos = self._settle()
+        self._car = car_record(car)
+        self._cars = np.full(n_cars, self._car)
         self._tyre_friction = np.full(n_cars, car.tyre_friction)
         self._floor_friction = np.broadcast_to(np.asarray(floor_friction, np.float64), n_cars).copy()
-        # Along and across the wheel; the other entries are spinning and rolling friction. With one floor for all cars,
-        # it is set in the model.
-        self.model.pair_friction[self._contacts, :2] = car.tyre_friction * self._floor_friction[0]
+        self._cars["friction"] = self._tyre_friction * self._floor_friction
         self._batch = mujoco.batch.Batch(self.model, n_cars, threads or len(os.sched_getaffinity(0)))
         self._rows: Floats = self._batch.state
         self._qpos: Floats = self._batch.bind("qpos")
         self._qvel: Floats = self._batch.bind("qvel")
+        self._forces: Floats = self._batch.bind("qfrc_applied")
+        self._drives = self._batch.bind("userdata").view(DRIVE)
         # Position and velocity are adjacent in a row, after the time.
         self._moving: Floats = self._rows[:, 1 : 1 + self.model.nq + self.model.nv]
-        self._ctrl: Floats = self._batch.bind("ctrl")
+        self._commands: Floats = np.empty((n_cars, 2))
         self._max_steering_rad = np.deg2rad(car.max_steering_deg)
-        self._rows[:] = self._rest_row
-        if (self._floor_friction != self._floor_friction[0]).any():
-            self._apply_friction(np.arange(n_cars))
+        self._rest_row = self._rows[0].copy()
 
     def place(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
-        """Put cars at rest on their wheels, steering straight, with a fresh physics state.
+        """Put cars at rest, steering straight, with a fresh physics state.
 
         Args:
             ids: distinct indices of cars, (n,).
@@ -85,20 +75,11 @@ class CarBatch:
             yaw_rad: heading, likewise.
         """
         rows = np.asarray(ids, np.intp)
-        half = 0.5 * np.asarray(yaw_rad, np.float64)
-        cos, sin = np.cos(half), np.sin(half)
-        w, x, y, z = self._rest_qpos[3:7]
         self._rows[rows] = self._rest_row
-        self._qpos[rows, 0] = x_m
-        self._qpos[rows, 1] = y_m
-        # The turn about the vertical, applied to the slight pitch in which the car came to rest.
-        self._qpos[rows, 3] = cos * w - sin * z
-        self._qpos[rows, 4] = cos * x - sin * y
-        self._qpos[rows, 5] = cos * y + sin * x
-        self._qpos[rows, 6] = cos * z + sin * w
+        self._set_pose(rows, np.asarray(x_m, np.float64), np.asarray(y_m, np.float64), yaw_rad)
 
     def move(self, ids: ArrayLike, pose: Floats, motion: Floats) -> None:
-        """Put cars elsewhere in motion; height, pitch, wheel turns and steering angles stay as they are.
+        """Put cars elsewhere in motion; wheel turns and steering angles stay as they are.
 
         Args:
             ids: distinct indices of cars, (n,).
@@ -106,35 +87,40 @@ class CarBatch:
             motion: speed_mps, lateral_mps, yaw_rate_radps as in `CarState`, (n, 3).
         """
         rows = np.asarray(ids, np.intp)
-        half = 0.5 * (pose[:, 2] - self.read().yaw_rad[rows])
-        cos, sin = np.cos(half), np.sin(half)
-        w, x, y, z = self._qpos[rows, 3:7].T
-        turned = [cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w]
-        self._qpos[rows, :2] = pose[:, :2]
-        self._qpos[rows, 3:7] = np.stack(turned, axis=-1)
+        self._set_pose(rows, *pose.T)
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        self._qvel[rows, 0] = cos * motion[:, 0] - sin * motion[:, 1]
-        self._qvel[rows, 1] = sin * motion[:, 0] + cos * motion[:, 1]
-        self._qvel[rows, 5] = motion[:, 2]
+        speed, rate = motion[:, 0], motion[:, 2]
+        lateral = motion[:, 1] + self.car.com_x_m * rate
+        self._qvel[rows, 0] = cos * speed - sin * lateral
+        self._qvel[rows, 1] = sin * speed + cos * lateral
+        self._qvel[rows, 2] = rate
+
+    def _set_pose(self, rows: NDArray[np.intp], x_m: Floats, y_m: Floats, yaw_rad: ArrayLike) -> None:
+        # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
+        com = self.car.com_x_m
+        self._qpos[rows, 0] = x_m + com * (np.cos(yaw_rad) - 1.0)
+        self._qpos[rows, 1] = y_m + com * np.sin(yaw_rad)
+        self._qpos[rows, 2] = yaw_rad
 
     @property
     def steering_rad(self) -> Floats:
         """Steering angle of the front wheels, (N,): a copy, positive to the left."""
-        angle: Floats = self._qpos[:, self._steer_qpos].mean(axis=1)
+        angle: Floats = self._drives["steering_rad"][:, 0] + self._car["steering_trim_rad"]
         return angle
 
     def lift(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
-        """Put cars at rest as `place` does, but keep the state of their front wheels and servos."""
-        rows = np.asarray(ids, np.intp)[:, None]
-        angles, targets = self._qpos[rows, self._steer_qpos], self._ctrl[rows, self._servos]
-        self.place(ids, x_m, y_m, yaw_rad)
-        self._qpos[rows, self._steer_qpos], self._ctrl[rows, self._servos] = angles, targets
+        """Put cars at rest as `place` does, but keep where their front wheels stand and what was sent to them."""
+        rows = np.asarray(ids, np.intp)
+        kept = {name: self._drives[name][rows] for name in ("steering_rad", "sent_steering_rad")}
+        self.place(rows, x_m, y_m, yaw_rad)
+        for name, values in kept.items():
+            self._drives[name][rows] = values
 
     def steer(self, ids: ArrayLike, angle_rad: ArrayLike) -> None:
-        """Turn cars' front wheels to an angle at once, (n,); the servos continue from there."""
+        """Turn cars' front wheels to an angle at once, (n,); the steering continues from there."""
         rows = np.asarray(ids, np.intp)
         angle = np.broadcast_to(np.asarray(angle_rad, np.float64), rows.shape)
-        self._qpos[rows[:, None], self._steer_qpos] = angle[:, None]
+        self._drives["steering_rad"][rows, 0] = angle - self._car["steering_trim_rad"]
 
     def drive(
         self, speed_mps: ArrayLike, steering_rad: ArrayLike, moving: NDArray[np.bool_] | None = None
@@ -150,47 +136,36 @@ class CarBatch:
             RunFailed: a command or a car's state is not finite, or MuJoCo reports an error; the message
                 names the first such car. `state` keeps the state of that moment.
         """
-        speed, steering = np.asarray(speed_mps, np.float64), np.asarray(steering_rad, np.float64)
-        # MuJoCo would replace all controls of that car by zero.
-        _require_finite("command", np.isfinite(np.stack([speed, steering], axis=-1)))
-        speed = np.clip(speed, self.car.min_speed_mps, self.car.max_speed_mps)
-        steering = np.clip(steering, -self._max_steering_rad, self._max_steering_rad)
+        commands = self._commands
+        commands[:, 0], commands[:, 1] = speed_mps, steering_rad
+        _require_finite("command", np.isfinite(commands))
+        np.clip(commands[:, 0], self.car.min_speed_mps, self.car.max_speed_mps, out=commands[:, 0])
+        np.clip(commands[:, 1], -self._max_steering_rad, self._max_steering_rad, out=commands[:, 1])
         if moving is not None:
-            speed, steering = speed * moving, steering * moving
-        target = self._front_angles(steering + self._trim_rad)
-        self._qpos[:, self._steer_qpos] += self.car.servo_kick * (target - self._ctrl[:, self._servos])
-        self._ctrl[:, self._servos] = target
-        self._ctrl[:, self._motors] = (speed / self.car.drive_radius_m)[:, None]
-        try:
-            self._batch.step(nstep=self.car.substeps)
-        except mujoco.batch.SimulationError as error:
-            raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
+            commands *= moving[:, None]
+        steps, dt_s = self.car.substeps, self.model.opt.timestep
+        for step in range(steps):
+            yaw = self._qpos[:, 2]
+            push_cars(self._cars, self._drives, yaw, self._qvel, commands, step, steps, dt_s, self._forces)
+            try:
+                self._batch.step()
+            except mujoco.batch.SimulationError as error:
+                raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
         _require_finite("physics state", np.isfinite(self._moving))
-
-    def _front_angles(self, steering: Floats) -> Floats:
-        """Return the angles of the left and the right front wheel, (N, 2) or (N, 1) where they are the same."""
-        if not self.car.ackermann:
-            return steering[:, None]
-        tangent = np.tan(steering)[:, None]
-        # The centre of the turn is on the line of the rear axle, wheelbase / tangent to the left of its middle.
-        length, left = self.car.wheelbase_m, self.car.front_wheel_y_m * np.array([1.0, -1.0])
-        angles: Floats = np.arctan(length * tangent / (length - left * tangent))
-        return angles
 
     def read(self) -> CarState:
         """Return position and motion of all cars."""
-        q, v = self._qpos, self._qvel
-        w, x, y, z = q[:, 3], q[:, 4], q[:, 5], q[:, 6]
-        cos_part, sin_part = 1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y)
-        norm = np.hypot(cos_part, sin_part)
-        cos, sin = cos_part / norm, sin_part / norm
+        x, y, yaw = self._qpos.T
+        vx, vy, rate = self._qvel.T
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        com = self.car.com_x_m
         return CarState(
-            x_m=q[:, 0].copy(),
-            y_m=q[:, 1].copy(),
-            yaw_rad=np.arctan2(sin_part, cos_part),
-            speed_mps=cos * v[:, 0] + sin * v[:, 1],
-            lateral_mps=cos * v[:, 1] - sin * v[:, 0],
-            yaw_rate_radps=v[:, 5].copy(),
+            x_m=x - com * (cos - 1.0),
+            y_m=y - com * sin,
+            yaw_rad=np.arctan2(sin, cos),
+            speed_mps=cos * vx + sin * vy,
+            lateral_mps=cos * vy - sin * vx - com * rate,
+            yaw_rate_radps=rate.copy(),
         )
 
     @property
@@ -211,18 +186,13 @@ class CarBatch:
         """Set the tyre friction coefficient of cars, (n,), without the floor's factor."""
         rows = np.asarray(ids, np.intp)
         self._tyre_friction[rows] = values
-        self._apply_friction(rows)
+        self._cars["friction"][rows] = self._tyre_friction[rows] * self._floor_friction[rows]
 
     def set_floor_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
         """Set the floor's factor on the tyre friction of cars, (n,)."""
         rows = np.asarray(ids, np.intp)
-        if (self._floor_friction[rows] != values).any():
-            self._floor_friction[rows] = values
-            self._apply_friction(rows)
-
-    def _apply_friction(self, rows: Ids) -> None:
-        friction = self._tyre_friction[rows] * self._floor_friction[rows]
-        self._batch.expand("pair_friction")[rows[:, None], self._contacts, :2] = friction[:, None, None]
+        self._floor_friction[rows] = values
+        self._cars["friction"][rows] = self._tyre_friction[rows] * self._floor_friction[rows]
 
     def set_mass_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
         """Multiply cars' masses and inertias by scale, (n,), relative to the configured ones."""
@@ -231,51 +201,20 @@ class CarBatch:
         self._batch.expand("body_mass")[rows] = factor[:, None] * self.model.body_mass
         self._batch.expand("body_inertia")[rows] = factor[:, None, None] * self.model.body_inertia
         self._batch.set_const(np.sort(rows))
+        for field in ("mass_kg", "yaw_inertia_kgm2", "wheel_kg"):
+            self._cars[field][rows] = factor * self._car[field]
 
     def set_motor_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
         """Multiply cars' motor gain and torque limit by scale, (n,), relative to the configured ones."""
-        for field in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
-            self._scale(field, ids, self._motors, scale)
+        rows = np.asarray(ids, np.intp)
+        factor = np.broadcast_to(np.asarray(scale, np.float64), rows.shape)
+        self._cars["motor_ns_per_m"][rows] = factor[:, None] * self._car["motor_ns_per_m"]
+        self._cars["motor_n"][rows] = factor * self._car["motor_n"]
 
     def set_servo_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
-        """Multiply cars' servo gain by scale, (n,), relative to the configured one.
-
-        The damping stays, so that the steering's time constant is divided by scale.
-        """
-        self._scale("actuator_gainprm", ids, self._servos, scale)
-        # An affine bias is (constant, per angle, per speed): the gain appears again as its second entry.
-        self._scale("actuator_biasprm", ids, self._servos, scale, column=1)
-
-    def _scale(
-        self, field: str, ids: ArrayLike, actuators: Ids, scale: ArrayLike, column: int | None = None
-    ) -> None:
-        """Set a field's columns (all, or one) of some cars' actuators to the model's times scale."""
+        """Divide the time constant of cars' steering by scale, (n,), relative to the configured one."""
         rows = np.asarray(ids, np.intp)
-        factor = np.broadcast_to(np.asarray(scale, np.float64), rows.shape)[:, None, None]
-        columns = slice(None) if column is None else slice(column, column + 1)
-        own = getattr(self.model, field)[actuators, columns]
-        self._batch.expand(field)[rows[:, None], actuators, columns] = factor * own
-
-    def _settle(self) -> tuple[Floats, Floats]:
-        """Let one car come to rest on its wheels at the world's origin; return its state row and pose."""
-        data = mujoco.MjData(self.model)
-        mujoco.mj_step(self.model, data, nstep=_SETTLE_PERIODS * self.car.substeps)
-        pose = data.qpos.copy()
-        if not np.isfinite(pose).all():
-            raise ValueError("its physics state is not finite at rest")
-        # Settling determines height and pitch; the rest is zero up to rounding.
-        pose[:2] = 0.0
-        pose[4] = pose[6] = 0.0
-        pose[3:7] /= np.linalg.norm(pose[3:7])
-        pose[7:] = 0.0
-        # A car that steers straight for long has its wheels at the trim.
-        pose[self._steer_qpos] = self._trim_rad
-        mujoco.mj_resetData(self.model, data)
-        data.qpos[:] = pose
-        data.ctrl[self._servos] = self._trim_rad
-        row = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_INTEGRATION))
-        mujoco.mj_getState(self.model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
-        return row, pose
+        self._cars["steering_time_s"][rows] = self._car["steering_time_s"] / np.asarray(scale, np.float64)
 
 
 def _require_finite(what: str, finite: NDArray[np.bool_]) -> None:
