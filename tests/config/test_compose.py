@@ -6,7 +6,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid
+from deepracer_exp.config.compose import compose_entry, compose_experiment, compose_option, expand_grid
 from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
@@ -169,7 +169,7 @@ def test_an_unknown_key_is_looked_for_in_the_chosen_option():
         ("collector.processes=0", "greater than or equal to 1"),
         ("track.direction=backwards", "'forward', 'reversed' or 'alternate'"),
         ("track.floor.road_color=red", "pattern"),
-        ("car.solver=foo", "'newton' or 'cg'"),
+        ("car.steering_kick=1", "less than 1"),
         ("episode.start_offset=1", "less than 1"),
         ("reward.constants.X=abc", "valid number"),
         ("observation.lookahead_m=[1,-2]", "greater than 0"),
@@ -331,3 +331,10 @@ def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, mon
 def test_an_option_by_itself_that_is_not_there_is_refused_with_the_nearest():
     with pytest.raises(BadInput, match=r"randomization=sim2rael: no such .*did you mean sim2real"):
         compose_option("randomization", "sim2rael", RandomizationConfig)
+
+
+def test_a_run_of_the_car_of_before_is_refused_with_what_to_do():
+    values = compose_entry("train", []).mapping
+    values["car"] |= {"contact_time_s": 0.04, "chassis_mass_kg": 5.9811}
+    with pytest.raises(BadInput, match="^car: .* train again$"):
+        parse_experiment(values)

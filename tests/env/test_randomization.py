@@ -250,15 +250,13 @@ def test_half_the_friction_halves_the_grip_of_that_car_alone():
 
 def test_each_car_has_the_mass_the_motors_and_the_servos_it_drew():
     race = race_of(mass_scale=(0.5, 1.5), motor_scale=(0.5, 1.5), servo_scale=(0.5, 1.5), n_cars=5)
-    motors, servos, nominal = race._batch._motors, race._batch._servos, race._batch.model
+    cars, nominal, model = race._batch._cars, race._batch._car, race._batch.model
+    mass, motor, servo = (drawn_of(race, f"{part}_scale") for part in ("mass", "motor", "servo"))
     for car in range(5):
-        own = race._batch._batch.get_model(car)
-        mass, motor, servo = (drawn_of(race, f"{part}_scale")[car] for part in ("mass", "motor", "servo"))
-        np.testing.assert_allclose(own.body_mass, mass * nominal.body_mass)
-        np.testing.assert_allclose(
-            own.actuator_forcerange[motors], motor * nominal.actuator_forcerange[motors]
-        )
-        np.testing.assert_allclose(own.actuator_gainprm[servos], servo * nominal.actuator_gainprm[servos])
+        np.testing.assert_allclose(race._batch._batch.get_model(car).body_mass, mass[car] * model.body_mass)
+    np.testing.assert_allclose(cars["mass_kg"], mass * nominal["mass_kg"])
+    np.testing.assert_allclose(cars["motor_n"], motor * nominal["motor_n"])
+    np.testing.assert_allclose(cars["steering_time_s"], nominal["steering_time_s"] / servo)
 
 
 def test_a_heavy_car_with_weak_motors_is_slower_away():
