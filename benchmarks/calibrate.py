@@ -1,50 +1,59 @@
 """Fit the simulated car to recorded drives.
 
-    python -m benchmarks.calibrate --traces DIR [--car NAME] [--output FILE.yaml]
+    python -m benchmarks.calibrate --traces PATH ... [--car NAME] [--output FILE.yaml] [--leave-one-out]
 
-Every fourth iteration of the recordings is held out: the car is fitted to a sample of windows of the others and its
-errors are reported for both. docs/fidelity.md says what was found and what the figures mean.
+Takes the folders, files and archives that `deepracer-exp analyze` reads. Every fourth iteration of each recording is
+held out: the car is fitted to the others, and its errors are reported for both. docs/fidelity.md explains the measure.
 """
 
 import argparse
 import dataclasses
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from benchmarks.replay import Windows, cut_windows
+from benchmarks.recorded import (
+    BANDS,
+    LENGTHS,
+    Median,
+    Recorded,
+    by_band,
+    car_named,
+    describe,
+    join,
+    read_recorded,
+    sample,
+)
+from benchmarks.replay import OBSERVER, Observer, Windows, errors, replay
+from benchmarks.report import number, table
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import find
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.errors import BadInput, RunFailed
-
-from .replay import Errors, errors, replay
-from .report import number, table
+from deepracer_exp.errors import BadInput
 
 Floats = NDArray[np.float64]
 
-FIT_STEPS = 15
-REPORT_STEPS = 45
-_LEAST_WINDOWS = 20
+LEAST_WINDOWS = 20
 _FITTED_AT = (4, 9, 14)
 """After a third, two thirds and the whole of a second."""
 _POSITION_SCALE_M = 0.03
 _HEADING_ARM_M = 0.1
 """A radian of heading counts as much as this distance."""
-_BLOWN_UP = 50.0
-_PROBE = 0.15
-"""Derivatives are differences over this share of a parameter's step: less is lost in the solver's tolerance."""
+_BLOWN_UP = 200.0
+_PROBE = 0.1
+"""Derivatives are differences over this many steps of a parameter."""
+_UNDETERMINED = 0.5
+"""Least share of what is known of a parameter that has to come from the recordings."""
 
 
 class Parameter(NamedTuple):
-    """A key of the car that is fitted."""
+    """A number that is fitted: a key of the car, or a gain of the observer."""
 
     key: str
     step: float
@@ -54,110 +63,180 @@ class Parameter(NamedTuple):
     """What a car of this size can have at least."""
     high: float
     """And at most."""
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    """Values beyond these have no meaning."""
 
 
 PARAMETERS = (
-    Parameter("tyre_friction", 0.2, True, 0.1, 1.5),
-    Parameter("front_slip_time_s", 0.2, True, 0.0267, 1.0),
-    Parameter("rear_slip_time_s", 0.2, True, 0.0267, 1.0),
-    Parameter("drive_radius_m", 0.2, True, 0.02, 0.05),
-    Parameter("front_motor_gain_nms", 0.2, True, 1e-4, 1.0),
-    Parameter("rear_motor_gain_nms", 0.2, True, 1e-4, 1.0),
-    Parameter("motor_torque_nm", 0.2, True, 0.01, 2.0),
-    Parameter("servo_damping_nms", 0.2, True, 0.02, 4.0),
-    Parameter("servo_kick", 0.05, False, 0.0, 0.95),
-    Parameter("steering_trim_deg", 1.0, False, -5.0, 5.0),
+    Parameter("com_z_m", 0.01, False, 0.001, 0.1, (0.001, 0.1)),
+    Parameter("tyre_friction", 0.2, True, 0.1, 2.0),
+    Parameter("front_tyre_along_ns_per_m", 0.3, True, 2.0, 3000.0),
+    Parameter("rear_tyre_along_ns_per_m", 0.3, True, 2.0, 3000.0),
+    Parameter("front_tyre_across_ns_per_m", 0.3, True, 2.0, 3000.0),
+    Parameter("rear_tyre_across_ns_per_m", 0.3, True, 2.0, 3000.0),
+    Parameter("drive_radius_m", 0.03, True, 0.02, 0.05),
+    Parameter("front_motor_gain_nms", 0.4, True, 1e-4, 3.0),
+    Parameter("rear_motor_gain_nms", 0.4, True, 1e-4, 3.0),
+    Parameter("motor_torque_nm", 0.2, True, 0.01, 3.0),
+    Parameter("speed_delay_s", 0.01, False, 0.0, 0.066, (0.0, 0.066)),
+    Parameter("steering_time_s", 0.4, True, 0.001, 2.0),
+    Parameter("steering_kick", 0.15, False, -0.5, 0.95, (-0.9, 0.95)),
+    Parameter("steering_delay_s", 0.01, False, 0.0, 0.066, (0.0, 0.066)),
+    Parameter("steering_trim_deg", 0.5, False, -5.0, 5.0),
 )
-"""Masses, inertias and lengths are the URDF's. Bounds: rubber grips with 0.1 (wet ice) to 1.5 (a racing tyre); slip
-takes two physics steps or more; the wheels' radius is 0.036 m; the servo's time constant, damping over its gain of 2,
-is 0.01 to 2 s."""
+"""Masses, inertias and lengths are the URDF's. Bounds: rubber grips with 0.1 (wet ice) to 2 (a racing tyre); wheels'
+radius is 0.036 m; a delay is less than a control period."""
+
+GAINS = tuple(
+    Parameter(key, step, False, -np.inf, np.inf)
+    for key, step in zip(Observer._fields, (0.1, 0.15, 1.0, 0.2, 0.3, 0.1), strict=True)
+)
 
 
-def held_out(iteration: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Say of each window whether it belongs to an iteration that is not fitted to: every fourth, or the last of few."""
-    iterations = np.unique(iteration)
-    held: NDArray[np.bool_] = np.isin(iteration, iterations[3::4] if len(iterations) > 3 else iterations[-1:])
-    return held
+class Fit(NamedTuple):
+    """A car, with the gains by which it is led along a recording."""
+
+    car: CarConfig
+    observer: Observer
+    cost: float
+    """Of the recordings, a window."""
+    undetermined: tuple[str, ...] = ()
+    """Parameters that the recordings do not determine; they are where they began."""
 
 
 def fit(
     car: CarConfig,
     windows: Windows,
-    parameters: Sequence[Parameter],
-    evaluations: int,
-    report: Callable[[float], None] = lambda cost: None,
-) -> CarConfig:
-    """Return the car with the parameters that predict the windows best.
+    parameters: Sequence[Parameter] = PARAMETERS,
+    evaluations: int = 25,
+    observer: Observer = OBSERVER,
+) -> Fit:
+    """Return the car and observer that predict the windows best.
+
+    A weak prior holds every parameter around where it begins: a step away counts as much as an error of 3 cm at one of
+    the three points of time of one window. A parameter for which the recordings say less than that is set back, and the
+    others are fitted again.
 
     Args:
         car: where to begin; what is not fitted stays.
         windows: what to predict.
-        parameters: which keys of the car to fit.
-        evaluations: at most this many steps of scipy's least_squares, each of which drives every window once for each
-            parameter and once more.
-        report: called with the cost after every improvement.
-
-    Raises:
-        RunFailed: the physics of the car to begin with blew up.
+        parameters: which keys of the car to fit; none: only the observer.
+        evaluations: steps of the solver, at most, each of which drives every window once for each parameter and once
+            more.
+        observer: where its gains begin.
     """
-    begin = np.array([_to_scale(p, getattr(car, p.key)) for p in parameters])
-    best = np.inf
+    parameters = list(parameters)
+    found, known = _solve(car, observer, windows, parameters, evaluations, Fit(car, observer, np.inf))
+    undetermined: list[str] = []
+    while parameters and min(known) < _UNDETERMINED:
+        least = parameters.pop(int(np.argmin(known)))
+        undetermined.append(least.key)
+        begin = dataclasses.replace(found.car, **{least.key: getattr(car, least.key)})
+        found, known = _solve(
+            car, observer, windows, parameters, evaluations, Fit(begin, found.observer, np.inf)
+        )
+    return found._replace(undetermined=tuple(undetermined))
 
-    def driven(place: Floats) -> CarConfig:
-        # least_squares takes steps relative to the values: 1 is where it begins.
-        values = begin + (place - 1.0)
-        chosen: dict[str, Any] = {
-            p.key: _from_scale(p, value) for p, value in zip(parameters, values, strict=True)
-        }
-        return dataclasses.replace(car, **chosen)
+
+def _solve(
+    car: CarConfig,
+    observer: Observer,
+    windows: Windows,
+    parameters: Sequence[Parameter],
+    evaluations: int,
+    begin: Fit,
+) -> tuple[Fit, list[float]]:
+    """Fit from `begin` on with the prior around the given car; return what share of each parameter is known by it."""
+    count = len(parameters)
+    every = (*parameters, *GAINS)
+    centre = np.array([_to_scale(p, _value(p.key, car, observer)) for p in every])
+    start = np.array([_to_scale(p, _value(p.key, begin.car, begin.observer)) for p in every])
+    low, high = (np.array([p.limits[side] / p.step for p in every]) for side in (0, 1))
+
+    def driven(place: Floats) -> tuple[CarConfig, Observer]:
+        values = [_from_scale(p, one) for p, one in zip(every, place, strict=True)]
+        chosen: dict[str, Any] = {p.key: value for p, value in zip(parameters, values, strict=False)}
+        return dataclasses.replace(begin.car, **chosen), Observer(*values[count:])
 
     def residuals(place: Floats) -> Floats:
-        nonlocal best
-        try:
-            found = _residuals(errors(replay(driven(place), windows), windows))
-        except (RunFailed, ValueError):
-            return np.full(3 * len(_FITTED_AT) * len(windows), _BLOWN_UP)
-        cost = float(np.sum(np.sqrt(1.0 + found**2) - 1.0))
-        if cost < best:
-            best = cost
-            report(cost)
-        return found
+        return np.concatenate([_residuals(*driven(place), windows), place - centre])
 
-    _residuals(errors(replay(car, windows), windows))
-    found = least_squares(
-        residuals, np.ones(len(parameters)), loss="soft_l1", diff_step=_PROBE, max_nfev=evaluations
+    def jacobian(place: Floats) -> Floats:
+        base = residuals(place)
+        columns = []
+        for at in range(len(place)):
+            probed = place.copy()
+            probed[at] += _PROBE if place[at] + _PROBE < high[at] else -_PROBE
+            columns.append((residuals(probed) - base) / (probed[at] - place[at]))
+        return np.stack(columns, axis=1)
+
+    solved = least_squares(
+        residuals,
+        np.clip(start, low, high),
+        jacobian,
+        bounds=(low, high),
+        loss="soft_l1",
+        max_nfev=evaluations,
+        ftol=3e-5,
+        xtol=1e-4,
     )
-    return driven(found.x)
+    prior = len(solved.fun) - len(every) + np.arange(len(every))
+    off = solved.fun[: prior[0]]
+    cost = float(np.sum(np.sqrt(1.0 + off**2) - 1.0)) / len(windows)
+    variance = np.diag(np.linalg.inv(solved.jac.T @ solved.jac))
+    known = 1.0 - variance * solved.jac[prior, np.arange(len(every))] ** 2
+    return Fit(*driven(solved.x), cost), [float(one) for one in known[:count]]
+
+
+def _value(key: str, car: CarConfig, observer: Observer) -> float:
+    return float(getattr(observer if key in Observer._fields else car, key))
 
 
 def _to_scale(parameter: Parameter, value: float) -> float:
-    return (np.log(value) if parameter.logarithmic else value) / parameter.step
+    return float(np.log(value) if parameter.logarithmic else value) / parameter.step
 
 
 def _from_scale(parameter: Parameter, value: float) -> float:
     plain = value * parameter.step
-    return float(np.exp(plain) if parameter.logarithmic else plain)
+    return float(np.exp(plain)) if parameter.logarithmic else float(np.clip(plain, *parameter.limits))
 
 
-def _residuals(off: Errors) -> Floats:
-    at = np.array(_FITTED_AT)
+def _residuals(car: CarConfig, observer: Observer, windows: Windows) -> Floats:
+    off, at = errors(replay(car, windows, observer), windows), np.array(_FITTED_AT)
     parts = [off.x_m[:, at], off.y_m[:, at], _HEADING_ARM_M * off.yaw_rad[:, at]]
-    return np.concatenate([part.ravel() for part in parts]) / _POSITION_SCALE_M
+    found = np.concatenate([part.ravel() for part in parts]) / _POSITION_SCALE_M
+    limited: Floats = np.clip(np.nan_to_num(found, nan=_BLOWN_UP), -_BLOWN_UP, _BLOWN_UP)
+    return limited
 
 
-def write_car(car: CarConfig, name: str, fitted: Sequence[Parameter], path: Path) -> None:
-    """Write the option `car=<name>` with the fitted values in place of its own, comments included."""
-    text = Path(find(f"car/{name}.yaml")).read_text(encoding="utf-8")
-    values = {p.key: f"{getattr(car, p.key):.5g}" for p in fitted} | {"name": path.stem}
-    for key, value in values.items():
-        text, replaced = re.subn(rf"(?m)^{key}: .*$", f"{key}: {value}", text)
-        assert replaced == 1, key
-    path.write_text(text, encoding="utf-8")
+def write_car(car: CarConfig, base: str, fitted: Sequence[str], path: Path, note: str) -> None:
+    """Write an option file that builds on the option `car=<base>` and has the fitted values, with its comments."""
+    lines = [f"# {note}", "defaults:", f"  - {base}", "", "# The car's name.", f"name: {path.stem}", ""]
+    for key in fitted:
+        lines += [*_comment(key, base), f"{key}: {getattr(car, key):.4g}"]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def parameter_table(before: CarConfig, after: CarConfig, parameters: Sequence[Parameter]) -> str:
+def _comment(key: str, option: str) -> list[str]:
+    """Return the comment above a key in the file of an option, or in the one that it builds on."""
+    text = Path(find(f"car/{option}.yaml")).read_text(encoding="utf-8")
+    above = re.search(rf"(?m)((?:^#.*\n)+)^{key}:", text)
+    if above is not None:
+        return above[1].splitlines()
+    below = (yaml.safe_load(text) or {}).get("defaults", [])
+    return _comment(key, below[0]) if below else []
+
+
+def parameter_table(before: CarConfig, fitted: Fit, parameters: Sequence[Parameter]) -> str:
     """Return what became of the parameters as text."""
-    rows = [(p.key, f"{getattr(before, p.key):.5g}", f"{getattr(after, p.key):.5g}") for p in parameters]
+    rows = [
+        (
+            p.key,
+            f"{getattr(before, p.key):.4g}",
+            "not determined" if p.key in fitted.undetermined else f"{getattr(fitted.car, p.key):.4g}",
+        )
+        for p in parameters
+    ]
     return table(("parameter", "before", "after"), rows)
 
 
@@ -175,30 +254,45 @@ def unphysical(car: CarConfig, parameters: Sequence[Parameter]) -> list[str]:
     return found
 
 
-def error_table(before: CarConfig, after: CarConfig, recorded: Sequence[Windows]) -> str:
-    """Return the median errors at the ends of windows of several lengths, on both parts of the recordings."""
+def interval(median: Median) -> str:
+    """Return a median error with its interval for a table."""
+    if median.interval_m is None:
+        return "-"
+    return f"{number(median.error_m, 3)} ({median.interval_m[0]:.3f} to {median.interval_m[1]:.3f})"
 
-    def median_error(car: CarConfig, some: Windows) -> float | None:
-        return float(np.median(errors(replay(car, some), some).distance_m[:, -1])) if len(some) else None
 
+def off_by(found: Fit, windows: Windows) -> dict[str, Median]:
+    """Return the median errors at the ends of windows, by band."""
+    return by_band(errors(replay(found.car, windows, found.observer), windows).distance_m[:, -1], windows)
+
+
+def error_table(before: Fit, after: Fit, parts: dict[str, Windows]) -> str:
+    """Return the median errors by part and band of speed."""
     rows = []
-    for windows in recorded:
-        held = held_out(windows.iteration)
-        for part, chosen in (("fitted iterations", ~held), ("held-out iterations", held)):
-            some = windows.choose(chosen)
-            name = f"{windows.steps * before.control_period_s:.0f} s, {part}"
-            off = (number(median_error(car, some), 3) for car in (before, after))
-            rows.append((name, str(len(some)), *off))
-    return table(("error (m), median", "windows", "before", "after"), rows)
+    for part, windows in parts.items():
+        off = [off_by(one, windows) for one in (before, after)]
+        for band in (*BANDS, "all"):
+            count = off[0][band].windows
+            if count:
+                rows.append((f"{part}, {band}", str(count), *(interval(one[band]) for one in off)))
+    return table(("median error (m) and 95 % interval", "windows", "before", "after"), rows)
 
 
-def car_named(name: str) -> CarConfig:
-    """Return the car of an option of `conf/car/`.
+def _starting_car(name: str | None, recorded: Sequence[Recorded]) -> str:
+    """Return the name of the car to begin with.
 
     Raises:
-        BadInput: there is none of that name.
+        BadInput: the recordings are of several versions.
     """
-    return compose_experiment([f"car={name}"])[0].car
+    if name is not None:
+        return name
+    versions = sorted({one.version for one in recorded})
+    if len(versions) > 1:
+        several = ", ".join(f"{one.name} of version {one.version}" for one in recorded)
+        raise BadInput(
+            f"--traces: {several}; accepted: recordings of one version, or --car NAME to begin with"
+        )
+    return f"deepracer_v{versions[0]}"
 
 
 def run(options: argparse.Namespace) -> None:
@@ -207,42 +301,63 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         BadInput: nothing to fit to, or nowhere to write the car.
     """
-    car = car_named(options.car)
     if options.evaluations < 1:
         raise BadInput(f"--evaluations {options.evaluations}: accepted: 1 or more")
-    if options.windows < _LEAST_WINDOWS:
-        raise BadInput(f"--windows {options.windows}: accepted: {_LEAST_WINDOWS} or more")
+    if options.windows < LEAST_WINDOWS:
+        raise BadInput(f"--windows {options.windows}: accepted: {LEAST_WINDOWS} or more")
+    if options.car is not None:
+        car_named(options.car)
     if options.output is not None:
         _require_writable(options.output)
-    recording = read_recording(options.traces)
-    for problem in recording.problems:
-        print(problem, file=sys.stderr)
-    recorded = recording.steps
-    windows, long = (cut_windows(recorded, car.front_point_m, steps) for steps in (FIT_STEPS, REPORT_STEPS))
-    if windows.left_out:
-        print(
-            f"{windows.left_out} windows of a second are left out: the car was paused or put elsewhere in them"
-        )
-    held = held_out(windows.iteration)
-    for part, count in (("to fit to", (~held).sum()), ("to hold out", held.sum())):
-        if count < _LEAST_WINDOWS:
+    recorded = read_recorded(options.traces)
+    if options.leave_one_out and len(recorded) < 2:
+        raise BadInput(f"--leave-one-out: --traces has {len(recorded)} recording; accepted: two or more")
+    name = _starting_car(options.car, recorded)
+    car = car_named(name)
+    known, held = (join([one.part(held) for one in recorded]) for held in (False, True))
+    for part, windows in (("to fit to", known), ("to hold out", held)):
+        if len(windows) < LEAST_WINDOWS:
             raise BadInput(
-                f"{options.traces}: {count} windows of a second {part} in "
-                f"{len(np.unique(windows.iteration))} iterations; accepted: at least {_LEAST_WINDOWS}, of two or more"
+                f"--traces {' '.join(map(str, options.traces))}: {len(windows)} windows of a second {part}; accepted: "
+                f"at least {LEAST_WINDOWS}, of two iterations or more"
             )
-    rng = np.random.default_rng(options.seed)
-    known = np.flatnonzero(~held)
-    sample = windows.choose(np.sort(rng.choice(known, min(options.windows, len(known)), replace=False)))
-    print(f"fitting {len(PARAMETERS)} parameters to {len(sample)} of {len(known)} windows", flush=True)
-    fitted = fit(
-        car, sample, PARAMETERS, options.evaluations, lambda cost: print(f"cost {cost:.2f}", flush=True)
-    )
-    print(f"\n{parameter_table(car, fitted, PARAMETERS)}\n\n{error_table(car, fitted, (windows, long))}")
-    for line in unphysical(fitted, PARAMETERS):
+    for one in recorded:
+        print(describe(one))
+    some = sample(known, options.windows, options.seed)
+    print(f"fitting car={name} to {len(some)} of {len(known)} windows", flush=True)
+    before = fit(car, some, (), options.evaluations)
+    found = fit(car, some, PARAMETERS, options.evaluations, before.observer)
+    print(f"\n{parameter_table(car, found, PARAMETERS)}\n")
+    parts = {"fitted": known, "held out": held}
+    for length in LENGTHS:
+        if length != "one_second":
+            parts = {"held out": join([one.part(True, length) for one in recorded])}
+        print(f"after {length.replace('_', ' ')}:\n{error_table(before, found, parts)}\n")
+    print(error_table(before, found, {one.name: one.part(True) for one in recorded}))
+    if options.leave_one_out:
+        _leave_one_out(recorded, before, found, options)
+    if found.undetermined:
+        print(f"not determined by the recordings, and as in car={name}: {', '.join(found.undetermined)}")
+    fitted = [p for p in PARAMETERS if p.key not in found.undetermined]
+    for line in unphysical(found.car, fitted):
         print(line)
     if options.output is not None:
-        write_car(fitted, options.car, PARAMETERS, options.output)
+        note = f"Fitted by benchmarks.calibrate to {', '.join(one.name for one in recorded)}."
+        write_car(found.car, name, [p.key for p in fitted], options.output, note)
         print(f"\nwritten: {options.output}")
+
+
+def _leave_one_out(
+    recorded: Sequence[Recorded], before: Fit, found: Fit, options: argparse.Namespace
+) -> None:
+    """Report the error on each recording of a car that is fitted to the others."""
+    free = [p for p in PARAMETERS if p.key not in found.undetermined]
+    for one in recorded:
+        others = join([other.part(False) for other in recorded if other is not one])
+        some = sample(others, options.windows, options.seed)
+        without = fit(before.car, some, free, options.evaluations, before.observer)
+        print(f"\nfitted without {one.name}:")
+        print(error_table(before, without, {one.name: one.windows["one_second"]}), flush=True)
 
 
 def _require_writable(path: Path) -> None:
@@ -262,17 +377,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--traces", type=Path, required=True, help="a folder of recorded drives, or one file")
-    parser.add_argument("--car", default="deepracer", help="the car to begin with (an option of conf/car)")
+    parser.add_argument(
+        "--traces", type=Path, nargs="+", required=True, help="folders, files or archives of recorded drives"
+    )
+    parser.add_argument(
+        "--car", help="the car to begin with (an option of conf/car); else that of the version"
+    )
     parser.add_argument("--output", type=Path, help="write the fitted car as an option file to this path")
     parser.add_argument(
-        "--evaluations", type=int, default=12, help="steps of the least squares solver, at most"
+        "--leave-one-out", action="store_true", help="also fit without each recording, and measure on it"
     )
-    parser.add_argument("--windows", type=int, default=400, help="windows to fit to, at most")
+    parser.add_argument(
+        "--evaluations", type=int, default=25, help="steps of the least squares solver, at most"
+    )
+    parser.add_argument("--windows", type=int, default=3000, help="windows to fit to, at most")
     parser.add_argument("--seed", type=int, default=0, help="which windows are taken")
     try:
         run(parser.parse_args(arguments))
-    except (BadInput, RunFailed) as error:
+    except BadInput as error:
         print(error, file=sys.stderr)
         return error.exit_code
     return 0

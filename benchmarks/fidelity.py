@@ -1,8 +1,9 @@
 """How far the simulated car is from recorded cars that were sent the same actions.
 
-    python -m benchmarks.fidelity --traces DIR [--held-out] [--car NAME] [--json FILE] [--figures DIR]
+    python -m benchmarks.fidelity --traces PATH ... [--held-out] [--car NAME] [--json FILE] [--figures DIR]
 
-Takes the traces or logs of any generation. docs/fidelity.md explains the measure.
+Takes the folders, files and archives that `deepracer-exp analyze` reads, of any generation; each is measured with the
+car of its version. docs/fidelity.md explains the measure.
 """
 
 import sys
@@ -11,21 +12,31 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from benchmarks.calibrate import FIT_STEPS, REPORT_STEPS, car_named, held_out
-from benchmarks.replay import WARM_UP_STEPS, Windows, cut_windows, errors, replay
+from benchmarks.calibrate import LEAST_WINDOWS, Fit, fit
+from benchmarks.recorded import (
+    BANDS,
+    LENGTHS,
+    Recorded,
+    by_band,
+    car_named,
+    describe,
+    join,
+    read_recorded,
+    sample,
+)
+from benchmarks.replay import OBSERVER, WARM_UP_STEPS, Windows, errors, replay
 from benchmarks.report import benchmark_parser, number, table, write_json
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.errors import BadInput
 
 Floats = NDArray[np.float64]
-WANTED_M = 0.06
-LENGTHS = {"one_second": FIT_STEPS, "three_second": REPORT_STEPS}
 MODELS = ("car", "formula", "bicycle")
+_FITTED_TO = 1500
+"""Windows to which observer and formula are fitted, at most."""
+_EVALUATIONS = 12
 
 
 def bicycle(car: CarConfig, windows: Windows) -> Floats:
@@ -34,11 +45,12 @@ def bicycle(car: CarConfig, windows: Windows) -> Floats:
     Returns:
         x_m, y_m and yaw_rad after each step, (M, steps, 3).
     """
-    period, ratio = car.control_period_s, -car.rear_axle_x_m / car.wheelbase_m
+    ratio = -car.rear_axle_x_m / car.wheelbase_m
     x, y, yaw = windows.start.T
     driven = np.empty_like(windows.truth)
     for step in range(windows.steps):
         speed, steering = windows.action[:, WARM_UP_STEPS + step].T
+        period = windows.duration_s[:, WARM_UP_STEPS + step]
         rate = speed * np.tan(steering) / car.wheelbase_m
         # The origin is ahead of the rear axle, which goes where it points.
         course = yaw + 0.5 * period * rate + np.arctan(ratio * np.tan(steering))
@@ -65,13 +77,12 @@ class Formula(NamedTuple):
 
     def predict(self, car: CarConfig, windows: Windows) -> Floats:
         """Return x_m, y_m and yaw_rad after each step, (M, steps, 3)."""
-        period = car.control_period_s
         x, y, yaw = windows.pose[:, 0].T
         speed, rate = np.zeros(len(windows)), np.zeros(len(windows))
-        keep_speed, keep_rate = np.exp(-period / self.speed_lag_s), np.exp(-period / self.rate_lag_s)
         driven = np.empty_like(windows.truth)
         for step in range(windows.action.shape[1]):
-            known = step >= windows.first
+            known, period = step >= windows.first, windows.duration_s[:, step]
+            keep_speed, keep_rate = np.exp(-period / self.speed_lag_s), np.exp(-period / self.rate_lag_s)
             commanded, steering = windows.action[:, step].T
             to_speed = self.speed_ratio * commanded
             to_rate = (
@@ -113,102 +124,133 @@ def fit_formula(car: CarConfig, windows: Windows) -> Formula:
     return Formula(*map(float, found.x))
 
 
-def measure(car: CarConfig, recorded: pd.DataFrame, only_held_out: bool, threads: int) -> dict[str, Any]:
-    """Return the median errors of the car, the fitted formula and the bicycle on the same windows.
+class Measured(NamedTuple):
+    """What predicts the recordings of one version."""
+
+    name: str
+    """Of the car."""
+    fitted: Fit
+    """The car with an observer fitted to the part that is not held out."""
+    formula: Formula
+    """Fitted to the same part."""
+
+    def predict(self, windows: Windows) -> dict[str, Floats]:
+        """Return the poses that each of `MODELS` predicts, (M, steps, 3)."""
+        car, observer = self.fitted.car, self.fitted.observer
+        return {
+            "car": replay(car, windows, observer),
+            "formula": self.formula.predict(car, windows),
+            "bicycle": bicycle(car, windows),
+        }
+
+
+def prepare(name: str, recorded: Sequence[Recorded]) -> Measured:
+    """Fit an observer to the car and recordings, and the formula.
 
     Raises:
         BadInput: the recordings have no window.
     """
-    figures: dict[str, Any] = {}
-    formula = None
-    for length, steps in LENGTHS.items():
-        windows = cut_windows(recorded, car.front_point_m, steps)
-        figures[f"{length}_windows_left_out"] = windows.left_out
-        known = chosen = windows
-        if only_held_out:
-            held = held_out(windows.iteration)
-            known, chosen = windows.choose(~held), windows.choose(held)
-        if formula is None:
-            if not len(chosen) or not len(known):
-                raise BadInput(
-                    f"--traces: {len(chosen)} windows of a second to measure, {len(known)} to fit the formula to; "
-                    f"accepted: at least one, with --held-out of two iterations or more"
-                )
-            # A second is what it is fitted to, like the car.
-            formula = fit_formula(car, known)
-        predictions = {
-            "car": replay(car, chosen, threads=threads),
-            "formula": formula.predict(car, chosen),
-            "bicycle": bicycle(car, chosen),
-        }
-        figures[f"{length}_windows"] = counts(chosen)
-        for model, predicted in predictions.items():
-            figures.setdefault(model, {})[f"{length}_error_m"] = split(predicted, chosen)
-    assert formula is not None
-    headline = {f"{length}_error_m": figures["car"][f"{length}_error_m"]["all"] for length in LENGTHS}
-    return {**headline, **figures, "formula_values": formula._asdict(), "wanted_one_second_m": WANTED_M}
-
-
-def counts(windows: Windows) -> dict[str, int]:
-    """Return how many windows there are, under way and from a standing start."""
-    standing = int(windows.standing.sum())
-    return {"all": len(windows), "under_way": len(windows) - standing, "standing": standing}
-
-
-def split(predicted: Floats, windows: Windows) -> dict[str, float | None]:
-    """Return the median error at the end of the windows: of all, under way, and from a standing start."""
-    off = errors(predicted, windows).distance_m[:, -1]
-    parts = {"all": np.full(len(off), True), "under_way": ~windows.standing, "standing": windows.standing}
-    return {part: float(np.median(off[of])) if of.any() else None for part, of in parts.items()}
-
-
-def show(figures: dict[str, Any]) -> str:
-    """Return the figures as a table."""
-    head = ("median error (m)", *MODELS, "windows")
-    rows = [
-        (
-            f"{length.replace('_', ' ')}, {part.replace('_', ' ')}",
-            *(number(figures[model][f"{length}_error_m"][part], 3) for model in MODELS),
-            number(figures[f"{length}_windows"][part]),
+    car = car_named(name)
+    known = join([one.part(False) for one in recorded])
+    if len(known) < LEAST_WINDOWS:
+        # One iteration only: there is no other part.
+        known = join([one.windows["one_second"] for one in recorded])
+    if not len(known):
+        raise BadInput(
+            f"--traces: {', '.join(one.name for one in recorded)}: no window of a second; accepted: one"
         )
-        for length in LENGTHS
-        for part in ("all", "under_way", "standing")
-    ]
-    left_out = ", ".join(
-        f"{figures[f'{length}_windows_left_out']} of {length.replace('_', ' ')}" for length in LENGTHS
-    )
-    return f"{table(head, rows)}\nleft out, since the car was paused or put elsewhere: windows {left_out}"
+    some = sample(known, _FITTED_TO, 0)
+    return Measured(name, fit(car, some, (), _EVALUATIONS, OBSERVER), fit_formula(car, some))
+
+
+def measure(measured: Measured, recorded: Sequence[Recorded], only_held_out: bool) -> dict[str, Any]:
+    """Return the median errors on recordings of one version, together and one by one."""
+    bands: dict[str, dict[str, Any]] = {band: {} for band in (*BANDS, "all")}
+    for length in LENGTHS:
+        windows = join([one.part(True, length) if only_held_out else one.windows[length] for one in recorded])
+        for model, predicted in measured.predict(windows).items():
+            off = by_band(errors(predicted, windows).distance_m[:, -1], windows)
+            for band, median in off.items():
+                figures = bands[band]
+                if model == "car":
+                    figures["windows" if length == "one_second" else f"{length}_windows"] = median.windows
+                    figures.setdefault("episodes", median.episodes)
+                else:
+                    figures = figures.setdefault(model, {})
+                figures[f"{length}_error_m"] = median.error_m
+                figures[f"{length}_interval_m"] = median.interval_m
+    return {"bands": bands}
+
+
+def show(version: int, name: str, figures: dict[str, Any]) -> str:
+    """Return the figures of one version as a table."""
+    head = (f"version {version}, car={name}: median error (m)", *MODELS, "interval of the car", "windows")
+    rows = []
+    for length in LENGTHS:
+        for band, of in figures["bands"].items():
+            if of["windows"]:
+                low, high = of[f"{length}_interval_m"] or (None, None)
+                each = (of, of["formula"], of["bicycle"])
+                rows.append(
+                    (
+                        f"{length.replace('_', ' ')}, {band}",
+                        *(number(one[f"{length}_error_m"], 3) for one in each),
+                        f"{number(low, 3)} to {number(high, 3)}",
+                        number(of["windows" if length == "one_second" else f"{length}_windows"]),
+                    )
+                )
+    return table(head, rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print and draw."""
     parser = benchmark_parser("fidelity", __doc__, None)
-    parser.add_argument("--traces", type=Path, required=True, help="a folder of recorded drives, or one file")
+    parser.add_argument(
+        "--traces", type=Path, nargs="+", required=True, help="folders, files or archives of recorded drives"
+    )
     parser.add_argument(
         "--held-out", action="store_true", help="only the iterations that calibrate does not fit to"
     )
-    parser.add_argument("--car", default="deepracer", help="the simulated car (an option of conf/car)")
-    parser.add_argument("--threads", type=int, default=0, help="physics threads; 0: one per core")
+    parser.add_argument("--car", help="one simulated car for all (an option of conf/car)")
     parser.add_argument(
         "--figures", type=Path, help="also draw the figures of docs/fidelity.md into this folder"
     )
     options = parser.parse_args(arguments)
     try:
-        car = car_named(options.car)
-        recording = read_recording(options.traces)
-        for problem in recording.problems:
-            print(problem, file=sys.stderr)
-        recorded = recording.steps
-        figures = measure(car, recorded, options.held_out, options.threads)
-    except (BadInput, RunFailed) as error:
+        if options.car is not None:
+            car_named(options.car)
+        recorded = read_recorded(options.traces)
+        versions, drawn = {}, []
+        for one in recorded:
+            print(describe(one))
+        for version in sorted({one.version for one in recorded}):
+            mine = [one for one in recorded if one.version == version]
+            measured = prepare(options.car or f"deepracer_v{version}", mine)
+            figures = measure(measured, mine, options.held_out)
+            print(f"\n{show(version, measured.name, figures)}", flush=True)
+            versions[str(version)] = {
+                "car": measured.name,
+                "observer": measured.fitted.observer._asdict(),
+                "formula_values": measured.formula._asdict(),
+                **figures,
+                "recordings": {
+                    one.name: {
+                        "version_stated": one.stated,
+                        "windows_left_out": one.windows["one_second"].left_out,
+                        **measure(measured, [one], options.held_out),
+                    }
+                    for one in mine
+                },
+            }
+            drawn.append((version, measured, mine))
+    except BadInput as error:
         print(error, file=sys.stderr)
         return error.exit_code
-    print(show(figures))
-    write_json(options.json, {**figures, "held_out": options.held_out, "car_name": options.car})
+    write_json(options.json, {"versions": versions, "held_out": options.held_out})
     if options.figures is not None:
         from benchmarks.fidelity_figures import draw
 
-        for path in draw(car, recorded, options.figures):
+        for path in draw(drawn, options.figures):
             print(path)
     return 0
 

@@ -1,5 +1,6 @@
-"""The figures of docs/fidelity.md: the recorded and the simulated car, sent the same actions."""
+"""The figures of docs/fidelity.md: recorded laps and simulated ones, and what the errors look like."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -8,101 +9,60 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from benchmarks.calibrate import FIT_STEPS, REPORT_STEPS, held_out
-from benchmarks.replay import WARM_UP_STEPS, Windows, cut_windows, replay
-from deepracer_exp.config.car import CarConfig
+from benchmarks.fidelity import Measured
+from benchmarks.recorded import BANDS, LENGTHS, Recorded, held_out, in_band, join
+from benchmarks.replay import WARM_UP_STEPS, cut_windows, errors, replay
 
 Floats = NDArray[np.float64]
 RECORDED, SIMULATED, FAINT = "#d9822b", "#2f6fb5", "#7b828c"
-LEAST = 15
-"""A median of fewer rows is not drawn."""
+COLOURS = {"low": "#5aa469", "middle": "#2f6fb5", "high": "#b5432f"}
+_PERIOD_S = 1.0 / 15.0
+_LEAST = 20
+"""Fewer windows are not drawn."""
+_BINS = 9
+
+Drawn = Sequence[tuple[int, Measured, Sequence[Recorded]]]
 
 
-def draw(car: CarConfig, recorded: pd.DataFrame, folder: Path) -> list[Path]:
+def draw(versions: Drawn, folder: Path) -> list[Path]:
     """Draw all figures into the folder and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    windows = cut_windows(recorded, car.front_point_m, REPORT_STEPS)
-    windows = windows.choose(held_out(windows.iteration))
-    motions = {"recorded": Motion(windows.start, windows.truth, windows, car.control_period_s)}
-    motions["simulated"] = Motion(
-        windows.start, replay(car, windows, threads=0), windows, car.control_period_s
-    )
-    figures = {
-        "fidelity_laps.png": _laps(car, recorded),
-        "fidelity_steady.png": _steady(motions),
-        "fidelity_lags.png": _lags(motions, car.control_period_s),
-    }
+    figures = {"fidelity_laps.png": _laps(versions), "fidelity_residuals.png": _residuals(versions)}
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=110, bbox_inches="tight")
         plt.close(figure)
     return [folder / name for name in figures]
 
 
-class Motion:
-    """What poses after each step tell of speed and curvature, with how long the action had been held."""
-
-    def __init__(self, start: Floats, after: Floats, windows: Windows, period_s: float) -> None:
-        """Take starts, (M, 3), and poses after each step, (M, S, 3)."""
-        pose = np.concatenate([start[:, None], after], axis=1)
-        moved = np.diff(pose, axis=1)
-        turned = np.remainder(moved[..., 2] + np.pi, 2.0 * np.pi) - np.pi
-        distance = np.hypot(moved[..., 0], moved[..., 1])
-        self.speed_mps: Floats = distance / period_s
-        self.rate_radps: Floats = turned / period_s
-        action = windows.action
-        self.commanded_mps, self.steering_deg = (
-            action[:, WARM_UP_STEPS:, 0],
-            np.degrees(action[:, WARM_UP_STEPS:, 1]),
-        )
-        self.speed_held, self.steering_held = (_held(action[..., i])[:, WARM_UP_STEPS:] for i in (0, 1))
-        self.standing = windows.standing
-
-    def curvature(self, of: NDArray[np.bool_]) -> Floats:
-        """Return the curvature in 1/m, left positive, of the chosen rows."""
-        curvature: Floats = self.rate_radps[of] / np.maximum(self.speed_mps[of], 0.05)
-        return curvature
-
-
-def _held(action: Floats) -> NDArray[np.int64]:
-    """For how many steps, this one included, an action, (M, S), has been the same."""
-    held = np.ones(action.shape, np.int64)
-    for step in range(1, action.shape[1]):
-        held[:, step] = np.where(action[:, step] == action[:, step - 1], held[:, step - 1] + 1, 1)
-    return held
-
-
-def _laps(car: CarConfig, recorded: pd.DataFrame) -> plt.Figure:
-    """Draw the fastest laps of the last three held-out iterations, the simulated car put back every three seconds."""
-    held = recorded[held_out(recorded["iteration"].to_numpy())]
-    of = ["stream", "worker", "iteration", "episode"]
-    episodes = held.groupby(of, sort=False, observed=True)
-    laps = episodes.agg(rows=("steps", "size"), progress=("progress", "max")).reset_index()
-    # Complete laps before others, then the shortest.
-    laps = laps.sort_values(["progress", "rows"], ascending=[False, True]).drop_duplicates("iteration")
-    laps = laps.sort_values("iteration").tail(3)
-    figure, axes = plt.subplots(1, len(laps), figsize=(4.6 * len(laps), 3.6), squeeze=False)
-    for axis, (_, lap) in zip(axes[0], laps.iterrows(), strict=True):
-        rows = held[(held[of] == list(lap[of])).all(axis=1)]
-        yaw = np.radians(rows["yaw"])
+def _laps(versions: Drawn) -> plt.Figure:
+    """Draw the fastest held-out episode of each version, the simulated car put back every three seconds."""
+    figure, axes = plt.subplots(1, len(versions), figsize=(4.6 * len(versions), 3.8), squeeze=False)
+    for axis, (version, measured, recorded) in zip(axes[0], versions, strict=True):
+        # The recording with most rows; of its episodes, complete laps before others, then the shortest.
+        one = max(recorded, key=lambda each: len(each.steps))
+        steps = one.steps[held_out(one.steps["iteration"].to_numpy())]
+        of = ["stream", "worker", "iteration", "episode"]
+        episodes = steps.groupby(of, sort=False, observed=True)
+        laps = episodes.agg(rows=("steps", "size"), progress=("progress", "max")).reset_index()
+        lap = laps.sort_values(["progress", "rows"], ascending=[False, True]).iloc[0]
+        rows = steps[(steps[of] == list(lap[of])).all(axis=1)]
+        car, yaw = measured.fitted.car, np.radians(rows["yaw"])
         origin = [rows[c] - car.front_point_m * turn(yaw) for c, turn in (("X", np.cos), ("Y", np.sin))]
         axis.plot(*origin, color=RECORDED, lw=2.6)
-        # With the end of the episode before, which tells how the wheels stand at the start.
-        begins = int(recorded.index.get_loc(rows.index[0]))
-        known = recorded.iloc[max(0, begins - WARM_UP_STEPS) : begins + len(rows)]
-        # The first row is the prepare step. A rest shorter than a third of a piece is not drawn.
-        for begin in range(1, len(rows) - FIT_STEPS, REPORT_STEPS):
-            steps = min(REPORT_STEPS, len(rows) - 1 - begin)
-            windows = cut_windows(known, car.front_point_m, steps)
-            piece = windows.choose(np.array([(begin - 1) // WARM_UP_STEPS]))
-            path = np.vstack([piece.start, replay(car, piece)[0]])
-            axis.plot(*path[:, :2].T, color=SIMULATED, lw=1.4)
-            axis.plot(*path[0, :2], "o", color=SIMULATED, ms=4)
+        for begin in range(0, len(rows) - LENGTHS["one_second"], LENGTHS["three_second"]):
+            ahead = min(LENGTHS["three_second"], len(rows) - begin - 2)
+            piece = cut_windows(rows.iloc[max(0, begin - WARM_UP_STEPS) :], car.front_point_m, ahead)
+            piece = piece.choose(np.arange(len(piece)) == (begin > 0))
+            if len(piece):
+                path = np.vstack([piece.start, replay(car, piece, measured.fitted.observer)[0]])
+                axis.plot(*path[:, :2].T, color=SIMULATED, lw=1.4)
+                axis.plot(*path[0, :2], "o", color=SIMULATED, ms=4)
         axis.set_aspect("equal")
-        axis.set_title(f"iteration {lap['iteration']}, episode {lap['episode']}", fontsize=10)
+        seconds = np.ptp(rows["tstamp"].to_numpy())
+        mps = np.hypot(np.diff(origin[0]), np.diff(origin[1])).sum() / max(seconds, _PERIOD_S)
+        axis.set_title(f"version {version}, {mps:.1f} m/s on average", fontsize=10)
         axis.set_xlabel("x (m)")
     axes[0][0].set_ylabel("y (m)")
     names = (("recorded", RECORDED), ("simulated, put back onto the recording every 3 s (dots)", SIMULATED))
@@ -112,104 +72,66 @@ def _laps(car: CarConfig, recorded: pd.DataFrame) -> plt.Figure:
     return figure
 
 
-def _steady(motions: dict[str, Motion]) -> plt.Figure:
-    """Draw how a commanded speed is reached, and curvature by steering and by speed."""
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12.5, 3.6))
-    angles = (-30, -20, -10, 0, 10, 20, 30)
-    bins = np.arange(0.3, 2.2, 0.2)
-    for (name, motion), color in zip(motions.items(), (RECORDED, SIMULATED), strict=True):
-        for speed, style in ((2.0, "-"), (1.0, "--")):
-            points = []
-            for steps in range(1, 21):
-                of = (np.abs(motion.commanded_mps - speed) < 0.05) & (motion.speed_held == steps)
-                if (q := _quartiles(motion.speed_mps[of])) is not None:
-                    points.append((steps, q[1]))
-            left.plot(*np.array(points).reshape(-1, 2).T, style, color=color, lw=1.8)
-        shift = 0.02 if name == "simulated" else -0.02
-        turning = [
-            (a, q)
-            for a in angles
-            if (
-                q := _quartiles(
-                    motion.curvature((np.abs(motion.steering_deg - a) < 1) & (motion.steering_held >= 6))
-                )
-            )
-            is not None
-        ]
-        _bars(middle, [a + 15 * shift for a, _ in turning], [q for _, q in turning], color, "o-")
-        full = (np.abs(motion.steering_deg) > 29) & (motion.steering_held >= 6)
-        by_speed = []
-        for low in bins:
-            inside = full & (motion.speed_mps >= low) & (motion.speed_mps < low + 0.2)
-            q = _quartiles(np.sign(motion.steering_deg[inside]) * motion.curvature(inside))
-            if q is not None:
-                by_speed.append((low + 0.1, q))
-        _bars(right, [s + 0.5 * shift for s, _ in by_speed], [q for _, q in by_speed], color, "o-")
-    for speed, style in ((2, "-"), (1, "--")):
-        left.axhline(speed, color=FAINT, lw=0.6, ls=":")
-        left.plot([], [], style, color=FAINT, label=f"commanded {speed} m/s")
-    left.set(xlabel="steps for which the speed has been commanded", ylabel="speed (m/s)", title="median")
-    middle.axhline(0, color=FAINT, lw=0.6)
-    middle.set(
-        xlabel="steering (degrees)", ylabel="curvature (1/m)", title="steering held for 6 steps or more"
+def _residuals(versions: Drawn) -> plt.Figure:
+    """Draw, by band: the error as it grows, its distribution ahead and to the left, and both by what was commanded."""
+    columns = (
+        "error as it grows",
+        "after 1 s: ahead and to the left",
+        "to the left, by steering",
+        "ahead, by speed",
     )
-    right.set(xlabel="speed (m/s)", ylabel="curvature (1/m)", title="30 degrees held for 6 steps or more")
-    right.set_ylim(bottom=0)
-    left.legend(frameon=False, fontsize=9)
-    _legend(middle, [("recorded", RECORDED), ("simulated", SIMULATED)])
-    for axis in (left, middle, right):
-        axis.title.set_fontsize(10)
+    figure, axes = plt.subplots(len(versions), 4, figsize=(15, 3.3 * len(versions)), squeeze=False)
+    for row, (version, measured, recorded) in zip(axes, versions, strict=True):
+        windows = join([one.part(True) for one in recorded])
+        car, observer = measured.fitted.car, measured.fitted.observer
+        off = errors(replay(car, windows, observer), windows)
+        yaw = windows.truth[:, -1, 2]
+        x_m, y_m = off.x_m[:, -1], off.y_m[:, -1]
+        ahead_m, left_m = np.cos(yaw) * x_m + np.sin(yaw) * y_m, np.cos(yaw) * y_m - np.sin(yaw) * x_m
+        action = windows.action[:, WARM_UP_STEPS:]
+        steering_deg, speed_mps = np.degrees(action[..., 1].mean(axis=1)), action[..., 0].mean(axis=1)
+        time_s = np.arange(1, windows.steps + 1) * _PERIOD_S
+        for band in BANDS:
+            of, color = in_band(windows, band), COLOURS[band]
+            if of.sum() < _LEAST:
+                continue
+            low, middle, high = np.quantile(off.distance_m[of], [0.25, 0.5, 0.75], axis=0)
+            row[0].plot(time_s, middle, color=color, label=f"{band}: {of.sum()} windows")
+            row[0].fill_between(time_s, low, high, color=color, alpha=0.15, lw=0)
+            row[1].plot(left_m[of], ahead_m[of], ".", color=color, ms=2, alpha=0.5)
+            _binned(row[2], steering_deg[of], left_m[of], color)
+            _binned(row[3], speed_mps[of], ahead_m[of], color)
+        row[0].set(xlabel="seconds", ylabel=f"version {version}: metres", ylim=(0, None))
+        row[0].legend(frameon=False, fontsize=8)
+        row[1].set(xlim=(-0.5, 0.5), ylim=(-0.3, 0.3), xlabel="to the left (m)", ylabel="ahead (m)")
+        row[2].set(xlabel="mean steering (degrees)", ylabel="to the left (m)", ylim=(-0.3, 0.3))
+        row[3].set(xlabel="mean commanded speed (m/s)", ylabel="ahead (m)", ylim=(-0.2, 0.2))
+        for axis in row[1:]:
+            axis.axhline(0, color=FAINT, lw=0.6)
+    for axis, title in zip(axes[0], columns, strict=True):
+        axis.set_title(title, fontsize=10)
     figure.tight_layout()
     return figure
 
 
-def _lags(motions: dict[str, Motion], period_s: float) -> plt.Figure:
-    """Draw the speed after a standing start, and curvature as steering is held."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6))
-    for motion, color in zip(motions.values(), (RECORDED, SIMULATED), strict=True):
-        starts = motion.speed_mps[motion.standing][:, :25]
-        time = (np.arange(starts.shape[1]) + 0.5) * period_s
-        low, mid, high = np.quantile(starts, [0.25, 0.5, 0.75], axis=0)
-        left.plot(time, mid, color=color, lw=1.8)
-        left.fill_between(time, low, high, color=color, alpha=0.15, lw=0)
-        for angle, style in ((30, "-"), (20, "--"), (10, ":")):
-            points = []
-            for steps in range(1, 13):
-                of = (np.abs(np.abs(motion.steering_deg) - angle) < 1) & (motion.steering_held == steps)
-                q = _quartiles(np.sign(motion.steering_deg[of]) * motion.curvature(of))
-                if q is not None:
-                    points.append((steps, q[1]))
-            right.plot(*np.array(points).reshape(-1, 2).T, style, color=color, lw=1.8)
-    left.set(xlabel="seconds after a standing start", ylabel="speed (m/s)", title="median and middle half")
-    left.set_ylim(bottom=0)
-    right.set(
-        xlabel="steps for which the steering has been held",
-        ylabel="curvature (1/m)",
-        title="towards the steered side, median",
-    )
-    _legend(left, [("recorded", RECORDED), ("simulated", SIMULATED)])
-    for angle, style in ((30, "-"), (20, "--"), (10, ":")):
-        right.plot([], [], style, color=FAINT, label=f"{angle} degrees")
-    right.legend(frameon=False, fontsize=9)
-    for axis in (left, right):
-        axis.title.set_fontsize(10)
-    figure.tight_layout()
-    return figure
-
-
-def _quartiles(values: Floats) -> Floats | None:
-    return np.quantile(values, [0.25, 0.5, 0.75]) if len(values) >= LEAST else None
-
-
-def _bars(axis: Axes, at: list[float], quartiles: list[Floats], color: str, style: str) -> None:
-    """Draw medians with bars over the middle half."""
-    if at:
-        low, mid, high = np.array(quartiles).T
+def _binned(axis: plt.Axes, at: Floats, values: Floats, color: str) -> None:
+    """Draw medians and the middle half of the values in bins with as many windows each."""
+    edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
+    number = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, max(len(edges) - 2, 0))
+    points = [
+        (np.median(at[number == one]), *np.quantile(values[number == one], [0.25, 0.5, 0.75]))
+        for one in np.unique(number)
+        if (number == one).sum() >= _LEAST
+    ]
+    if points:
+        place, low, middle, high = np.array(points).T
         axis.errorbar(
-            at, mid, yerr=[mid - low, high - mid], fmt=style, color=color, ms=4, lw=1.2, elinewidth=0.9
+            place,
+            middle,
+            yerr=[middle - low, high - middle],
+            fmt="o-",
+            color=color,
+            ms=3,
+            lw=1.0,
+            elinewidth=0.8,
         )
-
-
-def _legend(axis: Axes, entries: list[tuple[str, str]]) -> None:
-    lines = [axis.plot([], [], color=color, lw=2, label=name)[0] for name, color in entries]
-    axis.legend(handles=lines, frameon=False, fontsize=9)

@@ -48,6 +48,8 @@ class Windows:
     episode before: putting the car down does not turn its wheels straight."""
     iteration: NDArray[np.int64]
     """The iteration that a window is from, (M,)."""
+    episode: NDArray[np.int64]
+    """The episode that it is from, numbered within the recording, (M,)."""
     left_out: int = 0
     """Windows that were cut away because the car was paused or put elsewhere during them or their warm-up."""
 
@@ -78,16 +80,20 @@ class Windows:
             self.first[chosen],
             self.standing[chosen],
             self.iteration[chosen],
+            self.episode[chosen],
         )
 
 
-def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Windows:
-    """Cut every episode into windows of `steps` that begin every 15 rows, the first where the car begins to move.
+def cut_windows(
+    recorded: pd.DataFrame, front_point_m: float, steps: int, every: int = WARM_UP_STEPS
+) -> Windows:
+    """Cut every episode into windows of `steps`: where the car begins to move, and from a whole warm-up later on.
 
     Args:
         recorded: the steps of a `deepracer.recording.Recording`.
         front_point_m: how far the recorded point is ahead of the chassis origin.
         steps: control steps to predict.
+        every: rows from one window to the next.
 
     Returns:
         The windows in the order of the recording, without those in which, warm-up included, the car was paused or put
@@ -105,13 +111,16 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
     rows: list[Ids] = []
     first: list[int] = []
     standing: list[bool] = []
+    episode: list[int] = []
     left_out = 0
     end_of_last, last_car = np.zeros(0, np.intp), None
-    for (stream, worker, _, _), places in recorded.groupby(
+    episodes = recorded.groupby(
         ["stream", "worker", "iteration", "episode"], sort=False, observed=True
-    ).indices.items():
+    ).indices
+    for number, ((stream, worker, _, _), places) in enumerate(episodes.items()):
         car = stream, worker
-        for at in range(_FIRST_MOVING_ROW, len(places) - steps, WARM_UP_STEPS):
+        under_way = range(_FIRST_MOVING_ROW + WARM_UP_STEPS, len(places) - steps, every)
+        for at in (_FIRST_MOVING_ROW, *under_way) if len(places) > _FIRST_MOVING_ROW + steps else ():
             ahead = places[at : at + steps + 1]
             stands = at == _FIRST_MOVING_ROW
             if stands:
@@ -128,6 +137,7 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
             rows.append(np.concatenate([np.full(missing, known[0]), known]))
             first.append(missing)
             standing.append(stands)
+            episode.append(number)
         end_of_last, last_car = places[_FIRST_MOVING_ROW:][-WARM_UP_STEPS:], car
     at_rows = np.array(rows, np.intp).reshape(len(rows), WARM_UP_STEPS + 1 + steps)
     return Windows(
@@ -137,6 +147,7 @@ def cut_windows(recorded: pd.DataFrame, front_point_m: float, steps: int) -> Win
         first=np.array(first, np.intp),
         standing=np.array(standing, bool),
         iteration=recorded["iteration"].to_numpy(np.int64)[at_rows[:, -1]],
+        episode=np.array(episode, np.int64),
         left_out=left_out,
     )
 
@@ -194,8 +205,8 @@ class Observer(NamedTuple):
     steering_per_turn: float
 
 
-OBSERVER = Observer(0.33, 0.7, 0.04, 0.9, 0.04, 0.07)
-"""Found together with the car of conf/car/deepracer.yaml, on the same windows."""
+OBSERVER = Observer(0.33, 0.7, 2.7, 0.7, 0.06, 0.08)
+"""Where a fit of an observer to a car and its recordings begins."""
 
 
 class Errors(NamedTuple):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks import fidelity
-from benchmarks.calibrate import car_named
 from benchmarks.fidelity import Formula, bicycle, fit_formula
-from benchmarks.replay import WARM_UP_STEPS, Windows, errors
+from benchmarks.recorded import BANDS, car_named
+from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, errors
 
 CAR = car_named("deepracer")
-TRACES = Path(__file__).parents[3] / "shared/reference/console_training/sim-trace"
+RACE_PACE = Path(__file__).parents[3] / "shared/reference/race_pace"
 
 
 def windows(count: int, steps: int = 15) -> Windows:
@@ -24,9 +24,11 @@ def windows(count: int, steps: int = 15) -> Windows:
         action=np.stack(
             [rng.choice([1.0, 2.0], (count, rows)), rng.choice([-0.5, 0.0, 0.3], (count, rows))], axis=-1
         ),
+        duration_s=np.full((count, rows), PERIOD_S),
         first=np.full(count, WARM_UP_STEPS),
         standing=np.full(count, True),
         iteration=np.arange(count),
+        episode=np.arange(count),
     )
 
 
@@ -60,32 +62,26 @@ def test_fitting_the_formula_finds_the_formula_that_drove():
     assert found.rate_lag_s == pytest.approx(0.3, rel=0.02)
 
 
-@pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of the AWS console are not here")
-def test_the_benchmark_reports_the_documented_figures_for_any_folder_and_draws(tmp_path, capsys):
+@pytest.mark.skipif(not RACE_PACE.is_dir(), reason="the recordings of the service are not here")
+def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_drawn(tmp_path, capsys):
     file = tmp_path / "figures.json"
-    arguments = ["--traces", str(TRACES / "evaluation"), "--json", str(file), "--threads", "1"]
-    assert fidelity.main(arguments) == 0
-    told = json.loads(file.read_text())
-    assert 0 < told["one_second_error_m"] < 0.08
-    assert told["one_second_error_m"] < told["three_second_error_m"]
-    assert told["one_second_error_m"] < 0.2 * told["bicycle"]["one_second_error_m"]["all"]
-    count = told["one_second_windows"]
-    assert count["all"] == count["under_way"] + count["standing"]
-    assert "standing" in capsys.readouterr().out
-
-
-@pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of the AWS console are not here")
-def test_figures_are_drawn_of_what_is_held_out(tmp_path):
-    traces = TRACES / "training/training-simtrace"
-    for iteration in (10, 11):
-        (tmp_path / f"{iteration}-iteration.csv").write_text(
-            (traces / f"{iteration}-iteration.csv").read_text()
-        )
-    assert (
-        fidelity.main(["--traces", str(tmp_path), "--figures", str(tmp_path / "figures"), "--threads", "1"])
-        == 0
-    )
-    assert len(list((tmp_path / "figures").glob("fidelity_*.png"))) == 3
+    names = ("console_v5_reinvent_base.log.gz", "drfc_v5_FS_June2020.log.gz", "droa_v6_training.tar.gz")
+    arguments = ["--traces", *(str(RACE_PACE / name) for name in names), "--held-out", "--json", str(file)]
+    assert fidelity.main([*arguments, "--figures", str(tmp_path / "figures")]) == 0
+    told = json.loads(file.read_text())["versions"]
+    assert {version: of["car"] for version, of in told.items()} == {"5": "deepracer_v5", "6": "deepracer_v6"}
+    five = told["5"]
+    assert set(five["bands"]) == {*BANDS, "all"}
+    for band in BANDS:
+        of = five["bands"][band]
+        assert 0 < of["one_second_error_m"] < of["three_second_error_m"]
+        low, high = of["one_second_interval_m"]
+        assert low < of["one_second_error_m"] < high
+        assert of["one_second_error_m"] < 0.5 * of["bicycle"]["one_second_error_m"]
+        assert of["windows"] == sum(one["bands"][band]["windows"] for one in five["recordings"].values())
+    assert set(five["recordings"]) == set(names[:2])
+    assert len(list((tmp_path / "figures").glob("fidelity_*.png"))) == 2
+    assert "version 6, car=deepracer_v6" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
