@@ -28,6 +28,7 @@ from benchmarks.recorded import (
     car_named,
     describe,
     join,
+    mean_speed_mps,
     read_recorded,
     sample,
 )
@@ -42,7 +43,8 @@ Floats = NDArray[np.float64]
 LEAST_WINDOWS = 20
 _FITTED_AT = (4, 9, 14)
 """After a third, two thirds and the whole of a second."""
-_POSITION_SCALE_M = 0.03
+_POSITION_SCALE_M, _POSITION_SCALE_S = 0.02, 0.006
+"""Errors count in shares of the first and of the second times the mean commanded speed: they grow with it."""
 _HEADING_ARM_M = 0.1
 """A radian of heading counts as much as this distance."""
 _BLOWN_UP = 200.0
@@ -113,8 +115,8 @@ def fit(
 ) -> Fit:
     """Return the car and observer that predict the windows best.
 
-    A weak prior holds every parameter around where it begins: a step away counts as much as an error of 3 cm at one of
-    the three points of time of one window. A parameter for which the recordings say less than that is set back, and the
+    A weak prior holds every parameter around where it begins: a step away counts as much as an error of 3 to 4 cm at
+    one of the three points of time of one window. A parameter for which the recordings say less than that is set back, and the
     others are fitted again.
 
     Args:
@@ -204,7 +206,8 @@ def _from_scale(parameter: Parameter, value: float) -> float:
 def _residuals(car: CarConfig, observer: Observer, windows: Windows) -> Floats:
     off, at = errors(replay(car, windows, observer), windows), np.array(_FITTED_AT)
     parts = [off.x_m[:, at], off.y_m[:, at], _HEADING_ARM_M * off.yaw_rad[:, at]]
-    found = np.concatenate([part.ravel() for part in parts]) / _POSITION_SCALE_M
+    scale_m = _POSITION_SCALE_M + _POSITION_SCALE_S * mean_speed_mps(windows)
+    found = np.concatenate([(part / scale_m[:, None]).ravel() for part in parts])
     limited: Floats = np.clip(np.nan_to_num(found, nan=_BLOWN_UP), -_BLOWN_UP, _BLOWN_UP)
     return limited
 

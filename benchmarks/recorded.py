@@ -148,10 +148,16 @@ def join(parts: Sequence[Windows]) -> Windows:
     return Windows(**columns, episode=np.concatenate(apart), left_out=sum(part.left_out for part in parts))
 
 
+def mean_speed_mps(windows: Windows) -> Floats:
+    """Return the mean speed that is commanded in each window."""
+    mean: Floats = windows.action[:, WARM_UP_STEPS:, 0].mean(axis=1)
+    return mean
+
+
 def in_band(windows: Windows, band: str) -> Mask:
     """Say of each window whether its mean commanded speed is in a band."""
     low, high = BANDS[band]
-    mean_mps = windows.action[:, WARM_UP_STEPS:, 0].mean(axis=1)
+    mean_mps = mean_speed_mps(windows)
     inside: Mask = (mean_mps >= low) & (mean_mps < high)
     return inside
 
