@@ -5,8 +5,8 @@ import dataclasses
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
-import mujoco.batch
 import numpy as np
 import torch
 
@@ -16,6 +16,7 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.rewards.source import load_reward_source, source_with_constants
+from deepracer_exp.sim.batch import CarBatch
 
 PASS_STEPS = 150
 """Control steps of one pass: 10 s, several episodes of random driving."""
@@ -46,17 +47,16 @@ class SameDriving:
     def __init__(self, experiment: Experiment, n_cars: int):
         """Drive the pass once to write down each step's state."""
         setup = scalar_setup(experiment)
-        self.substeps = setup.car.substeps
         self._env = RaceEnv(Race(setup, n_cars, threads=1))
         torch.manual_seed(experiment.seed)
         self._actions = [self._env.action_spec.rand() for _ in range(PASS_STEPS)]
-        cars = self._env.race._batch
-        self._physics = cars._batch
-        noting = _Noting(self._physics)
-        cars._batch = noting
+        race = self._env.race
+        self._cars = race._batch
+        noting = _Noting(self._cars)
+        race._batch = noting  # type: ignore[assignment]
         self.env_pass_s()
-        cars._batch = self._physics
-        self._before, self._last = noting.before, noting.after
+        race._batch = self._cars
+        self._noted, self._last = noting.noted, noting.after
 
     @property
     def car_steps(self) -> int:
@@ -74,31 +74,40 @@ class SameDriving:
         return time.perf_counter() - began
 
     def physics_pass_s(self) -> float:
-        """Return the seconds of the pass inside `Batch.step` alone.
+        """Return the seconds of the pass inside `CarBatch.drive` alone.
 
         Raises:
             AssertionError: the cars did not end where the environment's did.
         """
-        physics, rows, substeps = self._physics, self._physics.state, self.substeps
         seconds = 0.0
-        for before in self._before:
-            rows[:] = before
+        for before, command in self._noted:
+            self._cars.state = before
             began = time.perf_counter()
-            physics.step(nstep=substeps)
+            self._cars.drive(**command)
             seconds += time.perf_counter() - began
-        assert np.array_equal(rows, self._last), "the physics alone drove another way than the environment"
+        assert np.array_equal(self._cars.state, self._last), (
+            "the physics drove another way than the environment"
+        )
         return seconds
 
 
 class _Noting:
-    """A batch that notes the state in which each of its steps begins, and in which the last one ended."""
+    """Cars that note the state in which each of their steps begins, its command, and the state after the last one."""
 
-    def __init__(self, batch: mujoco.batch.Batch):
-        self._batch = batch
-        self.before: list[np.ndarray] = []
+    def __init__(self, cars: CarBatch):
+        self._cars = cars
+        self.noted: list[tuple[np.ndarray, dict[str, Any]]] = []
         self.after: np.ndarray
 
-    def step(self, nstep: int) -> None:
-        self.before.append(self._batch.state.copy())
-        self._batch.step(nstep=nstep)
-        self.after = self._batch.state.copy()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._cars, name)
+
+    def drive(self, speed_mps: np.ndarray, steering_rad: np.ndarray, moving: np.ndarray) -> None:
+        command = {
+            "speed_mps": speed_mps.copy(),
+            "steering_rad": steering_rad.copy(),
+            "moving": moving.copy(),
+        }
+        self.noted.append((self._cars.state, command))
+        self._cars.drive(**command)
+        self.after = self._cars.state

@@ -4,9 +4,9 @@
 
 A step is one control step (1/15 s) of one car. Everything is the default experiment unless overridden.
 
-- `physics_steps_per_s`: `mujoco.batch.Batch.step(nstep=substeps)` alone, one thread, 256 cars. The batch is given the
-  very commands and starts of the next figure's driving and is checked to end in the same state; only the time inside
-  the call counts.
+- `physics_steps_per_s`: `CarBatch.drive` alone, tyres and MuJoCo, one thread, 256 cars. It is given the very commands
+  and starts of the next figure's driving and is checked to end in the same state; only the time inside the call
+  counts.
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
   experiment's without its `reward_batch`), episodes begun anew as they end.
 - `all_tracks_over_one_env` (a ratio): the same on eighteen tracks at once, over the figure on one track.

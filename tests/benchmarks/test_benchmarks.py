@@ -39,7 +39,7 @@ def test_bare_physics_and_environment_drive_the_same_way_every_time(experiment: 
         ended.append(same._env.race.state_arrays()["physics_state"])
         assert same.physics_pass_s() > 0  # asserts the state it ends in
     assert (ended[0] == ended[1]).all()
-    assert len(same._before) == PASS_STEPS
+    assert len(same._noted) == PASS_STEPS
 
 
 def test_the_scalar_reward_is_the_experiments_without_its_batch_form(experiment: Experiment) -> None:
