@@ -116,8 +116,8 @@ def fit(
     """Return the car and observer that predict the windows best.
 
     A weak prior holds every parameter around where it begins: a step away counts as much as an error of 3 to 4 cm at
-    one of the three points of time of one window. A parameter for which the recordings say less than that is set back, and the
-    others are fitted again.
+    one of the three points of time of one window. A parameter for which the recordings say less than that is set back,
+    and the others are fitted again.
 
     Args:
         car: where to begin; what is not fitted stays.
