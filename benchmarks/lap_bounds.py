@@ -122,7 +122,8 @@ def _resampled(line: Floats) -> Floats:
 def _time_s(line: Floats, turns: Cornering) -> float:
     before, after = np.roll(line, 1, axis=0), np.roll(line, -1, axis=0)
     a, b, c = (np.hypot(*(p - q).T) for p, q in ((before, line), (line, after), (before, after)))
-    twice_area = np.abs(np.cross(line - before, after - before))
+    (ux, uy), (wx, wy) = (line - before).T, (after - before).T
+    twice_area = np.abs(ux * wy - uy * wx)
     # Menger curvature of three neighbouring points, smoothed over as many.
     curvature = 2.0 * twice_area / np.maximum(a * b * c, 1e-12)
     curvature = (np.roll(curvature, 1) + curvature + np.roll(curvature, -1)) / 3.0
