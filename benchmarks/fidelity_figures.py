@@ -116,12 +116,12 @@ def _residuals(versions: Drawn) -> plt.Figure:
 
 def _binned(axis: plt.Axes, at: Floats, values: Floats, color: str) -> None:
     """Draw medians and the middle half of the values in bins with as many windows each."""
-    edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
+    edges = np.unique(np.quantile(at, np.linspace(0, 1, min(_BINS, len(at) // _LEAST) + 1)))
     number = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, max(len(edges) - 2, 0))
     points = [
         (np.median(at[number == one]), *np.quantile(values[number == one], [0.25, 0.5, 0.75]))
         for one in np.unique(number)
-        if (number == one).sum() >= _LEAST
+        if (number == one).sum() >= _LEAST // 2
     ]
     if points:
         place, low, middle, high = np.array(points).T
