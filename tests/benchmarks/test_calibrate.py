@@ -296,7 +296,7 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
         (["--traces", "few", "--output", "missing/car.yaml"], "--output missing/car.yaml: cannot be written"),
         (["--traces", "few", "--output", "empty"], "--output empty: cannot be written"),
         (["--traces", "few", "--evaluations", "0"], "--evaluations 0"),
-        (["--traces", "few", "--windows", "4"], "--windows 1"),
+        (["--traces", "few", "--windows", "1"], "--windows 1"),
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_the_fit(
