@@ -12,7 +12,7 @@ above a record says that the simulated car cannot do what a car of the service d
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -130,7 +130,7 @@ def _time_s(line: Floats, turns: Cornering) -> float:
     return float(np.sum(0.5 * (a + b) / turns.speed_at(curvature)))
 
 
-def measure(car: CarConfig, boards: pd.DataFrame) -> list[dict[str, object]]:
+def measure(car: CarConfig, boards: pd.DataFrame) -> list[dict[str, Any]]:
     """Return each world's record and bound."""
     turns, rows, known = cornering(car), [], options_of("track")
     for world, of_world in boards.groupby("world"):
