@@ -336,5 +336,5 @@ def test_an_option_by_itself_that_is_not_there_is_refused_with_the_nearest():
 def test_a_run_of_the_car_of_before_is_refused_with_what_to_do():
     values = compose_entry("train", []).mapping
     values["car"] |= {"contact_time_s": 0.04, "chassis_mass_kg": 5.9811}
-    with pytest.raises(BadInput, match="^car: .* train again$"):
+    with pytest.raises(BadInput, match=r"^car: .* train again$"):
         parse_experiment(values)

@@ -54,7 +54,9 @@ def test_impossible_cars_are_refused(car, change):
 
 def test_the_model_weighs_what_the_links_of_the_published_car_weigh(car):
     # Chassis, shell, camera and its mount, two hinges, four wheels.
-    assert build_model(car).body_mass.sum() == pytest.approx(5 + 0.3 + 2 * 0.34055 + 2 * 0.1 + 4 * 0.34055, abs=1e-3)
+    assert build_model(car).body_mass.sum() == pytest.approx(
+        5 + 0.3 + 2 * 0.34055 + 2 * 0.1 + 4 * 0.34055, abs=1e-3
+    )
 
 
 def test_the_model_turns_about_its_centre_of_mass(car):

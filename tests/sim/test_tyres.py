@@ -12,18 +12,26 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.sim.tyres import GRAVITY_MPS2, _grip
 
-CARS = {name: compose_experiment([f"car={name}"])[0].car for name in ("deepracer_v4", "deepracer_v5", "deepracer_v6")}
+CARS = {
+    name: compose_experiment([f"car={name}"])[0].car
+    for name in ("deepracer_v4", "deepracer_v5", "deepracer_v6")
+}
 CAR = dataclasses.replace(CARS["deepracer_v5"], steering_trim_deg=0.0, min_speed_mps=0.0)
 
 
 def energy_j(cars: CarBatch) -> np.ndarray:
     state, car = cars.read(), cars.car
     lateral = state.lateral_mps + car.com_x_m * state.yaw_rate_radps
-    return 0.5 * car.mass_kg * (state.speed_mps**2 + lateral**2) + 0.5 * car.inertia_kgm2[2] * state.yaw_rate_radps**2
+    return (
+        0.5 * car.mass_kg * (state.speed_mps**2 + lateral**2)
+        + 0.5 * car.inertia_kgm2[2] * state.yaw_rate_radps**2
+    )
 
 
 @given(
-    stiffness=st.floats(1, 5000), limit=st.floats(0.01, 100), slip=st.floats(-20, 20).filter(lambda v: abs(v) > 1e-6)
+    stiffness=st.floats(1, 5000),
+    limit=st.floats(0.01, 100),
+    slip=st.floats(-20, 20).filter(lambda v: abs(v) > 1e-6),
 )
 def test_a_tyres_force_is_the_mean_over_a_turn_of_the_wheel(stiffness, limit, slip):
     turn = (np.arange(20_000) + 0.5) / 20_000 * np.pi / 2
@@ -121,7 +129,9 @@ def drive_wildly(name: str, steps: int, n_cars: int, threads: int) -> CarBatch:
     """Drive cars of every extreme of the randomization: a third at random, the others full lock at 4 m/s."""
     cars = CarBatch(CARS[name], n_cars, threads)
     everyone = np.arange(n_cars)
-    extremes = np.array(list(itertools.product((0.3, 1.5), (0.5, 2.0), (0.4, 1.6), (0.2, 2.0))))[everyone % 16]
+    extremes = np.array(list(itertools.product((0.3, 1.5), (0.5, 2.0), (0.4, 1.6), (0.2, 2.0))))[
+        everyone % 16
+    ]
     cars.set_tyre_friction(everyone, extremes[:, 0] * cars.car.tyre_friction)
     cars.set_mass_scale(everyone, extremes[:, 1])
     cars.set_motor_scale(everyone, extremes[:, 2])
@@ -132,7 +142,9 @@ def drive_wildly(name: str, steps: int, n_cars: int, threads: int) -> CarBatch:
     for step in range(steps):
         speed = np.where(everyone % 3 == 0, rng.uniform(0.1, 4.0, n_cars), 4.0)
         alternating = lock * (1 - 2 * ((step + everyone) % 2))
-        steering = np.choose(everyone % 3, [rng.uniform(-lock, lock, n_cars), np.full(n_cars, lock), alternating])
+        steering = np.choose(
+            everyone % 3, [rng.uniform(-lock, lock, n_cars), np.full(n_cars, lock), alternating]
+        )
         if step % 40 < 4:
             speed = np.where(everyone % 2 == 0, 0.1, speed)
         cars.drive(speed, steering)
