@@ -95,6 +95,12 @@ def _commands():
     return [pytest.param(words, id=f"{page}: {shlex.join(words)}") for words, page in shown.items()]
 
 
+@pytest.fixture(autouse=True)
+def _path_restored(monkeypatch):
+    """Forget the working folder, which a command that names own classes adds to the import path."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Return a working folder with the files that the commands name, among them those of docs/extending.md."""

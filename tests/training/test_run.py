@@ -248,7 +248,8 @@ def test_an_observation_that_is_not_finite_ends_the_run_and_names_the_car(train_
 
     def break_one(self, *arguments):
         features = compute(self, *arguments)
-        calls.append(None)
+        if len(features) == 16:  # new episodes are observed by themselves
+            calls.append(None)
         if len(calls) == 40:
             features[3, 1] = np.nan
         return features
