@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.config.stored import config_differences, describe_differences
+from deepracer_exp.config.stored import ABSENT, config_differences, describe_differences
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput
@@ -25,6 +25,8 @@ HARMLESS = (
 """Keys, or their first parts, that change nothing of what a run learns. `runs_dir` is where the run is found."""
 _MEASURED_BY = "stopping.episodes"
 """Number of episodes behind `lap_share` in every row of metrics.jsonl."""
+REMEMBERED_EPISODES = 50
+"""That number where the stopping rule has none."""
 
 
 def fingerprint(config: Mapping[str, Any], setup: RaceSetup) -> dict[str, Any]:
@@ -53,7 +55,7 @@ def refuse_changes(
     """
     different = config_differences([before["config"], config])
     changed = describe_differences(
-        {key: values for key, values in different.items() if not _is_harmless(key)}
+        {key: values for key, values in different.items() if not _is_harmless(key, values)}
     )
     now = _hashes(setup)
     changed += [f"{file} has other contents" for file in now if now[file] != before["files"].get(file)]
@@ -64,9 +66,9 @@ def refuse_changes(
         )
 
 
-def _is_harmless(key: str) -> bool:
+def _is_harmless(key: str, values: Sequence[Any]) -> bool:
     if key == _MEASURED_BY:
-        return False
+        return len({REMEMBERED_EPISODES if value == ABSENT else value for value in values}) == 1
     return key == "runs_dir" or any(key == part or key.startswith(f"{part}.") for part in HARMLESS)
 
 

@@ -11,11 +11,11 @@ from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Metric, Rank
+from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.tracking.metrics import track_labels, track_metric
 
 TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 """Columns of metrics.jsonl that differ between two runs of the same seed."""
-_REMEMBERED = 50  # of the last episodes, where no stopping rule says how many
 _FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the policy
 
 
@@ -204,7 +204,7 @@ class RunMetrics:
             stopping: its rule says of how many episodes `lap_share` is taken.
         """
         self.track_names = names
-        self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else _REMEMBERED
+        self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else REMEMBERED_EPISODES
         self._book = EpisodeBook(n_cars, len(names), self.remembered, step_s)
         self.labels = track_labels(names) if len(names) > 1 else []
         self._last: list[dict[str, float | None]] = [{} for _ in self.labels]

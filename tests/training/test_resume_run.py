@@ -196,6 +196,22 @@ def test_a_run_ended_by_its_stopping_rule_uses_its_budget_up_without_it(trained,
     assert (summary["reason"], summary["stopping"]) == ("budget reached: iterations", None)
 
 
+def test_a_run_that_drives_reliably_continues_without_its_rule(call):
+    reliable = (
+        "stopping=reliable",
+        "stopping.lap_share=0.0",
+        "budget.env_steps=null",
+        "budget.iterations=30",
+    )
+    quick = ("experiment=tiny", "collector=in_process", "tracking=off", "evaluation.trials=1")
+    ended = call("train", *quick, *reliable)
+    assert ended.summary["stopping"]["rule"] == "reliable", ended.stderr
+    more = f"budget.iterations={ended.summary['iteration'] + 1}"
+    other = call("resume", ended.folder.name, "stopping=reliable", "stopping.episodes=10", more)
+    assert "stopping.episodes: 50 -> 10" in other.complaint
+    assert call("resume", ended.folder.name, "stopping=none", more).code == 0
+
+
 def test_a_run_that_others_have_pruned_continues_if_asked_which_rule_counts(trained, stopped, call):
     summary = json.loads((stopped / "summary.json").read_text())
     pruned = {"status": "stopped early", "reason": "median: 9.1 is worse", "stopping": None}
