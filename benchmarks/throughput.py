@@ -44,7 +44,7 @@ from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.commands.startup import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup
 
 from .all_tracks import TRACKS
@@ -106,8 +106,8 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
     assert frames is not None, "an iteration must be counted in frames"
     setup = build_setup(experiment)
     generator = torch.Generator().manual_seed(experiment.seed)
-    features = len(feature_names(experiment.observation))
-    policy = build_actor_critic(experiment.network, features, setup.actions.n, generator).policy
+    observed = observation_shape(experiment.observation)
+    policy = build_actor_critic(experiment.network, observed, setup.actions.n, generator).policy
 
     def start(processes: int) -> LocalCollector:
         config = dataclasses.replace(experiment.collector, mode="sync", processes=processes)

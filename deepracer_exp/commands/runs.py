@@ -380,6 +380,7 @@ def _promote(args: argparse.Namespace) -> int:
         feature_names(observation),
         stores.uri,
         stores.runs_dir,
+        observation.picture,
     )
     print(f"{registered}: version {registered.version}")
     print(f"  run         {run.path}")

@@ -30,6 +30,8 @@ class CarConfig:
     camera_x_m: Finite
     camera_z_m: Finite
     camera_pitch_deg: Finite
+    tilt_deg_per_mps2: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.0
+    """Seen by the camera only: tyres know of load, not of angles."""
 
     mass_kg: Positive
     com_x_m: Finite

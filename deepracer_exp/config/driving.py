@@ -1,7 +1,7 @@
 """Action space, observation, randomization, episode rules and reward."""
 
 from dataclasses import dataclass, fields
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, Field
 
@@ -9,6 +9,7 @@ from .bounds import Finite, Fraction, Natural, NonNegative, Positive, Seconds, U
 from .own_class import OwnClass
 
 SpeedMps = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
+Pixels = Annotated[int, Field(ge=16, le=640)]
 SteeringDeg = Annotated[float, Field(ge=-60, le=60, allow_inf_nan=False)]
 
 
@@ -75,8 +76,29 @@ ActionSpaceConfig = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """The pictures that the policy sees; where the camera sits is the car's (`car.camera_x_m`, ...)."""
+
+    width: Pixels
+    height: Pixels
+    color: Literal["grey", "rgb"]
+    frames: Annotated[int, Field(ge=1, le=8)]
+    """The last so many pictures, oldest first."""
+    stereo_m: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
+    """Distance between two cameras side by side, left first; 0: one camera."""
+    field_of_view_deg: Annotated[float, Field(ge=10, le=150, allow_inf_nan=False)]
+    """Horizontal."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Channels, height and width of what the policy sees."""
+        channels = (3 if self.color == "rgb" else 1) * (2 if self.stereo_m else 1) * self.frames
+        return channels, self.height, self.width
+
+
+@dataclass(frozen=True, kw_only=True)
 class ObservationConfig:
-    """The features of the observation, each divided by its scale."""
+    """What is observed: the features, each divided by its scale, and the pictures of a camera."""
 
     lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
     """Distances ahead along the centre line at which the road is observed."""
@@ -85,6 +107,21 @@ class ObservationConfig:
     yaw_rate_scale_radps: Positive
     parts: tuple[OwnClass, ...] = ()
     """Classes of your own that add features."""
+    camera: CameraConfig | None = None
+    """Pictures for the policy, which then sees nothing else; None: it sees the features."""
+
+    @property
+    def picture(self) -> tuple[int, int, int] | None:
+        """Channels, height and width of the pictures."""
+        return None if self.camera is None else self.camera.shape
+
+
+class ObservationShape(NamedTuple):
+    """What networks are built for."""
+
+    features: int
+    picture: tuple[int, int, int] | None = None
+    """Channels, height and width; None: there is no camera."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 from .car import CarConfig
 from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
 from .evaluation import EvaluationConfig
-from .learning import AlgorithmConfig, LRScheduleConfig, NetworkConfig
+from .learning import AlgorithmConfig, CNNConfig, LRScheduleConfig, MLPConfig, NetworkConfig
 from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
 from .stopping import StoppingConfig
 from .track import TrackConfig, Tracks
@@ -61,6 +61,27 @@ class Experiment:
     stopping: StoppingConfig
     budget: BudgetConfig
     tracking: TrackingConfig
+
+    def __post_init__(self) -> None:
+        """Refuse a network that cannot read what is observed."""
+        camera = self.observation.camera
+        if camera is None and isinstance(self.network, CNNConfig):
+            raise ValueError(
+                "network: convolutions need pictures; accepted: observation=camera, or network=mlp_small"
+            )
+        if camera is not None:
+            if isinstance(self.network, MLPConfig):
+                raise ValueError(
+                    "network: reads features, and observation.camera gives pictures; accepted: network=cnn_small, "
+                    "shallow, medium, deep"
+                )
+            if (
+                isinstance(self.network, CNNConfig)
+                and min(self.network.outputs(camera.height, camera.width)) < 1
+            ):
+                raise ValueError(
+                    f"network.kernels: a picture of {camera.width}x{camera.height} is too small for these layers"
+                )
 
     @property
     def tracks(self) -> dict[str, TrackConfig]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Tag
+from pydantic import Discriminator, Field, Tag
 
 from .bounds import Fraction, NonNegative, Positive, UpTo1000
 from .own_class import OURS_OR_OWN, OwnClass, Reference
@@ -28,9 +28,49 @@ class MLPConfig:
     """Standard deviation of a continuous policy at the start, in units of the action range -1..1."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CNNConfig:
+    """Convolutional layers without padding for the pictures of a camera, then a multi-layer perceptron."""
+
+    filters: Annotated[tuple[Annotated[int, Field(ge=1, le=512)], ...], Field(min_length=1, max_length=8)]
+    """Of each convolutional layer."""
+    kernels: tuple[Annotated[int, Field(ge=1, le=16)], ...]
+    """Width and height of each layer's filters."""
+    strides: tuple[Annotated[int, Field(ge=1, le=8)], ...]
+    hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)]
+    """Units of each hidden layer after the convolutions."""
+    activation: Literal["tanh", "relu", "elu", "silu"]
+    critic: Literal["features", "pictures"]
+    """What the value network sees; it is of no use to a car that drives."""
+    shared_trunk: bool
+    """One trunk with two heads; only where both see pictures."""
+    initial_std: Positive
+    """As in `MLPConfig`."""
+
+    def __post_init__(self) -> None:
+        """Refuse layers that are not complete, and a trunk that has nothing to share."""
+        if not len(self.filters) == len(self.kernels) == len(self.strides):
+            raise ValueError("filters, kernels and strides: one number each per layer")
+        if self.shared_trunk and self.critic == "features":
+            raise ValueError("shared_trunk=true: a value network that sees features has no layers to share")
+
+    def outputs(self, height: int, width: int) -> tuple[int, int]:
+        """Return height and width after the convolutions; below 1 where a picture is too small for them."""
+        for kernel, stride in zip(self.kernels, self.strides, strict=True):
+            height, width = (height - kernel) // stride + 1, (width - kernel) // stride + 1
+        return height, width
+
+
+def _network_kind(value: Any) -> str:
+    """Return the tag of a network's values."""
+    if isinstance(value, dict) and "target" in value:
+        return "own"
+    return "cnn" if isinstance(value, dict) and "kernels" in value else "mlp"
+
+
 NetworkConfig = Annotated[
-    Annotated[MLPConfig, Tag("ours")] | Annotated[OwnClass, Tag("own")],
-    OURS_OR_OWN,
+    Annotated[MLPConfig, Tag("mlp")] | Annotated[CNNConfig, Tag("cnn")] | Annotated[OwnClass, Tag("own")],
+    Discriminator(_network_kind),
 ]
 
 

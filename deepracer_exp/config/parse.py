@@ -163,7 +163,7 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
     if finding["type"] == "value_error":
         # The message of a dataclass whose values contradict each other names its keys.
         at = key if isinstance(value, dict) else f"{key}={_short(value)}"
-        return f"{at}: {finding['ctx']['error']}{more}"
+        return f"{at}: {finding['ctx']['error']}{more}" if key else f"{finding['ctx']['error']}{more}"
     return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
 
 

@@ -20,6 +20,12 @@ class FloorConfig:
     road_color: Color
     ground_color: Color
     line_color: Color
+    dash_color: Color = "#e38b05"
+    """Of the centre line."""
+    wall_color: Color = "#244651"
+    sky_color: Color = "#272727"
+    walls_beyond_m: Positive | None = 0.91
+    """Distance of the walls around the field from the road's extreme coordinates; None: there are no walls."""
 
 
 @dataclass(frozen=True, kw_only=True)

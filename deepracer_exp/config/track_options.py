@@ -31,6 +31,21 @@ PLACE = "several_tracks"
 BASE = "reinvent_base"
 """The option with the default values of all others."""
 
+# Textures of the service's worlds (deepracer-simapp, `bundle/meshes`): those of 2018 have colours of their own, and
+# only those of 2018 and 2019 have walls.
+_OF_2018 = re.compile(r"reinvent_")
+_OF_2019 = re.compile(
+    r"reInvent2019|AWS_track|Bowtie|Canada|China|H_track|London|Mexico|New_York|Oval|Straight|Tokyo|Vegas|Virtual_May19"
+)
+_LATER_FLOOR = {
+    "road_color": "#403f3d",
+    "ground_color": "#7e8541",
+    "line_color": "#dfdfdf",
+    "dash_color": "#e18f00",
+    "sky_color": "#b2b2b2",
+    "walls_beyond_m": 0.76,
+}
+
 
 @dataclass(frozen=True)
 class SeveralTracks:
@@ -54,7 +69,12 @@ def register_worlds() -> None:
     store = ConfigStore.instance()
     files = {path.stem for path in (conf_dir() / GROUP).glob("*.yaml")}
     for world in (world for name, world in worlds().items() if name not in files):
-        store.store(group=GROUP, name=world.name, node={"name": world.name, "title": world.title})
+        node: dict[str, Any] = {"name": world.name, "title": world.title}
+        if not _OF_2018.match(world.name):
+            node["floor"] = dict(_LATER_FLOOR)
+            if not _OF_2019.match(world.name):
+                node["floor"]["walls_beyond_m"] = None
+        store.store(group=GROUP, name=world.name, node=node)
 
 
 def complete(option: str, values: Mapping[Any, Any]) -> dict[Any, Any]:

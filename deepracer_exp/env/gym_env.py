@@ -25,11 +25,12 @@ from .race import Race
 from .setup import RaceSetup, build_setup, deal
 
 
-class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
+class DeepRacerEnv(gym.Env[NDArray[Any], Any]):
     """One car; with several tracks, every episode is on another one, by their weights.
 
-    Observation: the features of `Features`, float32. Action: an index into the action space's list, or steering and
-    speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of the pose before the step.
+    Observation: the features of `Features`, float32; with a camera only its pictures, uint8. Action: an index into the
+    action space's list, or steering and speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of
+    the pose before the step.
     """
 
     def __init__(self, overrides: Sequence[str] = ()):
@@ -49,7 +50,7 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Start an episode, further along the track than the last; with a seed, start over."""
         super().reset(seed=seed)
         if seed is not None:
@@ -57,9 +58,9 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
             self._courses = deal(self._weights)
         # Successive episodes are distributed over the courses as cars are.
         self._race.reset(course=np.array([next(self._courses)]))
-        return self._race.observation[0], {}
+        return _observed(self._race)[0], {}
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
         """Drive for 1/15 s."""
         race = self._race
         race.step(np.asarray(action)[None])
@@ -68,10 +69,10 @@ class DeepRacerEnv(gym.Env[NDArray[np.float32], Any]):
             "episode_status": EPISODE_STATUS[int(race.trace[0, PACKED["episode_status"]])],
         }
         terminated, truncated = bool(race.terminated[0]), bool(race.truncated[0])
-        return race.observation[0], float(race.reward[0]), terminated, truncated, info
+        return _observed(race)[0], float(race.reward[0]), terminated, truncated, info
 
 
-class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
+class DeepRacerVectorEnv(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
 
     `infos` holds arrays `progress` and `episode_status` (codes of `deepracer.trace.EPISODE_STATUS`) of the poses
@@ -113,18 +114,18 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
         """Start an episode with every car; with a seed (of a list, the first), start over."""
         first = seed[0] if isinstance(seed, list) else seed
         super().reset(seed=first)
         if first is not None:
             self._race.seed(first)
         self._race.reset()
-        return self._race.observation, {}
+        return _observed(self._race), {}
 
     def step(
         self, actions: NDArray[Any]
-    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Drive for 1/15 s with every car."""
         race = self._race
         race.step(np.asarray(actions))
@@ -138,7 +139,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
             ids = np.flatnonzero(ended)
             final = np.full(self.num_envs, None, dtype=object)
             for car in ids:
-                final[car] = race.observation[car]
+                final[car] = _observed(race)[car]
             infos |= {
                 "final_obs": final,
                 "_final_obs": ended,
@@ -146,11 +147,19 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[An
                 "_final_info": ended,
             }
             race.reset(ids)
-        return race.observation, reward, terminated, truncated, infos
+        return _observed(race), reward, terminated, truncated, infos
+
+
+def _observed(race: Race) -> NDArray[Any]:
+    """Return what a policy sees, (N, ...)."""
+    return race.seen.get("pixels", race.observation)
 
 
 def _spaces(race: Race) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-    observation = spaces.Box(-np.inf, np.inf, (race.observation.shape[1],), np.float32)
+    observed = _observed(race)
+    observation: spaces.Space[Any] = spaces.Box(-np.inf, np.inf, observed.shape[1:], np.float32)
+    if observed.dtype == np.uint8:
+        observation = spaces.Box(0, 255, observed.shape[1:], np.uint8)
     n_actions = race.setup.actions.n
     if n_actions is None:
         return observation, spaces.Box(-1.0, 1.0, (2,), np.float32)

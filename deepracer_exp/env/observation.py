@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deepracer_exp.config.driving import ObservationConfig
+from deepracer_exp.config.driving import ObservationConfig, ObservationShape
 from deepracer_exp.config.own_class import build_own
 
 from .state import Measures
@@ -46,6 +46,15 @@ def feature_names(config: ObservationConfig) -> tuple[str, ...]:
         BadInput: a part of the user's own cannot be used.
     """
     return _names(config, build_parts(config))
+
+
+def observation_shape(config: ObservationConfig) -> ObservationShape:
+    """Return the shape of what is observed.
+
+    Raises:
+        BadInput: a part of the user's own cannot be used.
+    """
+    return ObservationShape(len(feature_names(config)), config.picture)
 
 
 def _names(config: ObservationConfig, parts: Sequence[ObservationPart]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.sim.batch import CarBatch, CarState
 
 from .observation import Features
+from .pictures import Pictures
 from .randomization import Randomization
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
@@ -24,7 +25,7 @@ _RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED)
 
 _KEPT = (
     *("_return", "_steering_deg", "_commanded_mps"),
-    *("observation", "reward", "terminated", "truncated", "trace"),
+    *("observation", "pixels", "reward", "terminated", "truncated", "trace"),
 )
 """A race's own arrays that belong in a checkpoint."""
 
@@ -47,6 +48,7 @@ class Race:
 
     Attributes:
         observation: features of the poses now, (N, size), float32.
+        pixels: what the cameras see now, (N, channels, height, width), uint8; (N, 0) where there is no camera.
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step reached `episode.max_steps`, (N,), bool.
@@ -101,6 +103,9 @@ class Race:
         self._steering_deg = np.zeros(n_cars)
         self._commanded_mps = np.zeros(n_cars)
         self.observation = np.zeros((n_cars, self._features.size), np.float32)
+        camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
+        self._pictures = None if camera is None else Pictures(camera, setup.car, tracks)
+        self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         self.reward = np.zeros(n_cars)
         self.terminated = np.zeros(n_cars, bool)
         self.truncated = np.zeros(n_cars, bool)
@@ -112,6 +117,11 @@ class Race:
     def feature_names(self) -> tuple[str, ...]:
         """Return the names of the observation's entries."""
         return self._features.names
+
+    @property
+    def seen(self) -> dict[str, np.ndarray]:
+        """What a policy may read: `observation`, and with a camera `pixels`."""
+        return {"observation": self.observation} | ({"pixels": self.pixels} if self._pictures else {})
 
     def seed(self, seed: int) -> None:
         """Start over: random streams from `seed`, start positions and clocks from the first episode."""
@@ -273,20 +283,34 @@ class Race:
 
     def _observe(self) -> None:
         """Measure all cars and compute the policy's observations."""
-        features = self._features_of(self.rules.measure(self._batch.read()), self._everyone)
+        state = self._batch.read()
+        features = self._features_of(self.rules.measure(state), self._everyone)
         self.observation = self.randomization.disturb_observation(features, self.observation)
+        if self._pictures is not None:
+            self.pixels = self._pictures.next(
+                self.pixels,
+                state,
+                self._batch.acceleration_mps2,
+                self.rules.course,
+                self.randomization.dropped,
+            )
 
     def _observe_started(self, ids: np.ndarray) -> None:
         """Do the same for the cars `ids` alone: of many cars some start an episode at nearly every step."""
+        state = self._batch.read()
         if len(ids) == self.n_cars:
-            started = self.rules.measure(self._batch.read())
+            started = self.rules.measure(state)
         else:
-            started = self.rules.measure_some(ids, CarState(*(values[ids] for values in self._batch.read())))
+            state = CarState(*(values[ids] for values in state))
+            started = self.rules.measure_some(ids, state)
         # The terminal observation has been handed out; it must stay as it was.
         self.observation = self.observation.copy()
         self.observation[ids] = self.randomization.disturb_first_observation(
             ids, self._features_of(started, ids)
         )
+        if self._pictures is not None:
+            self.pixels = self.pixels.copy()
+            self.pixels[ids] = self._pictures.first(state, self.rules.course[ids])
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
         track_index = self.rules.track_index[ids]

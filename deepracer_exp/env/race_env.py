@@ -17,9 +17,10 @@ from .race import Race
 class RaceEnv(EnvBase):
     """A `Race` as a TorchRL environment of batch size [N].
 
-    Keys: `observation` (float32 features), `action` (int64 index, or float32 steering and speed in -1..1), and
-    under `next` also `reward`, `done`, `terminated`, `truncated` and `trace` (float64, columns
-    `deepracer.trace.PACKED_COLUMNS`). `trace` is part of the reward spec because it exists after a step only.
+    Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), `action` (int64
+    index, or float32 steering and speed in -1..1), and under `next` also `reward`, `done`, `terminated`, `truncated`
+    and `trace` (float64, columns `deepracer.trace.PACKED_COLUMNS`). `trace` is part of the reward spec because it
+    exists after a step only.
     """
 
     def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
@@ -38,6 +39,8 @@ class RaceEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Unbounded((n_cars, size), dtype=torch.float32), shape=(n_cars,)
         )
+        if "pixels" in race.seen:
+            self.observation_spec["pixels"] = Bounded(0, 255, race.pixels.shape, dtype=torch.uint8)
         self.action_spec = (
             Bounded(-1.0, 1.0, (n_cars, 2), dtype=torch.float32)
             if n_actions is None
@@ -63,13 +66,11 @@ class RaceEnv(EnvBase):
         following = self._step(tensordict)
         tensordict.set("next", following)
         done = following.get("done")
-        observation = following.get("observation")
         if done.any():
             self.race.reset(np.flatnonzero(done.numpy()))
-            observation = torch.from_numpy(self.race.observation)
         root = TensorDict._new_unsafe(
             {
-                "observation": observation,
+                **self._seen(),
                 "done": self._no.clone(),
                 "terminated": self._no.clone(),
                 "truncated": self._no.clone(),
@@ -97,7 +98,7 @@ class RaceEnv(EnvBase):
         else:
             self.race.reset(ids)
         return TensorDict(
-            {"observation": torch.from_numpy(self.race.observation), **self._flags(self._no)},
+            {**self._seen(), **self._flags(self._no)},
             batch_size=self.batch_size,
             device=self.device,
         )
@@ -111,7 +112,7 @@ class RaceEnv(EnvBase):
         truncated = torch.from_numpy(race.truncated)[:, None]
         return TensorDict._new_unsafe(
             {
-                "observation": torch.from_numpy(race.observation),
+                **self._seen(),
                 "reward": torch.from_numpy(race.reward.astype(np.float32))[:, None],
                 "trace": torch.from_numpy(race.trace.copy()),
                 "done": terminated | truncated,
@@ -121,6 +122,9 @@ class RaceEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
+
+    def _seen(self) -> dict[str, torch.Tensor]:
+        return {key: torch.from_numpy(values) for key, values in self.race.seen.items()}
 
     def _flags(self, value: torch.Tensor) -> dict[str, torch.Tensor]:
         return {key: value.clone() for key in ("done", "terminated", "truncated")}

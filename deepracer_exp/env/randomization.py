@@ -135,6 +135,7 @@ class Randomization:
             physics[name](self._rows, self._of(name))
         self._varying_physics = {name: apply for name, apply in physics.items() if name in varying}
         self._draws = bool(varying)
+        self.dropped: NDArray[np.bool_] | None = None
         self._sag_steps = _SAG_S / batch.car.control_period_s
         self._measured = np.array([name not in _KNOWN for name in features], np.float64)
         self._first_noise: Floats = np.zeros((len(self._cars), len(features)))
@@ -234,7 +235,10 @@ class Randomization:
     def disturb_observation(
         self, features: NDArray[np.float32], before: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Return the observations for the current features, given those of the step before, each (N, F)."""
+        """Return the observations for the current features, given those of the step before, each (N, F).
+
+        `dropped` then says which cars see nothing new, (N,); it is None where none can.
+        """
         if self._observation is None:
             return features
         from scipy.special import ndtr  # takes a quarter of a second, and few trainings have noise
@@ -242,8 +246,8 @@ class Randomization:
         normal = self._observation.normal()
         if "observation_noise" in self._on:
             features = features + self._noise(self._rows, normal[:, 1:])
-        lost = ndtr(normal[:, 0]) < self._of("observation_dropout")
-        return np.where(lost[:, None], before, features)
+        self.dropped = ndtr(normal[:, 0]) < self._of("observation_dropout")
+        return np.where(self.dropped[:, None], before, features)
 
     def disturb_first_observation(self, ids: Ids, features: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the first observations of the episodes of the cars `ids`, given their features, (n, F)."""

@@ -121,7 +121,9 @@ class Evaluator:
         with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(how):
             torch.manual_seed(config.seed)
             while protocol.running.any():
-                seen = TensorDict({"observation": torch.from_numpy(race.observation)}, [race.n_cars])
+                seen = TensorDict(
+                    {key: torch.from_numpy(values) for key, values in race.seen.items()}, [race.n_cars]
+                )
                 race.step(policy(seen)["action"].numpy())
                 row = race.trace
                 back = protocol.step(

@@ -1,10 +1,12 @@
 """The command `export`: write a policy as ONNX, or a run's files or logs in the layouts of AWS."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
 
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
@@ -17,7 +19,7 @@ from deepracer_exp.validation.console import console_findings
 
 from .aws_files import aws_files, write_texts
 from .aws_logs import write_aws_logs
-from .onnx_file import CHECKED, DeployedPolicy, write_onnx
+from .onnx_file import CHECKED, CHECKED_PICTURES, DeployedPolicy, write_onnx
 
 
 def export(config: ExportConfig, output: str | None, out: Console) -> Path:
@@ -42,21 +44,31 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
     stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
     actions = build_action_space(run.experiment.action_space)
     torch.set_num_threads(1)
-    facts = {
+    facts: dict[str, Any] = {
         "run": run.path.name,
         "checkpoint": stored.path.name,
         "control_period_s": run.experiment.car.control_period_s,
     }
-    features = tuple(feature_names(run.experiment.observation))
-    difference = write_onnx(DeployedPolicy(stored.networks, actions), features, facts, path)
+    observation = run.experiment.observation
+    features = feature_names(observation)
+    if observation.camera is None:
+        facts["features"] = features
+        reads = f"observation  {len(features)} features, named in the file's metadata"
+    else:
+        facts["camera"] = vars(observation.camera)
+        channels, height, width = observation.camera.shape
+        reads = f"pixels       pictures of {width}x{height} in bytes, channels: {channels}"
+    observed = ObservationShape(len(features), observation.picture)
+    difference = write_onnx(DeployedPolicy(stored.networks, actions), observed, facts, path)
     out.print(f"{path}", soft_wrap=True)
     out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
-    out.print(f"  observation  {len(features)} features, named in the file's metadata")
+    out.print(f"  {reads}")
     what = f"probabilities of {actions.n} actions" if actions.n else "mean steering and speed, -1 to 1"
     out.print(f"  policy       {what}")
     out.print("  command      steering in degrees, positive to the left; speed in m/s")
+    checked = CHECKED if observation.camera is None else CHECKED_PICTURES
     out.print(
-        f"  checked      largest difference to the network {difference:.1e} on {CHECKED:,} observations"
+        f"  checked      largest difference to the network {difference:.1e} on {checked:,} observations"
     )
     return path
 

@@ -1,4 +1,4 @@
-"""Export a policy as ONNX: observation features in, action probabilities and command out."""
+"""Export a policy as ONNX: features or pictures in, action probabilities and command out."""
 
 import json
 import logging
@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from deepracer_exp.agents.actor_critic import ActorCritic
+from deepracer_exp.agents.actor_critic import ActorCritic, PictureNet
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write
 
-OBSERVATION, POLICY, COMMAND = "observation", "policy", "command"
-CHECKED = 1000
+POLICY, COMMAND = "policy", "command"
+CHECKED, CHECKED_PICTURES = 1000, 100
 """Number of observations on which the file is compared with the network."""
 TOLERANCE = 1e-4
 """Largest accepted difference, with a margin over single-precision rounding."""
@@ -26,9 +27,9 @@ TOLERANCE = 1e-4
 class DeployedPolicy(nn.Module):
     """The deterministic policy of an actor-critic, without value network and sampling.
 
-    `observation` (N, features) -> `policy`, the probabilities of the actions (N, n), of a continuous policy the mean
-    of [steering, speed] clipped to -1..1 (N, 2); and `command` (N, 2), degrees (positive to the left) and metres per
-    second: of the likeliest action, or of that mean.
+    `observation` (N, features), or `pixels` (N, channels, height, width), bytes -> `policy`, the probabilities of the
+    actions (N, n), of a continuous policy the mean of [steering, speed] clipped to -1..1 (N, 2); and `command` (N, 2),
+    degrees (positive to the left) and metres per second: of the likeliest action, or of that mean.
     """
 
     def __init__(self, networks: ActorCritic, actions: ActionSpace):
@@ -37,6 +38,10 @@ class DeployedPolicy(nn.Module):
         trunk = networks.trunk
         self.trunk = nn.Identity() if trunk is None else trunk.module
         self.head = networks.policy_head[0].module
+        (self.in_key,) = networks.policy.in_keys
+        for module in self.modules():
+            if isinstance(module, PictureNet):
+                module.matrix_units = False  # a file for any processor
         self.discrete = isinstance(actions, DiscreteActions)
         if isinstance(actions, DiscreteActions):
             rows = [actions.steering_deg, actions.speed_mps]
@@ -46,9 +51,9 @@ class DeployedPolicy(nn.Module):
         self.table: Tensor
         self.register_buffer("table", torch.as_tensor(table, dtype=torch.float32))
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, observed: Tensor) -> tuple[Tensor, Tensor]:
         """Return policy and command."""
-        outputs = self.head(self.trunk(observation))
+        outputs = self.head(self.trunk(observed))
         if self.discrete:
             policy = torch.softmax(outputs, dim=-1)
             return policy, self.table[policy.argmax(dim=-1)]
@@ -58,13 +63,13 @@ class DeployedPolicy(nn.Module):
 
 
 def write_onnx(
-    model: DeployedPolicy, features: tuple[str, ...], facts: Mapping[str, Any], path: Path
+    model: DeployedPolicy, observed: ObservationShape, facts: Mapping[str, Any], path: Path
 ) -> float:
     """Write the file and return its largest difference from the network, on `CHECKED` observations.
 
     Args:
         model: the policy.
-        features: names of the observation's elements.
+        observed: the shape of what it reads.
         facts: metadata of the file, JSON types.
         path: the file, written atomically.
 
@@ -81,16 +86,14 @@ def write_onnx(
             f"format=onnx: needs the package {error.name}; install the project with its extra: "
             "pip install 'deepracer-exp[export]'"
         ) from error
-    program = _program(model.eval(), len(features))
-    onnx.helper.set_model_props(
-        program,
-        {"features": json.dumps(features), **{key: json.dumps(value) for key, value in facts.items()}},
-    )
+    observations = _observations(observed)
+    program = _program(model.eval(), observations[:2])
+    onnx.helper.set_model_props(program, {key: json.dumps(value) for key, value in facts.items()})
     content = program.SerializeToString()
-    difference = largest_difference(model, content, len(features))
+    difference = largest_difference(model, content, observations)
     if not difference <= TOLERANCE:
         raise RunFailed(
-            f"the ONNX file differs from the network by {difference:.3g} on {CHECKED} observations; "
+            f"the ONNX file differs from the network by {difference:.3g} on {len(observations)} observations; "
             f"at most {TOLERANCE:g} is rounding"
         )
     try:
@@ -101,21 +104,30 @@ def write_onnx(
     return difference
 
 
-def largest_difference(model: DeployedPolicy, content: bytes, n_features: int) -> float:
-    """Return how far any `policy` of a file is from the network's, on standard normal observations."""
+def _observations(observed: ObservationShape) -> Tensor:
+    """Return standard normal features, or pictures of noise."""
+    generator = torch.Generator().manual_seed(0)
+    if observed.picture is None:
+        return torch.randn(CHECKED, observed.features, generator=generator)
+    return torch.randint(
+        0, 256, (CHECKED_PICTURES, *observed.picture), generator=generator, dtype=torch.uint8
+    )
+
+
+def largest_difference(model: DeployedPolicy, content: bytes, observations: Tensor) -> float:
+    """Return how far any `policy` of a file is from the network's."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    observations = torch.randn(CHECKED, n_features, generator=torch.Generator().manual_seed(0))
-    (theirs,) = session.run([POLICY], {OBSERVATION: observations.numpy()})
+    (theirs,) = session.run([POLICY], {model.in_key: observations.numpy()})
     with torch.no_grad():
         ours = model(observations)[0].numpy()
     return float(np.abs(theirs - ours).max())
 
 
-def _program(model: DeployedPolicy, n_features: int) -> Any:
+def _program(model: DeployedPolicy, observations: Tensor) -> Any:
     """Return the ONNX model, with the exporter's own messages silenced."""
     quiet = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     before = [logger.level for logger in quiet]
@@ -126,10 +138,10 @@ def _program(model: DeployedPolicy, n_features: int) -> Any:
             warnings.simplefilter("ignore")  # between the libraries
             program = torch.onnx.export(
                 model,
-                (torch.zeros(2, n_features),),
-                input_names=[OBSERVATION],
+                (observations,),
+                input_names=[model.in_key],
                 output_names=[POLICY, COMMAND],
-                dynamic_shapes={"observation": {0: torch.export.Dim("batch")}},
+                dynamic_shapes={"observed": {0: torch.export.Dim("batch")}},
                 dynamo=True,
                 verbose=False,
             )

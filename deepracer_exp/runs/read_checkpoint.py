@@ -15,7 +15,7 @@ from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
 from deepracer_exp.agents.ppo import Algorithm
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 
 from .checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, verify
@@ -139,7 +139,7 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
     """
     networks = build_actor_critic(
         experiment.network,
-        len(feature_names(experiment.observation)),
+        observation_shape(experiment.observation),
         build_action_space(experiment.action_space).n,
         torch.Generator(),
     )

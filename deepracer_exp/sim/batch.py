@@ -108,6 +108,11 @@ class CarBatch:
         angle: Floats = self._drives["steering_rad"][:, 0] + self._car["steering_trim_rad"]
         return angle
 
+    @property
+    def acceleration_mps2(self) -> Floats:
+        """Acceleration ahead and to the left in the last physics step, (N, 2): a copy."""
+        return np.stack([self._drives["ahead_mps2"][:, 0], self._drives["left_mps2"][:, 0]], axis=1)
+
     def lift(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
         """Put cars at rest as `place` does, but keep where their front wheels stand and what was sent to them."""
         rows = np.asarray(ids, np.intp)

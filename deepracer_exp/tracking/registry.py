@@ -110,7 +110,14 @@ def _aliases(what: str, uri: str | None, runs_dir: Path) -> list[tuple[str, str]
 
 
 def promote(
-    run: Path, name: str, model: str, alias: str, features: Sequence[str], uri: str | None, runs_dir: Path
+    run: Path,
+    name: str,
+    model: str,
+    alias: str,
+    features: Sequence[str],
+    uri: str | None,
+    runs_dir: Path,
+    pixels: tuple[int, int, int] | None = None,
 ) -> Registered:
     """Register a checkpoint as a version of a model and give it the alias.
 
@@ -123,9 +130,10 @@ def promote(
         name: of the checkpoint: `best`, `last` or the number of an iteration.
         model: name, created if it does not exist.
         alias: moved from the version that has it.
-        features: names of the policy's observations.
+        features: names of the observed features.
         uri: the store, as of `open_client`.
         runs_dir: likewise.
+        pixels: channels, height and width of what the policy sees; None: it sees the features.
 
     Raises:
         BadInput: a name is invalid, the checkpoint is missing or corrupt, the run is not recorded in this store or was
@@ -157,7 +165,7 @@ def promote(
         if version is None:
             metrics = _evaluated(run, folder)
             logged = _log_model(
-                client, recorded.info.experiment_id, run_id, run, folder, tags, features, metrics
+                client, recorded.info.experiment_id, run_id, run, folder, tags, features, pixels, metrics
             )
             shown = (
                 f"Checkpoint {int(folder.name)} of `{run.name}`: {race_result(metrics)}.\n\n{picture(run_id)}"
@@ -184,6 +192,7 @@ def _log_model(
     checkpoint: Path,
     tags: Mapping[str, str],
     features: Sequence[str],
+    pixels: tuple[int, int, int] | None,
     metrics: Mapping[str, float],
 ) -> "LoggedModel":
     """Log a checkpoint as a model of MLflow, with the tensors and JSON of the run's folder."""
@@ -194,13 +203,18 @@ def _log_model(
     name = f"{run.name}-{checkpoint.name}"
     logged = client.create_logged_model(experiment_id, name, run_id, dict(tags), model_type="policy")
     observation = TensorSpec(np.dtype(np.float32), (-1, len(features)), "observation")
+    if pixels is not None:
+        observation = TensorSpec(np.dtype(np.uint8), (-1, *pixels), "pixels")
     command = TensorSpec(np.dtype(np.float32), (-1, 2), "command")
     described = Model(
         run_id=run_id,
         model_id=logged.model_id,
         signature=ModelSignature(Schema([observation]), Schema([command])),
         flavors={"deepracer_exp": {"checkpoint": "checkpoint", "format": "torchrl.checkpoint"}},
-        metadata={"observation": list(features), "command": ["steering_deg", "speed_mps"]},
+        metadata={
+            "observation": list(features) if pixels is None else ["pixels"],
+            "command": ["steering_deg", "speed_mps"],
+        },
     )
     with tempfile.TemporaryDirectory() as aside:
         described.save(str(Path(aside) / "MLmodel"))

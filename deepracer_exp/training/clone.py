@@ -103,6 +103,18 @@ def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
         )
         raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
     ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
+    if clone.observation.camera != parent.observation.camera:
+        changed = "; ".join(
+            describe_differences(
+                config_differences(
+                    [
+                        {"camera": one.observation.camera and vars(one.observation.camera)}
+                        for one in (parent, clone)
+                    ]
+                )
+            )
+        )
+        raise BadInput(f"observation: cannot be changed in a clone: {changed}; {why}")
     if clone.observation != parent.observation:
         odd = ", ".join(sorted(set(ours) ^ set(theirs))) or "the order, or what is looked ahead"
         raise BadInput(

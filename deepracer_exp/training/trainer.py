@@ -15,11 +15,11 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
-from deepracer_exp.collectors.base import Collector, worker_count
+from deepracer_exp.collectors.base import Collector, cores, worker_count
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.trace import TraceWriter, to_table
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.runs.checkpoints import CheckpointStore
@@ -173,13 +173,14 @@ class Trainer:
             track_names(setup), cars, experiment.car.control_period_s, experiment.stopping
         )
         self._trace = TraceWriter(folder.path / TRACE)
-        # More threads do not speed up networks of this size, and on a busy machine they wait for one another: an
-        # update took 25 times as long.
+        # More threads do not speed up networks of features, and on a busy machine they wait for one another: an
+        # update took 25 times as long. Convolutions are worth them while the workers wait for the update.
+        self._update_threads = cores() if experiment.observation.camera is not None else 1
         torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
         with reading(f"network={experiment.network}", "a network that fits into memory"):
             self.networks = build_actor_critic(
-                experiment.network, len(feature_names(experiment.observation)), setup.actions.n, generator
+                experiment.network, observation_shape(experiment.observation), setup.actions.n, generator
             )
         self.agent = build_agent(self.networks, experiment.algorithm, experiment.lr_schedule, experiment.seed)
         self.iteration, self.env_steps = 0, 0
@@ -419,6 +420,7 @@ class Trainer:
 
     def _update(self, batch: TensorDictBase) -> UpdateMetrics:
         _, fraction = self.budget.used(*self.usage)
+        torch.set_num_threads(self._update_threads)
         try:
             return self.agent.update(batch, self.iteration, min(fraction, 1.0))
         except RunFailed as error:
@@ -428,6 +430,8 @@ class Trainer:
                 "reward": batch["next", "reward"].numpy(),
             }
             raise
+        finally:
+            torch.set_num_threads(1)
 
     def _measure(
         self, finished: Finished, update: UpdateMetrics, frames: int, collect_s: float, update_s: float

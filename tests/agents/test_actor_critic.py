@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import MLPConfig
 
 KINDS = [(shared, actions) for shared in (False, True) for actions in (5, None)]
@@ -15,7 +16,7 @@ KINDS = [(shared, actions) for shared in (False, True) for actions in (5, None)]
 
 def build(shared: bool = False, actions: int | None = 5, seed: int = 0, std: float = 0.5) -> ActorCritic:
     network = MLPConfig(hidden=(16, 16), activation="tanh", shared_trunk=shared, initial_std=std)
-    return build_actor_critic(network, 4, actions, torch.Generator().manual_seed(seed))
+    return build_actor_critic(network, ObservationShape(4), actions, torch.Generator().manual_seed(seed))
 
 
 def steps(count: int) -> TensorDict:

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import AdaptiveKLLR, AlgorithmConfig, MLPConfig
 from deepracer_exp.errors import RunFailed
 
@@ -32,7 +33,7 @@ def make(
     shared: bool = False, actions: int | None = 3, seed: int = 0, **changes: object
 ) -> tuple[ActorCritic, PPO]:
     network = MLPConfig(hidden=(16, 16), activation="tanh", shared_trunk=shared, initial_std=0.5)
-    networks = build_actor_critic(network, 4, actions, torch.Generator().manual_seed(seed))
+    networks = build_actor_critic(network, ObservationShape(4), actions, torch.Generator().manual_seed(seed))
     schedule = PresetSchedule(
         AdaptiveKLLR(
             kind="adaptive_kl",

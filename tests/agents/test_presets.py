@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
-from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig, MLPConfig
+from deepracer_exp.config.driving import ObservationShape
+from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig, MLPConfig, NetworkConfig
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -25,9 +26,14 @@ def load(group, name, type_):
 @pytest.mark.parametrize("action_count", [7, None])
 @pytest.mark.parametrize("name", options("network"))
 def test_every_network_acts_and_judges(name, action_count):
-    config = load("network", name, MLPConfig)
-    networks = build_actor_critic(config, 11, action_count, torch.Generator())
-    steps = networks.value(networks.policy(TensorDict({"observation": torch.randn(3, 11)}, [3])))
+    config = load("network", name, NetworkConfig)
+    networks = build_actor_critic(
+        config, ObservationShape(11, (2, 120, 160)), action_count, torch.Generator()
+    )
+    pixels = torch.randint(0, 256, (3, 2, 120, 160), dtype=torch.uint8)
+    steps = networks.value(
+        networks.policy(TensorDict({"observation": torch.randn(3, 11), "pixels": pixels}, [3]))
+    )
     assert steps["action"].shape == ((3,) if action_count else (3, 2))
     assert steps["state_value"].shape == (3, 1)
 
@@ -42,7 +48,7 @@ def test_every_schedule_keeps_a_positive_rate_over_a_run(name):
 def test_every_algorithm_builds_and_names_one_length_of_an_iteration(name):
     config = load("algorithm", name, AlgorithmConfig)
     network = load("network", "mlp_small", MLPConfig)
-    networks = build_actor_critic(network, 11, 7, torch.Generator())
+    networks = build_actor_critic(network, ObservationShape(11), 7, torch.Generator())
     PPO(networks, config, PresetSchedule(load("lr_schedule", "constant", LRScheduleConfig)), seed=0)
     assert (config.frames_per_iteration is None) != (config.episodes_per_iteration is None)
 

@@ -11,6 +11,7 @@ from deepracer_exp.collectors.base import cores, worker_count
 from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.collectors.worker import EnvFactory
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import build_setup
@@ -28,7 +29,9 @@ def collect(tmp_path):
         experiment, _ = compose_experiment(["experiment=tiny", "collector.cars=4", *overrides])
         setup = build_setup(experiment)
         size = len(feature_names(experiment.observation))
-        networks = build_actor_critic(experiment.network, size, setup.actions.n, torch.Generator())
+        networks = build_actor_critic(
+            experiment.network, ObservationShape(size), setup.actions.n, torch.Generator()
+        )
         opened.append(LocalCollector(experiment.collector, setup, networks.policy, 61, tmp_path))
         opened[-1].networks = networks
         return opened[-1]

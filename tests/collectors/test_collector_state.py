@@ -11,6 +11,7 @@ from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput, RunFailed
@@ -36,7 +37,9 @@ class Driver:
         self._config, self._setup, self._folder = experiment.collector, build_setup(experiment), folder
         size = len(feature_names(experiment.observation))
         generator = torch.Generator().manual_seed(1)
-        self.policy = build_actor_critic(experiment.network, size, self._setup.actions.n, generator).policy
+        self.policy = build_actor_critic(
+            experiment.network, ObservationShape(size), self._setup.actions.n, generator
+        ).policy
         self._weights = copy.deepcopy(self.policy.state_dict())
         self._opened = []
 

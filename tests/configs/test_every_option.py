@@ -13,6 +13,7 @@ from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import conf_dir, groups, options
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.training.budget import Budget
@@ -26,7 +27,9 @@ DRIVEN = ("track", "car", "action_space", "observation", "randomization", "episo
 
 @cache
 def composed(group: str, name: str) -> tuple[Experiment, Composition]:
-    return compose_experiment([f"{group}={name}"])
+    """Compose an option into the default experiment, convolutions with a camera."""
+    sees = ["observation=camera"] if group == "network" and not name.startswith("mlp") else []
+    return compose_experiment([*sees, f"{group}={name}"])
 
 
 def test_the_groups_are_the_fields_of_an_experiment():
@@ -97,8 +100,9 @@ def test_every_option_puts_cars_on_the_road(group, name):
 
 @pytest.mark.parametrize("name", options("network"))
 def test_every_network_is_built(name):
-    network = composed("network", name)[0].network
-    assert build_actor_critic(network, 19, 5, torch.Generator().manual_seed(0)).policy
+    experiment = composed("network", name)[0]
+    network, observed = experiment.network, observation_shape(experiment.observation)
+    assert build_actor_critic(network, observed, 5, torch.Generator().manual_seed(0)).policy
 
 
 @pytest.mark.parametrize("name", options("lr_schedule"))

@@ -14,19 +14,22 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, build_action_space
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.export import onnx_file
 from deepracer_exp.export.onnx_file import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
 
 FEATURES = tuple(f"feature_{number}" for number in range(19))
+OBSERVATIONS = torch.randn(50, len(FEATURES), generator=torch.Generator().manual_seed(2))
+SHAPE, FACTS = ObservationShape(len(FEATURES)), {"run": "a", "features": FEATURES}
 
 
 def policy(*overrides: str, seed: int = 0) -> tuple[ActorCritic, ActionSpace]:
     experiment, _ = compose_experiment(overrides)
     actions = build_action_space(experiment.action_space)
     generator = torch.Generator().manual_seed(seed)
-    networks = build_actor_critic(experiment.network, len(FEATURES), actions.n, generator)
+    networks = build_actor_critic(experiment.network, SHAPE, actions.n, generator)
     with torch.no_grad():  # a fresh head is all but indifferent
         for parameter in networks.policy_head.parameters():
             parameter.mul_(3.0)
@@ -48,7 +51,7 @@ class Written:
 
 def written(path: Path, *overrides: str) -> Written:
     networks, actions = policy(*overrides)
-    assert 0 <= write_onnx(DeployedPolicy(networks, actions), FEATURES, {"run": "a"}, path) < 1e-5
+    assert 0 <= write_onnx(DeployedPolicy(networks, actions), SHAPE, FACTS, path) < 1e-5
     return Written(path, networks, actions)
 
 
@@ -107,9 +110,9 @@ def test_the_file_names_its_features(default):
 def test_a_file_of_another_network_is_detected(default):
     content = default.path.read_bytes()
     same = DeployedPolicy(default.networks, default.actions)
-    assert largest_difference(same, content, len(FEATURES)) < TOLERANCE
+    assert largest_difference(same, content, OBSERVATIONS) < TOLERANCE
     other = DeployedPolicy(*policy(seed=1))
-    assert largest_difference(other, content, len(FEATURES)) > 100 * TOLERANCE
+    assert largest_difference(other, content, OBSERVATIONS) > 100 * TOLERANCE
 
 
 def test_a_file_that_computes_something_else_is_not_written(programmed, tmp_path, monkeypatch):

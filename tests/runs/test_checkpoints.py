@@ -17,6 +17,7 @@ from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
 from deepracer_exp.runs.checkpoints import CheckpointStore
@@ -28,7 +29,7 @@ TRAINING = {"iteration": 0}
 def make_agent(seed: int) -> PPO:
     experiment, _ = compose_experiment(["experiment=tiny"])
     generator = torch.Generator().manual_seed(seed)
-    networks = build_actor_critic(experiment.network, 7, 5, generator)
+    networks = build_actor_critic(experiment.network, ObservationShape(7), 5, generator)
     with torch.no_grad():
         for parameter in networks.parameters():  # the same in every process, whatever its threads
             parameter.fill_(seed)

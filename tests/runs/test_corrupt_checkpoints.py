@@ -17,7 +17,7 @@ from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import pin, write_hashes
 from deepracer_exp.runs.checkpoints import CheckpointStore
@@ -29,7 +29,7 @@ STATE = {"cars": torch.arange(6.0), "streams": {"seed": 3}}
 def make_agent(experiment: Experiment, seed: int) -> PPO:
     networks = build_actor_critic(
         experiment.network,
-        len(feature_names(experiment.observation)),
+        observation_shape(experiment.observation),
         build_action_space(experiment.action_space).n,
         torch.Generator().manual_seed(seed),
     )

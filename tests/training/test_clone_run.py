@@ -13,7 +13,7 @@ from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.runs.resolve import resolve
 
@@ -32,7 +32,7 @@ def agent_of(folder, name: str) -> PPO:
     experiment = resolve(str(folder), folder.parent.parent, None).experiment
     networks = build_actor_critic(
         experiment.network,
-        len(feature_names(experiment.observation)),
+        observation_shape(experiment.observation),
         build_action_space(experiment.action_space).n,
         torch.Generator(),
     )

@@ -71,6 +71,7 @@ def whole(trained, *overrides):
             "lr_schedule=adaptive_kl",
         ),
         ("checkpoints.every=null", "reward=speed_on_track"),
+        ("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )

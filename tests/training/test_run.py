@@ -14,7 +14,7 @@ from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.trace import read_trace
-from deepracer_exp.env.observation import Features, feature_names
+from deepracer_exp.env.observation import Features, observation_shape
 from deepracer_exp.training.metrics import TIMES
 from deepracer_exp.training.run import train
 
@@ -315,7 +315,7 @@ def test_a_checkpoint_loads_back_into_a_fresh_agent(trained):
     experiment, _ = compose_experiment(["experiment=tiny"])
     out = next(value for name, value in reversed(state.items()) if "policy" in name and value.ndim == 2)
     networks = build_actor_critic(
-        experiment.network, len(feature_names(experiment.observation)), out.shape[0], torch.Generator()
+        experiment.network, observation_shape(experiment.observation), out.shape[0], torch.Generator()
     )
     agent = PPO(networks, experiment.algorithm, PresetSchedule(experiment.lr_schedule), 7)
     for name in ("best", "last"):

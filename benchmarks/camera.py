@@ -1,0 +1,158 @@
+"""Our camera beside MuJoCo's renderer, and beside pictures that AWS's simulator took.
+
+    python -m benchmarks.camera [--frames DIR] [--poses 200] [--json FILE]
+
+1. The same scene, 160x120: random poses on three tracks, with pitch and roll. `images_per_s` is ours, one core, in grey
+   as policies see it (in colour: `rgb_images_per_s`); `mujoco_images_per_s` is MuJoCo's with one sample a pixel and
+   without shadows, reflections and fog; `times` their ratio, measured in turns. `mujoco_640x480_images_per_s` is that
+   of pictures as AWS's simulator takes them, before it shrinks them.
+2. `difference_of_255`: mean over pixels and channels of the absolute difference from MuJoCo's picture of four times the
+   width and height with four samples a pixel, shrunk by taking means.
+3. `real_frames` (with `--frames`): pictures of AWS's simulator on re:Invent 2018 whose poses are unknown. Colours are
+   fitted on every other frame, once for all; each of the rest is explained by the pose whose picture differs least.
+   `difference_of_255`: mean over frames of the mean absolute difference in grey; `edge_error_px`: median distance of
+   the white lines' edges in the frame from those in our picture.
+
+MuJoCo draws with the library that `MUJOCO_GL` names; without a graphics card that is Mesa's renderer on the processor.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.pictures import GREY, floor_colors
+from deepracer_exp.sim.camera import Lens, take_pictures
+from deepracer_exp.sim.scenery import Scenery, build_scenery
+from deepracer_exp.tracks.track import Track
+
+from .report import benchmark_parser, number, table, write_json
+
+TRACKS = ("reinvent_base", "Oval_track", "Spain_track")
+WALLS_BEYOND_M = 0.91
+WIDTH, HEIGHT = 160, 120
+ROUNDS = 5
+WANTED = {"times": 100.0, "difference_of_255": 4.0}
+
+
+def service_lens(width: int, height: int) -> Lens:
+    """Return the default car's camera."""
+    car = compose_experiment([])[0].car
+    return Lens(
+        width=width,
+        height=height,
+        field_of_view_rad=1.13,
+        x_m=car.camera_x_m,
+        y_m=0.0,
+        z_m=car.camera_z_m,
+        pitch_rad=np.radians(car.camera_pitch_deg),
+    )
+
+
+def scenery_of(track: Track) -> Scenery:
+    """Return the track's outlines, with walls."""
+    return build_scenery(track.waypoints, (track.inner, track.outer), track.road, WALLS_BEYOND_M)
+
+
+def random_poses(track: Track, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Return poses near the centre line, some degrees off in every direction, (count, 5)."""
+    pose = track.start_pose(generator.random(count))
+    side = generator.uniform(-0.3, 0.3, count) * track.width_m
+    return np.column_stack(
+        [
+            pose.x - side * np.sin(pose.yaw_rad),
+            pose.y + side * np.cos(pose.yaw_rad),
+            pose.yaw_rad + generator.normal(0, 0.3, count),
+            generator.normal(0, 0.03, count),
+            generator.normal(0, 0.03, count),
+        ]
+    )
+
+
+def pictures(
+    lens: Lens, scenery: Scenery, poses: NDArray[np.float64], colors: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """Return our pictures, (N, channels, height, width)."""
+    out = np.empty((len(poses), colors.shape[-1], lens.height, lens.width), np.uint8)
+    everyone = np.broadcast_to(colors, (len(poses), *colors.shape))
+    return take_pictures(lens, scenery, poses, np.zeros(len(poses), np.intp), everyone, out)
+
+
+def per_second(count: int, work: Callable[..., object], *arguments: object) -> float:
+    """Return how many of `count` things are done a second of processor time."""
+    began = time.process_time()
+    work(*arguments)
+    return count / (time.process_time() - began)
+
+
+def compare_with_mujoco(count: int) -> dict[str, Any]:
+    """Measure speed and difference on each track."""
+    from .mujoco_scene import SceneRenderer, build_scene
+
+    generator = np.random.default_rng(0)
+    lens, large = service_lens(WIDTH, HEIGHT), service_lens(4 * WIDTH, 4 * HEIGHT)
+    rates: dict[str, list[float]] = {"ours": [], "rgb": [], "mujoco": [], "mujoco 640x480": []}
+    times, differences = [], {}
+    for name in TRACKS:
+        track = Track.from_config(compose_experiment([f"track={name}"])[0].tracks[name])
+        colors = floor_colors(track.floor)
+        grey = (colors @ GREY)[:, None]
+        scenery, poses = scenery_of(track), random_poses(track, -(-count // len(TRACKS)), generator)
+        fast = SceneRenderer(build_scene(track, lens, colors, 0, WALLS_BEYOND_M), WIDTH, HEIGHT)
+        plain = SceneRenderer(build_scene(track, large, colors, 0, WALLS_BEYOND_M), 4 * WIDTH, 4 * HEIGHT)
+        exact = SceneRenderer(build_scene(track, large, colors, 4, WALLS_BEYOND_M), 4 * WIDTH, 4 * HEIGHT)
+        pictures(lens, scenery, poses, grey), pictures(lens, scenery, poses, colors), fast.take(poses[0])
+        many = np.tile(poses, (20, 1))
+        for _ in range(ROUNDS):
+            rates["ours"].append(per_second(len(many), pictures, lens, scenery, many, grey))
+            rates["rgb"].append(per_second(len(many), pictures, lens, scenery, many, colors))
+            rates["mujoco"].append(per_second(len(poses), fast.take_all, poses))
+            times.append(rates["ours"][-1] / rates["mujoco"][-1])
+        rates["mujoco 640x480"].append(per_second(len(poses), plain.take_all, poses))
+        theirs = exact.take_all(poses).reshape(-1, HEIGHT, 4, WIDTH, 4, 3).mean(axis=(2, 4))
+        ours = np.moveaxis(pictures(lens, scenery, poses, colors), 1, -1)
+        differences[name] = float(np.abs(theirs - ours).mean())
+        for renderer in (fast, plain, exact):
+            renderer.close()
+    middle = {key: float(np.median(values)) for key, values in rates.items()}
+    return {
+        "images_per_s": middle["ours"],
+        "rgb_images_per_s": middle["rgb"],
+        "mujoco_images_per_s": middle["mujoco"],
+        "mujoco_640x480_images_per_s": middle["mujoco 640x480"],
+        "times": float(np.median(times)),
+        "difference_of_255": float(np.mean(list(differences.values()))),
+        "difference_by_track": differences,
+        "poses": count,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = benchmark_parser("camera", __doc__, command=None)
+    parser.add_argument("--frames", type=Path, help="folder of pictures of AWS's simulator, 160x120")
+    parser.add_argument("--poses", type=int, default=200)
+    options = parser.parse_args(arguments)
+    if "MUJOCO_GL" not in os.environ:
+        # MuJoCo reads it when it is imported, which has happened.
+        os.environ["MUJOCO_GL"] = "egl"
+        os.execv(sys.executable, [sys.executable, "-m", "benchmarks.camera", *(arguments or sys.argv[1:])])
+    summary = compare_with_mujoco(options.poses)
+    rows = [(key, number(value, 2)) for key, value in summary.items() if isinstance(value, float)]
+    if options.frames is not None:
+        from .camera_frames import explain_frames
+
+        summary["real_frames"] = explain_frames(options.frames, service_lens(WIDTH, HEIGHT))
+        rows += [(f"real frames: {key}", number(value, 2)) for key, value in summary["real_frames"].items()]
+    print(table(("figure", "value"), rows))
+    write_json(options.json, summary)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""The pictures of an observation: what each car's camera sees now, and saw before."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.config.track import FloorConfig
+from deepracer_exp.sim.batch import CarState
+from deepracer_exp.sim.camera import Lens, take_pictures
+from deepracer_exp.sim.scenery import MATERIALS, build_scenery, join_sceneries
+from deepracer_exp.tracks.track import Track
+
+GREY = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
+_WALL_Y_LIGHT = 0.3
+"""Brightness of the walls along the x axis relative to the others, in recorded frames (`benchmarks.camera`)."""
+_FAR_DASHES = 0.5
+"""Share of dashes in the centre line."""
+
+Pixels = NDArray[np.uint8]
+
+
+class Pictures:
+    """The cameras of N cars.
+
+    Attributes:
+        shape: channels, height and width of an observation; the channels of the oldest picture come first.
+    """
+
+    def __init__(self, config: CameraConfig, car: CarConfig, tracks: Sequence[Track]) -> None:
+        """Build the scenery.
+
+        Args:
+            config: size, colour and number of pictures.
+            car: where the camera sits.
+            tracks: of each course one.
+        """
+        self.shape = config.shape
+        self._now = config.shape[0] // config.frames  # channels of one moment
+        sides_m = (0.5 * config.stereo_m, -0.5 * config.stereo_m) if config.stereo_m else (0.0,)
+        self._lenses = [
+            Lens(
+                width=config.width,
+                height=config.height,
+                field_of_view_rad=np.radians(config.field_of_view_deg),
+                x_m=car.camera_x_m,
+                y_m=side_m,
+                z_m=car.camera_z_m,
+                pitch_rad=np.radians(car.camera_pitch_deg),
+            )
+            for side_m in sides_m
+        ]
+        self._tilt_rad_per_mps2 = np.radians(car.tilt_deg_per_mps2)
+        self._scenery = join_sceneries(
+            [
+                build_scenery(
+                    track.waypoints, (track.inner, track.outer), track.road, track.floor.walls_beyond_m
+                )
+                for track in tracks
+            ]
+        )
+        colors = np.stack([floor_colors(track.floor) for track in tracks])
+        self._colors = (colors @ GREY)[..., None] if config.color == "grey" else colors
+
+    def first(self, state: CarState, course: NDArray[np.intp]) -> Pixels:
+        """Return the observations of cars that stand, (n, *shape): as if they had always stood there.
+
+        Args:
+            state: of the cars, arrays (n,).
+            course: index of each car's track, (n,).
+        """
+        now = self._take(state, np.zeros((len(course), 2)), course)
+        return np.tile(now, (1, self.shape[0] // self._now, 1, 1))
+
+    def next(
+        self,
+        before: Pixels,
+        state: CarState,
+        acceleration_mps2: NDArray[np.float64],
+        course: NDArray[np.intp],
+        dropped: NDArray[np.bool_] | None,
+    ) -> Pixels:
+        """Return the observations after those of `before`, (n, *shape).
+
+        Args:
+            before: (n, *shape).
+            state: of the cars, arrays (n,).
+            acceleration_mps2: ahead and to the left, (n, 2).
+            course: index of each car's track, (n,).
+            dropped: cars that see nothing new, (n,); None: there are none.
+        """
+        now = self._take(state, acceleration_mps2, course)
+        out = now if self._now == self.shape[0] else np.concatenate([before[:, self._now :], now], axis=1)
+        if dropped is not None:
+            out[dropped] = before[dropped]
+        return out
+
+    def _take(
+        self, state: CarState, acceleration_mps2: NDArray[np.float64], course: NDArray[np.intp]
+    ) -> Pixels:
+        ahead, left = self._tilt_rad_per_mps2 * acceleration_mps2.T
+        poses = np.stack([state.x_m, state.y_m, state.yaw_rad, -ahead, left], axis=1)
+        colors = self._colors[course]
+        shots = [
+            take_pictures(
+                lens,
+                self._scenery,
+                poses,
+                course,
+                colors,
+                np.empty((len(course), colors.shape[-1], lens.height, lens.width), np.uint8),
+            )
+            for lens in self._lenses
+        ]
+        return shots[0] if len(shots) == 1 else np.concatenate(shots, axis=1)
+
+
+def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:
+    """Return red, green and blue of MATERIALS, 0 to 255, (materials, 3)."""
+    road, dash, wall = _rgb(floor.road_color), _rgb(floor.dash_color), _rgb(floor.wall_color)
+    colors = {
+        "sky": _rgb(floor.sky_color),
+        "field": _rgb(floor.ground_color),
+        "road": road,
+        "line": _rgb(floor.line_color),
+        "dash": dash,
+        "far_dash": road + _FAR_DASHES * (dash - road),
+        "wall_x": wall,
+        "wall_y": _WALL_Y_LIGHT * wall,
+    }
+    return np.array([colors[material] for material in MATERIALS], np.float32)
+
+
+def _rgb(color: str) -> NDArray[np.float32]:
+    return np.array([int(color[at : at + 2], 16) for at in (1, 3, 5)], np.float32)

@@ -1,0 +1,270 @@
+"""The pictures of all cars' cameras at once, exact to the share of each pixel that an outline covers.
+
+Straight edges of the scenery are straight in the picture. Where an edge crosses a column, the colour below differs from
+the one above by a known amount: the sum of these changes from the top of the column down is the picture. A change
+within a pixel counts by the area below the edge, so that each pixel is the mean of what it sees (as glyph rasterisers
+do, R. Levien, "Inside the fastest font renderer in the world", 2016).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from .scenery import Scenery
+
+NEAREST_M = 0.02
+"""Nothing nearer to the picture's plane is seen (deepracer-simapp, `bundle/models/camera/model.sdf`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """A pinhole camera bolted to the chassis.
+
+    Attributes:
+        width, height: of the picture, pixels.
+        field_of_view_rad: horizontal.
+        x_m, y_m, z_m: from the chassis origin: ahead, to the left, above the floor.
+        pitch_rad: downwards.
+    """
+
+    width: int
+    height: int
+    field_of_view_rad: float
+    x_m: float
+    y_m: float
+    z_m: float
+    pitch_rad: float
+
+
+def take_pictures(
+    lens: Lens,
+    scenery: Scenery,
+    poses: ArrayLike,
+    track_index: NDArray[np.intp],
+    colors: NDArray[np.float32],
+    out: NDArray[np.uint8],
+) -> NDArray[np.uint8]:
+    """Take a picture of each of N cars.
+
+    Args:
+        lens: of all cars.
+        scenery: of all tracks.
+        poses: x and y of the chassis origin in metres, yaw, pitch (nose down) and roll (to the right) in radians,
+            (N, 5).
+        track_index: of each car's track in the scenery, (N,).
+        colors: of each car's `scenery.MATERIALS`, 0 to 255, (N, materials, channels).
+        out: (N, channels, height, width), written and returned.
+    """
+    half_width = np.tan(0.5 * lens.field_of_view_rad)
+    mount = (lens.x_m, lens.y_m, lens.z_m, lens.pitch_rad)
+    _take(
+        np.ascontiguousarray(poses, np.float64),
+        track_index,
+        np.ascontiguousarray(colors, np.float32),
+        scenery.points_m,
+        scenery.joined,
+        scenery.pieces,
+        scenery.first_piece,
+        mount,
+        0.5 * lens.width / half_width,
+        out,
+    )
+    return out
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _take(  # type: ignore[no-untyped-def]
+    poses, track_index, colors, points, joined, pieces, first_piece, mount, focal, out
+):
+    """Take the pictures; `mount` is x, y, z and pitch of the camera, `focal` the focal length in pixels."""
+    cars, channels, height, width = out.shape
+    # The rows beyond the picture take what edges at its bottom leave to those below.
+    changes = np.zeros((channels, (height + 3) * width), np.float32)
+    running = np.empty(width, np.float32)
+    change = np.empty(channels, np.float32)
+    rotation = np.empty((3, 3))
+    mount_x, mount_y, mount_z, tilt = mount
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    middle_x, middle_y = 0.5 * width, 0.5 * height
+    # Of the planes through the picture's left and right edges: normal's share along the axis and across.
+    side_axis = middle_x / np.hypot(middle_x, focal)
+    side_across = focal / np.hypot(middle_x, focal)
+    for car in range(cars):
+        _rotation(poses[car, 2], poses[car, 3], poses[car, 4], rotation)
+        eye_x = poses[car, 0] + rotation[0, 0] * mount_x + rotation[0, 1] * mount_y + rotation[0, 2] * mount_z
+        eye_y = poses[car, 1] + rotation[1, 0] * mount_x + rotation[1, 1] * mount_y + rotation[1, 2] * mount_z
+        eye_z = rotation[2, 0] * mount_x + rotation[2, 1] * mount_y + rotation[2, 2] * mount_z
+        # The picture's axis, its right and its bottom, in the world.
+        axis_x, axis_y, axis_z = (
+            rotation[0, 0] * cos - rotation[0, 2] * sin,
+            rotation[1, 0] * cos - rotation[1, 2] * sin,
+            rotation[2, 0] * cos - rotation[2, 2] * sin,
+        )
+        down_x, down_y, down_z = (
+            -rotation[0, 0] * sin - rotation[0, 2] * cos,
+            -rotation[1, 0] * sin - rotation[1, 2] * cos,
+            -rotation[2, 0] * sin - rotation[2, 2] * cos,
+        )
+        right_x, right_y, right_z = -rotation[0, 1], -rotation[1, 1], -rotation[2, 1]
+        track = track_index[car]
+        for index in range(first_piece[track], first_piece[track + 1]):
+            piece = pieces[index]
+            from_x, from_y = piece.middle_m[0] - eye_x, piece.middle_m[1] - eye_y
+            reach = np.float64(piece.radius_m) + 0.2
+            square = from_x * from_x + from_y * from_y
+            if square < piece.near_m * piece.near_m or square >= piece.far_m * piece.far_m:
+                continue
+            depth = from_x * axis_x + from_y * axis_y
+            across = from_x * right_x + from_y * right_y
+            if depth < -reach or side_across * abs(across) - side_axis * depth > reach:
+                continue
+            for channel in range(channels):
+                change[channel] = colors[car, piece.outside, channel] - colors[car, piece.inside, channel]
+            was_depth = was_x = was_y = 0.0
+            for point in range(piece.first, piece.last):
+                x, y, z = points[point, 0] - eye_x, points[point, 1] - eye_y, points[point, 2] - eye_z
+                depth = x * axis_x + y * axis_y + z * axis_z
+                right = x * right_x + y * right_y + z * right_z
+                down = x * down_x + y * down_y + z * down_z
+                if joined[point] and (depth > NEAREST_M or was_depth > NEAREST_M):
+                    ax, ay, bx, by, a_depth, b_depth = was_x, was_y, right, down, was_depth, depth
+                    # What is cut off here lies beside or below the picture.
+                    if a_depth < NEAREST_M:
+                        share = (NEAREST_M - a_depth) / (b_depth - a_depth)
+                        ax, ay, a_depth = ax + share * (bx - ax), ay + share * (by - ay), NEAREST_M
+                    elif b_depth < NEAREST_M:
+                        share = (NEAREST_M - b_depth) / (a_depth - b_depth)
+                        bx, by, b_depth = bx + share * (ax - bx), by + share * (ay - by), NEAREST_M
+                    a_focal, b_focal = focal / a_depth, focal / b_depth
+                    _add_edge(
+                        changes,
+                        height,
+                        width,
+                        middle_x + ax * a_focal,
+                        middle_y + ay * a_focal,
+                        middle_x + bx * b_focal,
+                        middle_y + by * b_focal,
+                        change,
+                    )
+                was_depth, was_x, was_y = depth, right, down
+        for channel in range(channels):
+            running[:] = colors[car, 0, channel] + np.float32(0.5)  # the sky, rounded
+            for row in range(height):
+                first = row * width
+                for column in range(width):
+                    running[column] += changes[channel, first + column]
+                    changes[channel, first + column] = 0
+                    out[car, channel, row, column] = np.uint8(
+                        min(max(running[column], np.float32(0)), np.float32(255))
+                    )
+            changes[channel, height * width :] = 0
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
+def _add_edge(changes, height, width, ax, ay, bx, by, change):  # type: ignore[no-untyped-def]
+    """Add an edge from a to b, in pixels: `change` below it where it runs to the right, else its opposite.
+
+    `changes` is (channels, (height + 3) * width): what lies below the picture goes to rows that nobody sees.
+    """
+    sign = 1.0
+    if ax > bx:
+        ax, ay, bx, by, sign = bx, by, ax, ay, -1.0
+    if bx <= 0.0 or ax >= width or ax == bx or (ay >= height and by >= height):
+        return
+    slope = (by - ay) / (bx - ax)
+    if ax < 0.0:
+        ay -= ax * slope
+        ax = 0.0
+    if bx > width:
+        by -= (bx - width) * slope
+        bx = np.float64(width)
+    if abs(slope) <= 1.0:
+        _add_flat(changes, height, width, ax, ay, bx, slope, sign, change)
+        return
+    # What lies above or below the picture, as if it were level there.
+    if min(ay, by) < 0.0:
+        x = ax - ay / slope
+        if max(ay, by) <= 0.0:
+            _add_flat(changes, height, width, ax, 0.0, bx, 0.0, sign, change)
+            return
+        if ay < 0.0:
+            _add_flat(changes, height, width, ax, 0.0, x, 0.0, sign, change)
+            ax, ay = x, 0.0
+        else:
+            _add_flat(changes, height, width, x, 0.0, bx, 0.0, sign, change)
+            bx, by = x, 0.0
+    if ay > height:
+        ax, ay = ax + (height - ay) / slope, np.float64(height)
+    if by > height:
+        bx, by = bx + (height - by) / slope, np.float64(height)
+    _add_steep(changes, width, ax, ay, bx, by, 1.0 / slope, sign, change)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
+def _add_flat(changes, height, width, ax, ay, bx, slope, sign, change):  # type: ignore[no-untyped-def]
+    """Add an edge column by column; in one it crosses two rows at most. No branches: they could not be foreseen."""
+    bottom = np.float64(height)
+    for column in range(int(ax), int(np.ceil(bx))):
+        begin, end = max(ax, np.float64(column)), min(bx, column + 1.0)
+        weight = sign * (end - begin)
+        y = min(max(ay + (begin - ax) * slope, 0.0), bottom)
+        end_y = min(max(ay + (end - ax) * slope, 0.0), bottom)
+        low, high = min(y, end_y), max(y, end_y)
+        row = int(low)
+        # Mean height below the edge down to the end of its first row, and of the one after.
+        in_first = row + 1.0 - low
+        mean = 0.5 * (high - low)
+        first = in_first - mean if low + in_first >= high else 0.25 * in_first * in_first / mean
+        both = in_first + 1.0 - mean
+        at = np.uint64(row * width + column)
+        for channel in range(len(change)):
+            step = np.float32(weight) * change[channel]
+            changes[channel, at] += np.float32(first) * step
+            changes[channel, at + np.uint64(width)] += np.float32(both - 2.0 * first) * step
+            changes[channel, at + np.uint64(2 * width)] += np.float32(1.0 - both + first) * step
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
+def _add_steep(changes, width, ax, ay, bx, by, x_per_row, sign, change):  # type: ignore[no-untyped-def]
+    """Add an edge within the picture row by row; in one it crosses two columns at most."""
+    x_at = ax - ay * x_per_row
+    low, high = min(ay, by), max(ay, by)
+    for row in range(int(low), int(np.ceil(high))):
+        begin, end = max(low, np.float64(row)), min(high, row + 1.0)
+        x, end_x = x_at + begin * x_per_row, x_at + end * x_per_row
+        left, right = min(x, end_x), max(x, end_x)
+        column = min(max(int(left), 0), width - 1)
+        border = min(max(left, column + 1.0), right)
+        # Of the two parts: width, and mean height down to the end of the row.
+        at_left = row + 1.0 - (begin if x <= end_x else end)
+        per_x = (
+            (at_left - (row + 1.0 - (end if x <= end_x else begin))) / (right - left) if right > left else 0.0
+        )
+        for part in range(2):
+            wide = border - left if part == 0 else right - border
+            middle = 0.5 * (left + border) if part == 0 else 0.5 * (border + right)
+            below = at_left - (middle - left) * per_x
+            at = np.uint64(row * width + min(column + part, width - 1))
+            for channel in range(len(change)):
+                step = np.float32(sign * wide) * change[channel]
+                changes[channel, at] += np.float32(below) * step
+                changes[channel, at + np.uint64(width)] += np.float32(1.0 - below) * step
+
+
+@njit(cache=True)
+def _rotation(yaw, pitch, roll, out):  # type: ignore[no-untyped-def]
+    """Write the matrix whose columns are ahead, left and up of a chassis: roll, then pitch, then yaw."""
+    cos_y, sin_y = np.cos(yaw), np.sin(yaw)
+    cos_p, sin_p = np.cos(pitch), np.sin(pitch)
+    cos_r, sin_r = np.cos(roll), np.sin(roll)
+    out[0, 0] = cos_y * cos_p
+    out[1, 0] = sin_y * cos_p
+    out[2, 0] = -sin_p
+    out[0, 1] = cos_y * sin_p * sin_r - sin_y * cos_r
+    out[1, 1] = sin_y * sin_p * sin_r + cos_y * cos_r
+    out[2, 1] = cos_p * sin_r
+    out[0, 2] = cos_y * sin_p * cos_r + sin_y * sin_r
+    out[1, 2] = sin_y * sin_p * cos_r - cos_y * sin_r
+    out[2, 2] = cos_p * cos_r

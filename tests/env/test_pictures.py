@@ -1,0 +1,138 @@
+import gymnasium
+import numpy as np
+import pytest
+from torchrl.envs.utils import check_env_specs
+
+import deepracer_exp.env.gym_env  # noqa: F401 - registers DeepRacer-v0
+from deepracer_exp.config.track import FloorConfig
+from deepracer_exp.env.pictures import GREY, floor_colors
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.sim.scenery import MATERIALS
+
+SMALL = "observation=camera_small"
+AHEAD = np.array([7])
+
+
+def drive(race: Race, steps: int) -> list[np.ndarray]:
+    return [(race.step(np.full(race.n_cars, 7)), race.pixels)[1] for _ in range(steps)]
+
+
+@pytest.mark.parametrize("space", ["action_space=discrete", "action_space=continuous"])
+def test_specs_and_rollouts_agree(setup_of, space):
+    check_env_specs(RaceEnv(Race(setup_of(SMALL, space), 3)))
+
+
+def test_without_a_camera_nothing_is_drawn(race_of):
+    race = race_of(n_cars=2)
+    assert set(race.seen) == {"observation"}
+    assert race.pixels.size == 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "shape"),
+    [
+        (["observation=camera"], (1, 120, 160)),
+        ([SMALL, "observation.camera.color=rgb"], (3, 60, 80)),
+        ([SMALL, "observation.camera.frames=3"], (3, 60, 80)),
+        (["observation=stereo", "observation.camera.frames=2"], (4, 120, 160)),
+    ],
+)
+def test_the_picture_has_the_shape_that_was_asked_for(race_of, overrides, shape):
+    assert race_of(*overrides, n_cars=2).pixels.shape == (2, *shape)
+
+
+def test_grey_is_the_services_mixture_of_red_green_and_blue(race_of):
+    grey, rgb = (race_of(SMALL, f"observation.camera.color={color}").pixels[0] for color in ("grey", "rgb"))
+    mixed = np.einsum("chw,c->hw", rgb.astype(float), GREY)
+    assert np.abs(mixed - grey[0]).max() < 1.01
+
+
+def test_a_started_car_has_seen_its_first_picture_all_along_and_then_the_last_ones(race_of):
+    race = race_of(SMALL, "observation.camera.frames=3")
+    first = race.pixels[0]
+    assert np.array_equal(first[0], first[1])
+    assert np.array_equal(first[1], first[2])
+    one = race_of(SMALL)
+    newest = [picture[0, 0] for picture in drive(one, 8)]
+    stacks = [picture[0] for picture in drive(race, 8)]
+    for at in range(2, 8):
+        assert np.array_equal(stacks[at], np.stack(newest[at - 2 : at + 1]))
+    assert not np.array_equal(newest[-1], newest[-2])
+
+
+def test_two_cameras_see_what_one_sees_from_either_side(race_of):
+    """Half the distance to the left: what lies ahead moves to the right."""
+    left, right = race_of("observation=stereo").pixels[0].astype(int)
+    assert not np.array_equal(left, right)
+    middle = race_of("observation=camera").pixels[0, 0].astype(int)
+    row = 80  # about 0.3 m ahead
+    shifts = range(-20, 21)
+
+    def shift_of(picture: np.ndarray) -> int:
+        return min(
+            shifts, key=lambda by: np.abs(np.roll(middle[row], by)[30:130] - picture[row, 30:130]).sum()
+        )
+
+    assert shift_of(left) > 0 > shift_of(right)
+
+
+def test_starting_one_car_leaves_what_the_others_see(race_of):
+    race = race_of(SMALL, n_cars=3)
+    drive(race, 5)
+    before = race.pixels
+    race.reset(np.array([1]))
+    assert np.array_equal(race.pixels[[0, 2]], before[[0, 2]])
+    assert not np.array_equal(race.pixels[1], before[1])
+    assert np.array_equal(race.pixels[1], race_of(SMALL, "episode.start_offset=0.05", n_cars=3).pixels[1])
+
+
+def test_a_dropped_observation_repeats_the_picture_too(race_of):
+    race = race_of(SMALL, "randomization.observation_dropout=[0.5,0.5]", n_cars=40)
+    repeated = np.zeros((2, 40), bool)
+    for _ in range(10):
+        pixels, features = race.pixels, race.observation
+        race.step(np.full(40, 7))
+        repeated[0] = (race.pixels == pixels).all(axis=(1, 2, 3))
+        repeated[1] = (race.observation == features).all(axis=1)
+    assert np.array_equal(*repeated)
+    assert 5 < repeated[0].sum() < 35
+
+
+def test_a_race_put_back_sees_on_as_the_original(race_of):
+    overrides = (SMALL, "observation.camera.frames=2", "randomization=sim2real")
+    race, other = race_of(*overrides, n_cars=4), race_of(*overrides, n_cars=4)
+    drive(race, 7)
+    other.load_state_dict(race.state_dict())
+    for ours, theirs in zip(drive(race, 5), drive(other, 5), strict=True):
+        assert np.array_equal(ours, theirs)
+
+
+def test_a_car_that_accelerates_looks_up(race_of):
+    """Its nose rises, so the horizon sinks in the picture."""
+    flat, leaning = (race_of(SMALL, f"car.tilt_deg_per_mps2={tilt}") for tilt in (0, 2))
+    drive(flat, 3), drive(leaning, 3)
+    ahead = leaning._batch.acceleration_mps2[0, 0]
+    assert ahead > 0.3
+    wall = [(race.pixels[0, 0] < 60).argmin(axis=0).mean() for race in (flat, leaning)]
+    assert wall[1] > wall[0]
+
+
+def test_every_material_has_a_colour_of_its_floor():
+    floor = FloorConfig(friction=1.0, road_color="#102030", ground_color="#405060", line_color="#708090")
+    colors = dict(zip(MATERIALS, floor_colors(floor).tolist(), strict=True))
+    assert colors["road"] == [16, 32, 48]
+    assert colors["field"] == [64, 80, 96]
+    assert colors["line"] == [112, 128, 144]
+    assert colors["far_dash"] == [(a + b) / 2 for a, b in zip(colors["road"], colors["dash"], strict=True)]
+
+
+def test_gymnasium_sees_pictures_alone():
+    env = gymnasium.make("DeepRacer-v0", overrides=[SMALL])
+    observation, _ = env.reset()
+    assert env.observation_space.contains(observation)
+    assert observation.shape == (1, 60, 80)
+    cars = gymnasium.make_vec("DeepRacer-v0", num_envs=3, overrides=[SMALL])
+    cars.reset()
+    observations, *_ = cars.step(np.full(3, 7))
+    assert cars.observation_space.contains(observations)

@@ -1,0 +1,100 @@
+"""Trainings from pictures: what holds of runs with features holds of them."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from mlflow import MlflowClient
+from mlflow.models import Model
+from tensordict import TensorDict
+
+import deepracer_exp.env.gym_env  # noqa: F401 - registers DeepRacer-v0
+from deepracer_exp import load_policy
+from tests.conftest import IN_PROCESS
+
+CAMERA = (
+    "observation=camera_small",
+    "collector.cars=8",
+    "algorithm.frames_per_iteration=512",
+    "budget.env_steps=1024",
+    "checkpoints.every=null",
+)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("network.critic=pictures", "action_space=continuous"),
+        ("network.critic=pictures", "network.shared_trunk=true", "observation.camera.color=rgb"),
+        ("observation=stereo", "network=medium", "budget.env_steps=512"),
+        ("observation=camera", "network=deep", "observation.camera.frames=2", "budget.env_steps=512"),
+    ],
+    ids=lambda overrides: " ".join(overrides) or "as it is",
+)
+def test_every_kind_of_picture_and_network_trains_and_is_raced(trained, call, overrides):
+    ended = trained(*CAMERA, *overrides)
+    assert ended.code == 0, ended.stderr
+    losses = [row["value_loss"] for row in ended.metrics]
+    assert len(set(losses)) == len(losses)
+    assert all(np.isfinite(row["grad_norm"]) and row["grad_norm"] > 0 for row in ended.metrics)
+    raced = call("evaluate", str(ended.folder), "evaluation.trials=2")
+    assert raced.code == 0, raced.stderr
+
+
+def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_path):
+    ended = trained(*CAMERA)
+    exported = call("export", str(ended.folder), "format=onnx", "-o", str(tmp_path / "policy.onnx"))
+    assert exported.code == 0, exported.stderr
+    env = gymnasium.make_vec("DeepRacer-v0", num_envs=6, overrides=["observation=camera_small"])
+    pixels, _ = env.reset()
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    theirs = session.run(["policy"], {"pixels": pixels})[0]
+    policy = load_policy(ended.folder)
+    with torch.no_grad():
+        logits = policy.get_dist(policy_input(pixels)).probs
+    assert np.abs(theirs - logits.numpy()).max() < 0.01  # products in bfloat16
+    assert np.abs(theirs[0] - theirs[-1]).max() > 0
+
+
+def policy_input(pixels: np.ndarray):
+    return TensorDict({"pixels": torch.from_numpy(pixels)}, [len(pixels)])
+
+
+def test_a_clone_keeps_what_the_networks_were_made_for(call):
+    parent = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512").folder
+    cloned = call("clone", str(parent), "budget.env_steps=512", "tracking=off")
+    assert cloned.code == 0, cloned.stderr
+    other = call("clone", str(parent), "observation.camera.width=100")
+    assert other.code == 2
+    assert "camera.width: 80 -> 100" in other.complaint
+
+
+def test_a_promoted_model_says_that_it_reads_pictures(call, tmp_path):
+    ended = call("train", *IN_PROCESS, *CAMERA, "tracking=mlflow", "budget.env_steps=512", "name=eye")
+    assert ended.code == 0, ended.stderr
+    promoted = call("runs", "promote", ended.folder.name)
+    assert promoted.code == 0, promoted.stderr
+    client = MlflowClient(f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
+    version = client.get_model_version_by_alias("eye", "champion")
+    logged = client.get_logged_model(version.source.removeprefix("models:/"))
+    folder = Path(logged.artifact_location.removeprefix("file://"))
+    (spec,) = Model.load(str(folder / "MLmodel")).signature.inputs.inputs
+    assert (spec.name, spec.type, spec.shape) == ("pixels", np.dtype(np.uint8), (-1, 1, 60, 80))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("observation=camera", "network=mlp_small"), ("network", "features", "cnn_small")),
+        (("network=shallow",), ("network", "pictures", "observation=camera")),
+        (("observation=camera_small", "network=deep"), ("network.kernels", "80x60")),
+        (("observation=camera_small", "network.shared_trunk=true"), ("shared_trunk", "features")),
+        (("observation=camera_small", "network.strides=[1]"), ("network", "strides")),
+    ],
+)
+def test_a_network_that_cannot_read_what_is_seen_is_refused_in_one_line(call, overrides, words):
+    call("train", *overrides).assert_bad_input(*words)
