@@ -6,28 +6,56 @@ As many cars as the experiment has over all its processes are driven through `De
 physics thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights
 are the experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock
 starts; then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
+
+With a camera it is the peer's `CnnPolicy` with the experiment's convolutions, which policy and value share, as is usual
+there; a value network of features beside pictures is not.
 """
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
 from deepracer_exp.collectors.base import worker_count
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import MLPConfig
+from deepracer_exp.config.learning import CNNConfig, MLPConfig
 from deepracer_exp.env.gym_env import DeepRacerVectorEnv
 from deepracer_exp.env.setup import build_setup
 
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
+
+
+class Convolutions(BaseFeaturesExtractor):
+    """The experiment's layers for pictures."""
+
+    def __init__(self, observation_space: spaces.Box, network: CNNConfig) -> None:
+        super().__init__(observation_space, network.hidden[-1])
+        channels, height, width = observation_space.shape
+        layers: list[torch.nn.Module] = []
+        for filters, kernel, stride in zip(network.filters, network.kernels, network.strides, strict=True):
+            layers += [torch.nn.Conv2d(channels, filters, kernel, stride), _ACTIVATIONS[network.activation]()]
+            channels = filters
+        units = channels * math.prod(network.outputs(height, width))
+        layers.append(torch.nn.Flatten())
+        for hidden in network.hidden:
+            layers += [torch.nn.Linear(units, hidden), _ACTIVATIONS[network.activation]()]
+            units = hidden
+        self.layers = torch.nn.Sequential(*layers)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(observations)
+        return features
 
 
 class SB3Cars(VecEnv):
@@ -75,11 +103,28 @@ def build(experiment: Experiment, physics_threads: int) -> PPO:
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
     assert algorithm.frames_per_iteration is not None
-    assert isinstance(network, MLPConfig)
     n_cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
-    hidden = list(network.hidden)
+    if isinstance(network, MLPConfig):
+        hidden = list(network.hidden)
+        policy, layers = (
+            "MlpPolicy",
+            {
+                "net_arch": {"pi": hidden, "vf": hidden},
+                "activation_fn": _ACTIVATIONS[network.activation],
+            },
+        )
+    else:
+        assert isinstance(network, CNNConfig)
+        policy, layers = (
+            "CnnPolicy",
+            {
+                "net_arch": [],
+                "features_extractor_class": Convolutions,
+                "features_extractor_kwargs": {"network": network},
+            },
+        )
     return PPO(
-        "MlpPolicy",
+        policy,
         SB3Cars(DeepRacerVectorEnv(n_cars, threads=physics_threads, setup=build_setup(experiment))),
         learning_rate=algorithm.lr,
         n_steps=-(-algorithm.frames_per_iteration // n_cars),
@@ -91,10 +136,7 @@ def build(experiment: Experiment, physics_threads: int) -> PPO:
         ent_coef=algorithm.entropy_coeff,
         vf_coef=algorithm.critic_coeff,
         max_grad_norm=algorithm.max_grad_norm or float("inf"),
-        policy_kwargs={
-            "net_arch": {"pi": hidden, "vf": hidden},
-            "activation_fn": _ACTIVATIONS[network.activation],
-        },
+        policy_kwargs=layers,
         seed=experiment.seed,
         device="cpu",
     )

@@ -184,6 +184,36 @@ OffsetRange = Annotated[tuple[Offset, ...], _TWO, _ORDERED]
 DeviationRange = Annotated[tuple[Deviation, ...], _TWO, _ORDERED]
 
 
+Height = Annotated[float, Field(ge=-0.1, le=0.5, allow_inf_nan=False)]
+HeightRange = Annotated[tuple[Height, ...], _TWO, _ORDERED]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureRandomizationConfig:
+    """What pictures differ in: the lowest and highest value of each quantity, drawn for each episode of each car."""
+
+    brightness_scale: ScaleRange
+    """Factor on all values."""
+    contrast_scale: ScaleRange
+    """Factor on the distance of all values from the middle grey."""
+    gamma_scale: ScaleRange
+    """Exponent of all values, where white is 1: above 1 dark colours become darker."""
+    color_noise: ShareRange
+    """Standard deviation of the factor on red, green and blue of each material."""
+    light: ShareRange
+    """How much darker a shadow in the picture is at its middle, or a spot of light brighter."""
+    blur: ShareRange
+    """Share of a pixel that comes from its four neighbours."""
+    pixel_noise: ShareRange
+    """Standard deviation of the Gaussian noise on each pixel at each step, as a fraction of white."""
+    height_m: HeightRange
+    """Added to the height of the camera."""
+    pitch_deg: OffsetRange
+    """Added to the pitch of the camera, downwards."""
+    field_of_view_scale: ScaleRange
+    """Factor on the tangent of half the field of view."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
     """Domain randomization: the lowest and highest value of each quantity; each episode of each car draws its own.
@@ -213,8 +243,10 @@ class RandomizationConfig:
     """Standard deviation of the Gaussian noise on each measured feature, in units of its scale."""
     observation_dropout: ShareRange
     """Probability at each step that the previous observation is repeated."""
+    pictures: PictureRandomizationConfig | None = None
+    """Of a camera's pictures; None: nothing."""
 
 
-QUANTITIES = tuple(field.name for field in fields(RandomizationConfig))
+QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name != "pictures")
 OFF = {name: 1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES}
 """The value of each quantity that has no effect."""

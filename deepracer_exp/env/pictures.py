@@ -6,12 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.config.driving import CameraConfig, PictureRandomizationConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.sim.camera import Lens, take_pictures
 from deepracer_exp.sim.scenery import MATERIALS, build_scenery, join_sceneries
 from deepracer_exp.tracks.track import Track
+
+from .picture_randomization import PictureRandomization
+from .randomization import Ids
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
@@ -30,14 +33,28 @@ class Pictures:
         shape: channels, height and width of an observation; the channels of the oldest picture come first.
     """
 
-    def __init__(self, config: CameraConfig, car: CarConfig, tracks: Sequence[Track]) -> None:
+    def __init__(
+        self,
+        config: CameraConfig,
+        car: CarConfig,
+        tracks: Sequence[Track],
+        randomizations: Sequence[PictureRandomizationConfig | None],
+        cars: Sequence[int],
+    ) -> None:
         """Build the scenery.
 
         Args:
             config: size, colour and number of pictures.
             car: where the camera sits.
             tracks: of each course one.
+            randomizations: of each car, (N,).
+            cars: their numbers over all processes.
         """
+        self._varied = (
+            PictureRandomization(randomizations, cars)
+            if any(one is not None for one in randomizations)
+            else None
+        )
         self.shape = config.shape
         self._now = config.shape[0] // config.frames  # channels of one moment
         sides_m = (0.5 * config.stereo_m, -0.5 * config.stereo_m) if config.stereo_m else (0.0,)
@@ -62,17 +79,29 @@ class Pictures:
                 for track in tracks
             ]
         )
-        colors = np.stack([floor_colors(track.floor) for track in tracks])
-        self._colors = (colors @ GREY)[..., None] if config.color == "grey" else colors
+        self._floor_colors = np.stack([floor_colors(track.floor) for track in tracks])
+        self._grey = config.color == "grey"
 
-    def first(self, state: CarState, course: NDArray[np.intp]) -> Pixels:
-        """Return the observations of cars that stand, (n, *shape): as if they had always stood there.
+    def seed(self, seed: int) -> None:
+        """Start the random streams from `seed`."""
+        if self._varied is not None:
+            self._varied.seed(seed)
+
+    def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
+        """Draw what pictures differ in for new episodes of the cars `ids`."""
+        if self._varied is not None:
+            self._varied.begin(ids, episodes)
+
+    def first(self, ids: Ids, state: CarState, course: NDArray[np.intp]) -> Pixels:
+        """Return the observations of the cars `ids`, which stand, (n, *shape): as if they had always stood there.
 
         Args:
-            state: of the cars, arrays (n,).
-            course: index of each car's track, (n,).
+            ids: indices of the cars, (n,).
+            state: of these cars, arrays (n,).
+            course: index of each of these cars' track, (n,).
         """
-        now = self._take(state, np.zeros((len(course), 2)), course)
+        still = np.zeros((len(course), 2))
+        now = self._take(ids, state, still, course, np.zeros(len(course), np.int64))
         return np.tile(now, (1, self.shape[0] // self._now, 1, 1))
 
     def next(
@@ -81,41 +110,48 @@ class Pictures:
         state: CarState,
         acceleration_mps2: NDArray[np.float64],
         course: NDArray[np.intp],
+        steps: NDArray[np.int64],
         dropped: NDArray[np.bool_] | None,
     ) -> Pixels:
-        """Return the observations after those of `before`, (n, *shape).
+        """Return the observations of all cars after those of `before`, (N, *shape).
 
         Args:
-            before: (n, *shape).
-            state: of the cars, arrays (n,).
-            acceleration_mps2: ahead and to the left, (n, 2).
-            course: index of each car's track, (n,).
-            dropped: cars that see nothing new, (n,); None: there are none.
+            before: (N, *shape).
+            state: arrays (N,).
+            acceleration_mps2: ahead and to the left, (N, 2).
+            course: index of each car's track, (N,).
+            steps: control steps of each car's episode, (N,).
+            dropped: cars that see nothing new, (N,); None: there are none.
         """
-        now = self._take(state, acceleration_mps2, course)
+        now = self._take(np.arange(len(before)), state, acceleration_mps2, course, steps)
         out = now if self._now == self.shape[0] else np.concatenate([before[:, self._now :], now], axis=1)
         if dropped is not None:
             out[dropped] = before[dropped]
         return out
 
     def _take(
-        self, state: CarState, acceleration_mps2: NDArray[np.float64], course: NDArray[np.intp]
+        self,
+        ids: Ids,
+        state: CarState,
+        acceleration_mps2: NDArray[np.float64],
+        course: NDArray[np.intp],
+        steps: NDArray[np.int64],
     ) -> Pixels:
         ahead, left = self._tilt_rad_per_mps2 * acceleration_mps2.T
         poses = np.stack([state.x_m, state.y_m, state.yaw_rad, -ahead, left], axis=1)
-        colors = self._colors[course]
-        shots = [
-            take_pictures(
-                lens,
-                self._scenery,
-                poses,
-                course,
-                colors,
-                np.empty((len(course), colors.shape[-1], lens.height, lens.width), np.uint8),
-            )
-            for lens in self._lenses
-        ]
-        return shots[0] if len(shots) == 1 else np.concatenate(shots, axis=1)
+        varied = self._varied
+        colors = self._floor_colors[course]
+        if varied is not None:
+            colors = varied.colors(ids, colors)
+        if self._grey:
+            colors = (colors @ GREY)[..., None]
+        shots = []
+        for lens in self._lenses:
+            out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)
+            mounts = None if varied is None else varied.mounts(ids, lens.mount)
+            shots.append(take_pictures(lens, self._scenery, poses, course, colors, out, mounts))
+        now = shots[0] if len(shots) == 1 else np.concatenate(shots, axis=1)
+        return now if varied is None else varied.disturb(ids, now, steps)
 
 
 def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:

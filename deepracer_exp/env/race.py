@@ -104,7 +104,10 @@ class Race:
         self._commanded_mps = np.zeros(n_cars)
         self.observation = np.zeros((n_cars, self._features.size), np.float32)
         camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
-        self._pictures = None if camera is None else Pictures(camera, setup.car, tracks)
+        pictures = [one.pictures for one in randomizations or [setup.randomization] * n_cars]
+        self._pictures = (
+            None if camera is None else Pictures(camera, setup.car, tracks, pictures, self.cars.tolist())
+        )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         self.reward = np.zeros(n_cars)
         self.terminated = np.zeros(n_cars, bool)
@@ -126,6 +129,8 @@ class Race:
     def seed(self, seed: int) -> None:
         """Start over: random streams from `seed`, start positions and clocks from the first episode."""
         self.randomization.seed(seed)
+        if self._pictures is not None:
+            self._pictures.seed(seed)
         self.rules.restart()
 
     def reset(
@@ -147,9 +152,15 @@ class Race:
             self._batch.set_floor_friction(ids, self._floors[course])
         for kept in (self._return, self._steering_deg, self._commanded_mps):
             kept[ids] = 0
-        self.randomization.begin(ids, self.rules.episode[ids])
+        self._begin(ids)
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
+
+    def _begin(self, ids: np.ndarray) -> None:
+        """Draw what differs from episode to episode."""
+        self.randomization.begin(ids, self.rules.episode[ids])
+        if self._pictures is not None:
+            self._pictures.begin(ids, self.rules.episode[ids])
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
         """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn again.
@@ -228,6 +239,9 @@ class Race:
             setattr(self, name, checked_array(state, name.lstrip("_"), getattr(self, name).shape))
         self.rules.load_state_dict(state["referee"])
         self.randomization.load_state_dict(state["randomization"])
+        if self._pictures is not None:
+            self._pictures.seed(state["randomization"]["seed"])
+            self._pictures.begin(self._everyone, self.rules.episode)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
         # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics
@@ -292,6 +306,7 @@ class Race:
                 state,
                 self._batch.acceleration_mps2,
                 self.rules.course,
+                self.rules.steps,
                 self.randomization.dropped,
             )
 
@@ -310,7 +325,7 @@ class Race:
         )
         if self._pictures is not None:
             self.pixels = self.pixels.copy()
-            self.pixels[ids] = self._pictures.first(state, self.rules.course[ids])
+            self.pixels[ids] = self._pictures.first(ids, state, self.rules.course[ids])
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
         track_index = self.rules.track_index[ids]

@@ -33,6 +33,7 @@ class Purpose(IntEnum):
     ACTION = 0
     OBSERVATION = 1
     EPISODE = 2
+    PICTURE = 3
 
 
 class CarStreams:

@@ -37,6 +37,12 @@ class Lens:
     z_m: float
     pitch_rad: float
 
+    @property
+    def mount(self) -> NDArray[np.float64]:
+        """Place ahead, to the left and above, pitch, and focal length in pixels, (5,)."""
+        focal = 0.5 * self.width / np.tan(0.5 * self.field_of_view_rad)
+        return np.array([self.x_m, self.y_m, self.z_m, self.pitch_rad, focal])
+
 
 def take_pictures(
     lens: Lens,
@@ -45,6 +51,7 @@ def take_pictures(
     track_index: NDArray[np.intp],
     colors: NDArray[np.float32],
     out: NDArray[np.uint8],
+    mounts: NDArray[np.float64] | None = None,
 ) -> NDArray[np.uint8]:
     """Take a picture of each of N cars.
 
@@ -56,9 +63,10 @@ def take_pictures(
         track_index: of each car's track in the scenery, (N,).
         colors: of each car's `scenery.MATERIALS`, 0 to 255, (N, materials, channels).
         out: (N, channels, height, width), written and returned.
+        mounts: of each car's camera, (N, 5), see `Lens.mount`; None: the lens's own for all.
     """
-    half_width = np.tan(0.5 * lens.field_of_view_rad)
-    mount = (lens.x_m, lens.y_m, lens.z_m, lens.pitch_rad)
+    if mounts is None:
+        mounts = np.broadcast_to(lens.mount, (len(out), 5))
     _take(
         np.ascontiguousarray(poses, np.float64),
         track_index,
@@ -67,8 +75,7 @@ def take_pictures(
         scenery.joined,
         scenery.pieces,
         scenery.first_piece,
-        mount,
-        0.5 * lens.width / half_width,
+        mounts,
         out,
     )
     return out
@@ -76,22 +83,22 @@ def take_pictures(
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
 def _take(  # type: ignore[no-untyped-def]
-    poses, track_index, colors, points, joined, pieces, first_piece, mount, focal, out
+    poses, track_index, colors, points, joined, pieces, first_piece, mounts, out
 ):
-    """Take the pictures; `mount` is x, y, z and pitch of the camera, `focal` the focal length in pixels."""
+    """Take the pictures."""
     cars, channels, height, width = out.shape
     # The rows beyond the picture take what edges at its bottom leave to those below.
     changes = np.zeros((channels, (height + 3) * width), np.float32)
     running = np.empty(width, np.float32)
     change = np.empty(channels, np.float32)
     rotation = np.empty((3, 3))
-    mount_x, mount_y, mount_z, tilt = mount
-    cos, sin = np.cos(tilt), np.sin(tilt)
     middle_x, middle_y = 0.5 * width, 0.5 * height
-    # Of the planes through the picture's left and right edges: normal's share along the axis and across.
-    side_axis = middle_x / np.hypot(middle_x, focal)
-    side_across = focal / np.hypot(middle_x, focal)
     for car in range(cars):
+        mount_x, mount_y, mount_z, tilt, focal = mounts[car]
+        cos, sin = np.cos(tilt), np.sin(tilt)
+        # Of the planes through the picture's left and right edges: normal's share along the axis and across.
+        side_axis = middle_x / np.hypot(middle_x, focal)
+        side_across = focal / np.hypot(middle_x, focal)
         _rotation(poses[car, 2], poses[car, 3], poses[car, 4], rotation)
         eye_x = poses[car, 0] + rotation[0, 0] * mount_x + rotation[0, 1] * mount_y + rotation[0, 2] * mount_z
         eye_y = poses[car, 1] + rotation[1, 0] * mount_x + rotation[1, 1] * mount_y + rotation[1, 2] * mount_z

@@ -136,3 +136,65 @@ def test_gymnasium_sees_pictures_alone():
     cars.reset()
     observations, *_ = cars.step(np.full(3, 7))
     assert cars.observation_space.contains(observations)
+
+
+VARIED = (SMALL, "randomization=sim2real")
+
+
+def test_light_differs_from_episode_to_episode_and_car_to_car(race_of):
+    race = race_of(*VARIED, "episode.start_advance=0", n_cars=6)
+    first = race.pixels
+    assert len(np.unique(first.mean(axis=(1, 2, 3)).round(2))) == 6
+    race.reset()
+    assert (np.abs(race.pixels.mean(axis=(1, 2, 3)) - first.mean(axis=(1, 2, 3))) > 0.1).all()
+
+
+def test_a_cars_pictures_depend_on_its_number_and_not_on_the_batch(race_of):
+    together = race_of(*VARIED, "episode.start_advance=0", n_cars=5)
+    alone = race_of(*VARIED, "episode.start_advance=0", n_cars=2, first_car=3)
+    for ours, theirs in zip(drive(together, 4), drive(alone, 4), strict=True):
+        assert np.array_equal(ours[3:], theirs)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "low", "high", "law"),
+    [
+        ("brightness_scale", 0.5, 2.0, lambda a, b: b.mean() > 2.5 * a.mean()),
+        ("contrast_scale", 0.5, 2.0, lambda a, b: b.std() > 1.5 * a.std()),
+        ("gamma_scale", 0.5, 2.0, lambda a, b: b.mean() < 0.7 * a.mean()),
+        ("blur", 0.0, 1.0, lambda a, b: np.abs(np.diff(b)).max() < 0.8 * np.abs(np.diff(a)).max()),
+        ("pixel_noise", 0.0, 0.1, lambda a, b: 15 < (b - a)[20:].std() < 30),
+        ("light", 0.0, 0.9, lambda a, b: np.abs(b - a).max() > 20),
+        ("color_noise", 0.0, 0.9, lambda a, b: np.abs(b - a).max() > 20),
+        # A higher camera that looks down further, and a wider lens, see the wall's foot in another row.
+        ("height_m", 0.0, 0.1, lambda a, b: np.abs(b - a).mean() > 3),
+        ("pitch_deg", 0.0, 10.0, lambda a, b: horizon(b) < horizon(a) - 5),
+        ("field_of_view_scale", 0.5, 2.0, lambda a, b: np.abs(b - a).mean() > 3),
+    ],
+)
+def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
+    """Pictures at the start, with only this one at its lowest and highest value."""
+    off = "{brightness_scale: [1,1], contrast_scale: [1,1], gamma_scale: [1,1], color_noise: [0,0], light: [0,0], "
+    off += "blur: [0,0], pixel_noise: [0,0], height_m: [0,0], pitch_deg: [0,0], field_of_view_scale: [1,1]}"
+    pictures = []
+    for value in (low, high):
+        on = f"randomization.pictures.{quantity}=[{value},{value}]"
+        pictures.append(
+            race_of(SMALL, f"randomization.pictures={off}".replace(": ", ":"), on).pixels[0, 0].astype(float)
+        )
+    assert law(*pictures)
+
+
+def horizon(picture: np.ndarray) -> float:
+    return float((picture < 60).argmin(axis=0).mean())
+
+
+def test_pictures_without_randomization_are_those_with_ranges_that_change_nothing(race_of):
+    plain = race_of(SMALL)
+    nothing = race_of(
+        SMALL,
+        "randomization.pictures={brightness_scale:[1,1],contrast_scale:[1,1],gamma_scale:[1,1],color_noise:[0,0],"
+        "light:[0,0],blur:[0,0],pixel_noise:[0,0],height_m:[0,0],pitch_deg:[0,0],field_of_view_scale:[1,1]}",
+    )
+    for ours, theirs in zip(drive(plain, 5), drive(nothing, 5), strict=True):
+        assert np.array_equal(ours, theirs)
