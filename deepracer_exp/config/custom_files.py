@@ -50,10 +50,10 @@ NOT_APPLICABLE = {
     "stack_size": "the service ignores it, too",
     "term_cond_avg_score": "the service only stores it",
     "sac_alpha": "for SAC only",
-    "sensor": "here the policy sees features, no camera or lidar",
+    "sensor": "here observation=NAME chooses what the policy sees",
     "neural_network": "for camera images; here use network=NAME",
     "version": "the service's physics; here use car=NAME",
-    "lidar_config": "here the policy sees features, no lidar",
+    "lidar_config": "here the policy has no lidar",
 }
 """Keys of both JSON files that have no effect here, and why."""
 
