@@ -29,7 +29,7 @@ from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
 from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
-from deepracer_exp.training.callbacks import BUDGET_REACHED
+from deepracer_exp.runs.result import BUDGET_REACHED
 from sweeps.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary

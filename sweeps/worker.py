@@ -33,15 +33,16 @@ from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
 from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY
 from deepracer_exp.tracking.metadata import PARENT
 from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import STUDY, TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
-from deepracer_exp.training.budget import Budget
+from deepracer_exp.training.budget import Budget, RunEnded
 from deepracer_exp.training.clone import prepare_clone
-from deepracer_exp.training.run import RunEnded, copy_run, resume, train
+from deepracer_exp.training.run import copy_run, resume, train
 from deepracer_exp.training.signals import Interruption
-from deepracer_exp.training.trainer import STOPPED_EARLY, Callback, TakenOver, Trainer, TrainResult
+from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
 from .claims import Claim, Lease, TrialClaims, TrialResult, report_results
 from .objectives import intermediate_value, values_of
@@ -250,9 +251,9 @@ class TrialRun(Callback):
             run = self._runs[index] if index < len(self._runs) else None
             if run is None or run["status"] is None:
                 run = self._made(index, overrides)
-            if run["status"] == "failed":
+            if run["status"] == FAILED:
                 return self._with_attrs("FAIL", None, overrides)
-            if run["status"] in (STOPPED_EARLY, "hopeless"):  # the second in older studies
+            if run["status"] == STOPPED_EARLY:
                 return self._with_attrs("PRUNED", None, overrides)
             so_far = [run["value"][0] for run in self._runs]
             is_last = len(so_far) == config.seeds
@@ -298,7 +299,7 @@ class TrialRun(Callback):
         outcome = None if known is None else self._resumed(Path(known["run_dir"]))
         if outcome is None:
             outcome = self._trained(index, overrides)
-        if outcome.status == "interrupted":
+        if outcome.status == INTERRUPTED:
             raise Interrupted
         decision = outcome.summary.get("stopping") or {}
         run = {
@@ -309,7 +310,7 @@ class TrialRun(Callback):
             "env_steps": outcome.summary["env_steps"],
             "wall_clock_s": outcome.summary["wall_clock_s"],
         }
-        if outcome.status == "failed":
+        if outcome.status == FAILED:
             error = outcome.error
             trace = "".join(traceback.format_exception(error)) if error else outcome.reason
             run = _as_failed(run, outcome.reason, trace)

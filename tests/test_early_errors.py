@@ -6,10 +6,13 @@ import os
 import sqlite3
 import subprocess
 import sys
+from dataclasses import asdict
 
 import pytest
+import yaml
 
 from deepracer_exp.config.options import groups, options
+from deepracer_exp.tracking.tracking_file import TrackedRun
 
 HEAVY = ("torch", "mujoco", "mlflow", "optuna", "pandas")
 CASES = {
@@ -29,18 +32,24 @@ CASES = {
     ("import", "nowhere", "--name", "mine"): "nowhere",
     ("validate", "reward.file=nothing.py"): "nothing.py",
     ("validate", "reward=racing"): "reward=racing",
-    ("evaluate", "unknown"): "unknown: no such run in runs (1 there)",
+    ("evaluate", "unknown"): "unknown: no such run in runs (3 there)",
     ("evaluate", "runs/a/run", "checkpoint=120"): "checkpoint=120",
     ("evaluate", "runs/a/run", "evaluation=sumit"): "did you mean summit?",
+    ("evaluate", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
     ("evaluate", "evaluation=summit"): "RUN: missing; write deepracer-exp evaluate RUN",
     ("evaluate", "one", "two"): "one two: 2 runs given",
-    ("evaluate", "unknown", "runs_dir=recorded"): "unknown: no such run in recorded (0 there); no registered",
+    ("evaluate", "unknown", "runs_dir=recorded"): "unknown: no such run in recorded (1 there); no registered",
     ("resume", "unknown"): "unknown: no such run",
     ("resume", "~no_such_user"): "~no_such_user",
     ("resume", "a" * 300): "File name too long",
     ("resume", "runs/a/run", "budget.stepz=1"): "budget.stepz",
+    ("resume", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
+    ("resume", "runs/a/ended"): "has ended (budget reached: env_steps); to resume it, give it more",
+    ("resume", "recorded/a/stopped"): "has ended (stopped early: converged); stopping=none resumes it anyway",
     ("clone", "unknown"): "unknown: no such run",
     ("clone", "runs/a/run", "checkpoint=120"): "checkpoint=120",
+    ("clone", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
+    ("checkpoints", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
     ("checkpoints", "unknown"): "unknown: no such run",
     ("checkpoints", "runs/a/run"): "checkpoints",
     ("runs", "lst"): "did you mean list?",
@@ -54,6 +63,7 @@ CASES = {
     ("export", "unknown", "format=onnx"): "unknown: no such run",
     ("export", "runs/a/run", "format=onnx"): "checkpoint",
     ("export", "runs/a/run", "format=onx"): "format",
+    ("export", "runs/a/own", "format=onnx"): "network.target=my_network:Net: named by a stored run",
     ("analyze", "unknown"): "unknown: no such file or folder, and no run",
     ("analyze", "pipe"): "pipe: is a pipe",
     ("analyze", "log.txt", "--reward", "nothing.py"): "nothing.py",
@@ -91,6 +101,17 @@ CASES = {
 }
 
 
+def write_run(run, config, *checkpoints, **summary):
+    """Write a run's folder, with empty checkpoints; the run has ended if there is a summary."""
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    for checkpoint in checkpoints:
+        (run / "checkpoints" / checkpoint).mkdir()
+        (run / "checkpoints" / "last").symlink_to(checkpoint)
+    if summary:
+        (run / "summary.json").write_text(json.dumps({"iteration": 1, "wall_clock_s": 1.0} | summary))
+
+
 @pytest.fixture(scope="module")
 def refused(tmp_path_factory, call_at):
     """Call all of them in one fresh process: exit code, output and heavy imports of each."""
@@ -100,9 +121,16 @@ def refused(tmp_path_factory, call_at):
     (folder / "recorded").mkdir()
     with contextlib.closing(sqlite3.connect(folder / "recorded" / "mlflow.db")) as store:
         store.execute("CREATE TABLE registered_model_aliases (name, alias, version)")
-    run = folder / "runs" / "a" / "run"
-    (run / "checkpoints").mkdir(parents=True)
-    (run / "config.yaml").write_text(call_at(folder, "train", "name=a", "--cfg").stdout)
+    config = yaml.safe_load(call_at(folder, "train", "name=a", "--cfg").stdout)
+    runs, recorded = folder / "runs" / "a", folder / "recorded" / "a"
+    write_run(runs / "run", config)
+    write_run(runs / "own", config | {"network": {"target": "my_network:Net", "kwargs": {}}}, "000001")
+    spent = config["budget"]["env_steps"]
+    write_run(runs / "ended", config, status="finished", reason="budget reached: env_steps", env_steps=spent)
+    write_run(recorded / "stopped", config, status="stopped early", reason="converged", env_steps=9)
+    store = f"sqlite:///{folder / 'recorded' / 'mlflow.db'}"
+    tracked = TrackedRun("id", "a", "a", 0, store, complete=True)
+    (recorded / "stopped" / "tracking.json").write_text(json.dumps(asdict(tracked)))
     code = f"""
 import contextlib, io, json, sys
 from deepracer_exp.cli import main

@@ -10,7 +10,7 @@ from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_run, run_and_overrides, runs_and_overrides, split_stores
 from .output import table_console, warnings_on_stderr
-from .startup import check_run
+from .startup import check_policy
 
 _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
@@ -91,7 +91,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     args.debug = config.debug
     if args.video is not None:
         _choose_graphics()
-    check_run(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+    check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
 
     from rich.console import Console
 
@@ -147,7 +147,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
     config, _ = compose_evaluation([*overrides, override_line("run", run)])
     own_trials = not any(group_of(given) == "evaluation" for given in overrides)
     args.debug = config.debug
-    check_run(config.run, config.runs_dir, config.tracking.uri, None)
+    check_policy(config.run, config.runs_dir, config.tracking.uri, None)
 
     from rich.console import Console
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from .arguments import add_command, add_run, run_and_overrides
 from .output import print_notes, warnings_on_stderr
-from .startup import check_run
+from .startup import check_policy
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -83,7 +83,7 @@ def _export(args: argparse.Namespace) -> int:
     config, _ = compose_export([*overrides, override_line("run", run)])
     args.debug = config.debug
     if config.format == "onnx":
-        check_run(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+        check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
     else:
         resolve(config.run, Path(config.runs_dir), config.tracking.uri)
 

@@ -35,6 +35,18 @@ def check_files(experiment: "Experiment") -> None:
             Track.from_config(track)
 
 
+def check_policy(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> None:
+    """Find a run as `check_run` does, and import the classes of the user's own that its policy needs.
+
+    Raises:
+        BadInput: as `check_run`, or a class is not named again or cannot be imported.
+    """
+    from deepracer_exp.config.own_class import OF_POLICY
+    from deepracer_exp.config.parse import import_own_classes
+
+    import_own_classes(check_run(run, runs_dir, tracking_uri, checkpoint).experiment, OF_POLICY)
+
+
 def check_run(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> "StoredRun":
     """Find a run that has the checkpoint, or any checkpoint if none is named.
 
@@ -54,15 +66,12 @@ def check_changes(run_dir: Path, overrides: "Sequence[str]") -> "Experiment":
     """Return the experiment of a stored run with overrides applied.
 
     Raises:
-        BadInput: an override names something unknown or gives a value that is not accepted, or a class of the user's
-            own is not named again.
+        BadInput: an override names something unknown or gives a value that is not accepted.
     """
-    from deepracer_exp.config.parse import import_own_classes, parse_experiment
+    from deepracer_exp.config.parse import parse_experiment
     from deepracer_exp.config.stored import with_overrides
 
-    experiment = parse_experiment(with_overrides(read_config(run_dir), {}, overrides).mapping)
-    import_own_classes(experiment)
-    return experiment
+    return parse_experiment(with_overrides(read_config(run_dir), {}, overrides).mapping)
 
 
 def check_sweep(request: "SweepRequest") -> None:

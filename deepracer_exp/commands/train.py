@@ -143,37 +143,42 @@ If a finished run was recorded while MLflow did not answer, resume delivers the 
 
 
 def _resume(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.parse import import_own_classes
     from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.training.budget import RunEnded, refuse_ended
 
     name, given = run_and_overrides(args)
     stores, changes = split_stores(given)
     run_dir = resolve(name, stores.runs_dir, stores.uri).path
     # The folder says where the run is, but MLflow may have moved.
     overrides = [*changes, *(one for one in given if one.startswith("tracking.uri="))]
-    check_changes(run_dir, overrides)
+    experiment = check_changes(run_dir, overrides)
+    try:
+        refuse_ended(run_dir, experiment.budget, overrides)
+    except RunEnded as error:
+        return _deliver(run_dir, stores.uri, error)
+    import_own_classes(experiment)
     print_start()
     start_workers_early(has_workers(run_dir))
 
     from rich.console import Console
 
-    from deepracer_exp.training.run import RunEnded, resume
+    from deepracer_exp.training.run import resume
 
-    try:
-        with warnings_on_stderr():
-            outcome = resume(run_dir, overrides, Console(stderr=True))
-    except RunEnded as error:
-        return _deliver(run_dir, stores.uri, error)
+    with warnings_on_stderr():
+        outcome = resume(run_dir, overrides, Console(stderr=True))
     print_result(outcome, str(stores.runs_dir))
     return outcome.exit_code
 
 
 def _deliver(run_dir: Path, uri: str | None, ended: Exception) -> int:
     """Deliver the points of an ended run that MLflow lacks; if there are none, raise that the run has ended."""
-    from deepracer_exp.tracking.delivery import deliver
+    from deepracer_exp.tracking.delivery import deliver, is_delivered
 
-    if not (run_dir / TRACKING).exists():
+    runs_dir, own_uri = run_dir.parent.parent, read_config(run_dir)["tracking"].get("uri")
+    if not (run_dir / TRACKING).exists() or is_delivered(run_dir, uri or own_uri, runs_dir):
         raise ended
-    points = deliver(run_dir, uri or read_config(run_dir)["tracking"].get("uri"), run_dir.parent.parent)
+    points = deliver(run_dir, uri or own_uri, runs_dir)
     if not points:
         raise ended
     print(f"{ended}\n  delivered {points:,} points that MLflow lacked")
@@ -193,12 +198,16 @@ cannot be changed. `deepracer-exp runs lineage RUN` draws the family tree.
 
 
 def _clone(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.parse import import_own_classes
+
     run, given = run_and_overrides(args)
     checkpoints = [one.partition("=")[2] for one in given if one.startswith("checkpoint=")]
     changes = [one for one in given if not one.startswith("checkpoint=")]
     stores, _ = split_stores(given)
     parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None).path
-    check_files(check_changes(parent, changes))
+    experiment = check_changes(parent, changes)
+    import_own_classes(experiment)
+    check_files(experiment)
     print_start()
     start_workers_early(has_workers(parent))
 

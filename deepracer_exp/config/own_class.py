@@ -8,7 +8,7 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
@@ -21,6 +21,8 @@ from deepracer_exp.errors import BadInput, reading
 
 GROUPS = ("network", "algorithm", "lr_schedule", "observation", "stopping", "tracking")
 """Groups whose option may be a class of your own. Entry points are registered under `deepracer_exp.GROUP`."""
+OF_POLICY = ("network", "observation")
+"""Those that a stored policy needs, in an evaluation or an export."""
 _REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
 Reference = Annotated[str, Field(pattern=rf"^{_REFERENCE}$")]
 _GIVEN = re.compile(rf"(?:{'|'.join(GROUPS)})\.target=({_REFERENCE})")
@@ -81,6 +83,21 @@ def allow_given(overrides: Sequence[str]) -> list[str]:
     return [line for line in overrides if line not in given]
 
 
+def own_classes(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> Iterator[tuple[str, str]]:
+    """Return the classes of the user's own among the values of an experiment, each with its group."""
+    for group in groups:
+        values = config.get(group)
+        for own in [values, *(values.get("parts") or ())] if isinstance(values, dict) else []:
+            if own.get("target") is not None:
+                yield group, own["target"]
+
+
+def named_again(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> list[str]:
+    """Return the overrides that let a command import the classes of a stored run."""
+    found = own_classes(config, groups)
+    return [f"{group}.target={target}" for group, target in found if not _is_registered(target)]
+
+
 def load_class(target: str, key: str) -> type:
     """Import a class.
 
@@ -91,7 +108,7 @@ def load_class(target: str, key: str) -> type:
     Raises:
         BadInput: only a stored run names it, or it cannot be imported.
     """
-    if target not in _allowed and not any(target in registered(group).values() for group in GROUPS):
+    if target not in _allowed and not _is_registered(target):
         raise BadInput(
             f"{key}={target}: named by a stored run, which imports no code by itself; if you trust the class, repeat "
             f"{key}={target} on the command line, or install a package that registers it as an entry point"
@@ -132,6 +149,10 @@ def build_own(own: OwnClass, key: str, base: type[Base], *arguments: Any) -> Bas
         ) from error
     with reading(f"{key}={own.target}"):
         return kind(*arguments, **own.kwargs)
+
+
+def _is_registered(target: str) -> bool:
+    return any(target in registered(group).values() for group in GROUPS)
 
 
 def _references(values: Any) -> Iterator[str]:

@@ -1,6 +1,8 @@
 """Plain values to validated, frozen dataclasses; bad values are reported by their dotted keys."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -9,7 +11,7 @@ from deepracer_exp.deepracer.worlds import worlds
 from deepracer_exp.errors import BadInput, nearest
 
 from .experiment import Experiment
-from .own_class import OwnClass, load_class
+from .own_class import GROUPS, load_class, own_classes
 from .track import TrackConfig
 
 Config = TypeVar("Config")
@@ -110,20 +112,14 @@ def _check_combinations(experiment: Experiment) -> None:
         )
 
 
-def import_own_classes(experiment: Experiment) -> None:
-    """Import the classes of the user's own that a training needs.
+def import_own_classes(experiment: Experiment, groups: Sequence[str] = GROUPS) -> None:
+    """Import the classes of the user's own that an experiment has in some groups.
 
     Raises:
         BadInput: one is named by a stored run only, or cannot be imported.
     """
-    for group in ("network", "lr_schedule", "stopping", "tracking"):
-        config = getattr(experiment, group)
-        if isinstance(config, OwnClass):
-            load_class(config.target, f"{group}.target")
-    if experiment.algorithm.target is not None:
-        load_class(experiment.algorithm.target, "algorithm.target")
-    for part in experiment.observation.parts:
-        load_class(part.target, "observation.target")
+    for group, target in own_classes(asdict(experiment), groups):
+        load_class(target, f"{group}.target")
 
 
 def _check_shape(key: str, track: TrackConfig) -> None:

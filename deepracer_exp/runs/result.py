@@ -1,4 +1,4 @@
-"""How good a run's best checkpoint is, by its summary."""
+"""How a run ended and how good its best checkpoint is, by its summary."""
 
 import math
 from collections.abc import Mapping
@@ -10,6 +10,10 @@ from deepracer_exp.errors import BadInput
 
 from .files import SUMMARY, read_object
 
+FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "stopped early", "interrupted", "failed"
+"""`status` of a run that has ended, as in summary.json."""
+BUDGET_REACHED = "budget reached: "
+"""Beginning of `reason` of a run that has used its budget; the limit's key follows."""
 IN_TRAINING = "training"
 CRITERIA = {
     "race_score": "race score",

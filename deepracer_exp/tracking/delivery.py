@@ -8,21 +8,17 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.files import METRICS, SUMMARY, TRACKING, read_metrics, read_object, read_run_id
+from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
 
 from .metadata import END_TAG
 from .metrics import now_ms, points_at, points_of
 from .store import Store, StoreRefusedError, StoreUnavailableError, has_store, one_line, resolve_store
-from .tracking_file import Status, TrackedRun, TrackingFile
+from .tracking_file import Status, TrackedRun, TrackingFile, read_tracked_run
 
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
 
-ENDS: dict[str, Status] = {
-    "finished": "FINISHED",
-    "stopped early": "FINISHED",
-    "hopeless": "FINISHED",  # as "stopped early" was called
-    "failed": "FAILED",
-}
+ENDS: dict[str, Status] = {FINISHED: "FINISHED", STOPPED_EARLY: "FINISHED", FAILED: "FAILED"}
 """MLflow's word for the `status` in a run's summary; any other is KILLED."""
 
 _log = logging.getLogger(__name__)
@@ -64,6 +60,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             run.conclude(file.run, summary)
             run.set_tags({END_TAG: f"{summary['status']}: {summary['reason']}"})
             run.end(file.run.status or ENDS.get(summary["status"], "KILLED"), file.run.end_ms or now_ms())
+            file.change(complete=True)
     except StoreRefusedError as error:
         raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused it: {one_line(error)}") from error
     except StoreUnavailableError as error:
@@ -104,6 +101,16 @@ def deliver_evaluation(
                 run.log_artifact(file, folder)
     except (StoreRefusedError, StoreUnavailableError) as error:
         _log.warning("MLflow (%s): this evaluation was not recorded: %s", store.shown, one_line(error))
+
+
+def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
+    """Return whether a store was given everything of an ended run, by the run's folder; MLflow is not imported.
+
+    Raises:
+        BadInput: tracking.json is invalid, or `uri` can never work.
+    """
+    run, store = read_tracked_run(run_dir / TRACKING), resolve_store(uri, runs_dir)
+    return run.complete and run.store == store.shown and has_store(uri, runs_dir)
 
 
 @contextmanager

@@ -155,7 +155,7 @@ class MLflowTracker(Tracker):
     def reopen(self, identity: Path) -> None:
         file = TrackingFile.read(identity, self._store.shown)
         tags = {key: value for key, value in file.run.tags.items() if key != END_TAG}
-        file.change(status=None, end_ms=None, files={}, tags=tags)
+        file.change(status=None, end_ms=None, complete=False, files={}, tags=tags)
         self._begin(file, lambda run, tracked, _: run.reopen(tracked))
 
     @override
@@ -201,6 +201,7 @@ class MLflowTracker(Tracker):
             )  # fmt: skip
         if not is_ended:
             _log.warning("MLflow (%s): the run could not be marked %s", self._store.shown, status)
+        self._file.change(complete=is_ended and not lost)
         return lost
 
     def _begin(self, file: TrackingFile, open_run: Callable[["MLflowRun", TrackedRun, bool], None]) -> None:

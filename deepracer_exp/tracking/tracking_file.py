@@ -36,6 +36,8 @@ class TrackedRun:
     status: Status | None = None
     """Of the ended run; None while it is running, or if it was killed."""
     end_ms: int | None = None
+    complete: bool = False
+    """Whether the run has ended and the store has been given all of it."""
 
 
 class TrackingFile:
@@ -55,7 +57,9 @@ class TrackingFile:
         For another store the id is dropped, because the run may have another one there, or none yet.
         """
         run = read_tracked_run(path)
-        return cls(path, run if run.store == store else replace(run, run_id=None, store=store))
+        return cls(
+            path, run if run.store == store else replace(run, run_id=None, store=store, complete=False)
+        )
 
     @property
     def folder(self) -> Path:
@@ -107,4 +111,5 @@ def begin_again(path: Path, run_dir: Path) -> None:
     """Turn a copied `tracking.json` into that of the new run in `run_dir`."""
     run = read_tracked_run(path)
     tags = {**run.tags, "run_dir": str(run_dir.resolve())}
-    atomic_write(path, json.dumps(asdict(replace(run, run_id=None, tags=tags)), indent=1) + "\n")
+    again = replace(run, run_id=None, tags=tags, complete=False)
+    atomic_write(path, json.dumps(asdict(again), indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The budget: how much of it a run and all runs of its experiment have used, and alerts at shares of it."""
+"""The budget: how much of it a run and all runs of its experiment have used, what is left, and alerts at shares of it."""
 
 import json
 import logging
@@ -9,15 +9,18 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lifeline import running
-from deepracer_exp.runs.files import METRICS, SUMMARY
+from deepracer_exp.runs.files import METRICS, SUMMARY, read_object
+from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, INTERRUPTED
 
 _log = logging.getLogger(__name__)
 
@@ -140,6 +143,42 @@ def refuse_spent(config: BudgetConfig, experiment_dir: Path) -> None:
                 f"budget.{_EXPERIMENT}{name}={most:g}: the runs in {experiment_dir} have used {spent[name]:,.6g} "
                 "already; accepted: more than that, or another name="
             )
+
+
+class RunEnded(BadInput):
+    """The run to resume has come to its end."""
+
+
+def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) -> None:
+    """Refuse to resume a run that has ended.
+
+    With another stopping rule among the overrides, what ended it, its own rule or a comparison with other runs, does
+    not count; a budget that is still used up does.
+
+    Args:
+        run_dir: its folder.
+        config: the budget to resume it with.
+        overrides: to resume it with.
+
+    Raises:
+        RunEnded: it says how the run can be resumed anyway.
+    """
+    summary = read_object(run_dir / SUMMARY)
+    status, reason = summary.get("status"), str(summary.get("reason"))
+    if status in (None, INTERRUPTED, FAILED):
+        return
+    if not reason.startswith(BUDGET_REACHED):
+        if "stopping" in map(group_of, overrides):
+            return
+        raise RunEnded(
+            f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it anyway, `deepracer-exp clone "
+            f"{run_dir.name}` starts a new run from its best checkpoint"
+        )
+    used = Budget(config).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
+    if used[1] >= 1:
+        raise RunEnded(
+            f"{run_dir}: has ended ({reason}); to resume it, give it more, such as budget.{used[0]}="
+        )
 
 
 class Alerts:

@@ -29,6 +29,7 @@ from deepracer_exp.runs.files import (
     SUMMARY,
     TRACE,
 )
+from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
 from deepracer_exp.tracking.tracker import Tracker
@@ -36,12 +37,10 @@ from deepracer_exp.tracking.tracker import Tracker
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
 from .metrics import NOT_EVALUATED, EvalResult, Finished, Ranking
-from .trainer import FINISHED, STOPPED_EARLY, Callback, Trainer, TrainResult
+from .trainer import Callback, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
 
-BUDGET_REACHED = "budget reached"
-"""Beginning of the reason of a run that has used its budget."""
 _DRIVING = "driving"
 """What ranks a policy that is not evaluated: the training's own episodes."""
 
@@ -202,7 +201,7 @@ class BudgetCallback(Callback):
     def _check(self, trainer: Trainer) -> None:
         limit, fraction = trainer.budget.used(*trainer.usage)
         if fraction >= 1:
-            trainer.request_stop(f"{BUDGET_REACHED}: {limit}")
+            trainer.request_stop(f"{BUDGET_REACHED}{limit}")
 
 
 class RecordCallback(Callback):

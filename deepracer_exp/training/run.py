@@ -17,7 +17,6 @@ from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.collectors.ray_cluster import check_collector
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
@@ -39,22 +38,19 @@ from deepracer_exp.runs.fingerprint import refuse_changes
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.read_checkpoint import intact_checkpoint, read_training
+from deepracer_exp.runs.result import INTERRUPTED
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.tracker import Tracker, open_tracker
 
-from .budget import Budget, refuse_spent
-from .callbacks import BUDGET_REACHED, standard_callbacks
+from .budget import refuse_ended, refuse_spent
+from .callbacks import standard_callbacks
 from .metrics import track_names
 from .signals import Interruption
-from .trainer import FAILED, INTERRUPTED, Callback, TakenOver, Trainer, TrainResult
+from .trainer import Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
-
-
-class RunEnded(BadInput):
-    """The run to resume has come to its end."""
 
 
 def train(
@@ -110,7 +106,8 @@ def resume(
         tags: likewise.
 
     Raises:
-        BadInput: the run has ended, is being trained, or was started with other values.
+        RunEnded: the run has ended.
+        BadInput: it is being trained, or was started with other values.
         TakenOver: a callback raised it.
     """
     console = console or Console(quiet=True)
@@ -237,7 +234,7 @@ def _reopen(
     # The folder may have been moved with the one it lies in.
     composition.mapping["runs_dir"] = str(run_dir.parent.parent)
     experiment = parse_experiment(composition.mapping)
-    _refuse_ended(run_dir, experiment, "stopping" in map(group_of, overrides))
+    refuse_ended(run_dir, experiment.budget, overrides)
     setup = read_files(experiment)
     checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
     state = read_training(checkpoint)
@@ -309,33 +306,6 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
         # A bug: its traceback is shown, but the run must not look as if it were running.
         trainer.fail(f"{type(error).__name__}: {error}", error)
         raise
-
-
-def _refuse_ended(run_dir: Path, experiment: Experiment, rule_given: bool) -> None:
-    """Refuse to resume a run that has ended.
-
-    Args:
-        run_dir: its folder.
-        experiment: to resume it with.
-        rule_given: whether it gets another stopping rule. What ended it, a rule of its own or a comparison with
-            others, does not count then; a budget that is still used up does.
-    """
-    summary = read_object(run_dir / SUMMARY)
-    status, reason = summary.get("status"), str(summary.get("reason"))
-    if status is None or status in (INTERRUPTED, FAILED):
-        return
-    if not reason.startswith(BUDGET_REACHED):
-        if rule_given:
-            return
-        raise RunEnded(
-            f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it all the same, `deepracer-exp clone "
-            f"{run_dir.name}` starts a new run from its best checkpoint"
-        )
-    used = Budget(experiment.budget).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
-    if used[1] >= 1:
-        raise RunEnded(
-            f"{run_dir}: has ended ({reason}); to resume it give it more, such as budget.{used[0]}="
-        )
 
 
 def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:

@@ -28,6 +28,7 @@ from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.read_checkpoint import read_agent
+from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED
 
 from .budget import Budget
 from .metrics import NOT_EVALUATED, EvalResult, Finished, RunMetrics, track_names
@@ -35,8 +36,6 @@ from .signals import Interruption
 
 logger = logging.getLogger("deepracer_exp")
 
-FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "stopped early", "interrupted", "failed"
-"""`status` of a run that has ended, as in summary.json."""
 _LAST_EVERY, _LAST_EVERY_S = 10, 5.0
 """Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
 

@@ -67,7 +67,7 @@ def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(seas
 
 
 def test_traces_of_failed_runs_can_go_and_of_no_others(season):
-    for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", "hopeless")):
+    for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", "stopped early")):
         shutil.rmtree(season.run(name, status=status) / "checkpoints")
     assert listed(season) == [("2", FAILED_TRACE, ["trace"])]
 

@@ -6,7 +6,7 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.tracking.delivery import deliver, deliver_evaluation
+from deepracer_exp.tracking.delivery import deliver, deliver_evaluation, is_delivered
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.tracking_file import read_tracked_run
@@ -34,18 +34,20 @@ def run_dir(tmp_path, away):
     for row in rows:
         tracker.log(row, row["env_steps"])
         tracker.safe_until(row["env_steps"])
-    (folder / "summary.json").write_text(json.dumps({"status": "hopeless", "reason": "collapsed"}))
+    (folder / "summary.json").write_text(json.dumps({"status": "stopped early", "reason": "collapsed"}))
     tracker.log_artifact(folder / "summary.json")
     tracker.log_artifact((folder / "checkpoints" / "best").resolve(), "checkpoints/best")
     tracker.set_tag("stopping.rule", "collapsed")
-    tracker.set_tag("end", "hopeless: collapsed")
+    tracker.set_tag("end", "stopped early: collapsed")
     assert tracker.finish("FINISHED", deadline_s=0) == 9
     return folder
 
 
 def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, store, tmp_path, caplog):
     moved = run_dir.rename(tmp_path / "moved")  # what was told is found there, too
+    assert not is_delivered(moved, store.uri, tmp_path)
     assert deliver(moved, store.uri, tmp_path) == 9
+    assert is_delivered(moved, store.uri, tmp_path)
     client = MlflowClient(tracking_uri=store.uri)
     (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
     told = read_tracked_run(moved / "tracking.json")
@@ -54,7 +56,7 @@ def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, sto
         told.run_id, told.start_ms, told.end_ms,
     )  # fmt: skip
     assert run.data.params == {"seed": "1"}
-    wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "hopeless: collapsed"}
+    wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "stopped early: collapsed"}
     assert run.data.tags.items() >= wanted.items()
     assert run.data.metrics.keys() == {"train/completion", "train/iteration", "time/wall_clock_s"}
     files = {file.path for file in client.list_artifacts(run.info.run_id)}
@@ -72,7 +74,7 @@ def test_a_run_killed_before_it_logged_its_end_is_ended_by_its_summary(run_dir, 
     deliver(run_dir, store.uri, tmp_path)
     run_id = read_tracked_run(run_dir / "tracking.json").run_id
     run = MlflowClient(tracking_uri=store.uri).get_run(run_id)
-    assert (run.info.status, run.data.tags["end"]) == ("FINISHED", "hopeless: collapsed")
+    assert (run.info.status, run.data.tags["end"]) == ("FINISHED", "stopped early: collapsed")
 
 
 def test_a_missing_file_does_not_block_the_rest(run_dir, store, tmp_path, caplog):

@@ -8,8 +8,9 @@ from benchmarks.same import different_rows, different_tensors
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
+from deepracer_exp.runs.result import STOPPED_EARLY
 from deepracer_exp.training.run import copy_run, resume, train
-from deepracer_exp.training.trainer import STOPPED_EARLY, Callback, TakenOver
+from deepracer_exp.training.trainer import Callback, TakenOver
 
 TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "checkpoints.every=2")
 

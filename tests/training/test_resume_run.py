@@ -221,7 +221,7 @@ def test_a_run_that_others_have_pruned_continues_if_asked_which_rule_counts(trai
     (stopped / "config.yaml").write_text(yaml.safe_dump(config | {"stopping": {"kind": "none"}}))
     ended = call("resume", stopped.name)
     assert ended.code == 2
-    assert "stopping=none resumes it all the same" in ended.complaint
+    assert "stopping=none resumes it anyway" in ended.complaint
     ended = call("resume", stopped.name, "stopping=none")
     assert ended.code == 0, ended.stderr
     assert_same_run(stopped, whole(trained))
