@@ -9,12 +9,13 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.next_steps import COMMAND
+from deepracer_exp.analysis.next_steps import COMMAND, command_line
 from deepracer_exp.analysis.next_steps import outcome as outcome_of_run
 from deepracer_exp.analysis.page import plot, render
+from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_bytes
-from deepracer_exp.runs.files import BEST_LAP, read_head
+from deepracer_exp.runs.files import BEST_LAP, read_config, read_head
 
 from .best import best_line, best_run, best_shown, best_trial, complete_trials, reranked
 from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
@@ -118,12 +119,17 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
 
 def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
     """Return commands for the winner, each with what it does."""
-    winner = shlex.quote(f"best:{study.study_name}")
+    winner = f"best:{study.study_name}"
+    try:
+        config = read_config(best_run(study))
+    except BadInput:  # moved or removed since
+        config = {}
+    evaluate = command_line("evaluate", winner, config, OF_POLICY)
     more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
     return [
         (best_line(study), "train the winner again"),
-        (f"{COMMAND} evaluate {winner} --video lap.mp4", "race it, and film its fastest lap"),
-        (f"{COMMAND} clone {winner}", "train it further, at a tenth of the learning rate"),
+        (f"{evaluate} --video lap.mp4", "race it, and film its fastest lap"),
+        (command_line("clone", winner, config), "train it further, at a tenth of the learning rate"),
         (f"{_resume(study)} sweep.trials={more}", "continue the search, with twice the trials"),
     ]
 

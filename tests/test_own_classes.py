@@ -1,6 +1,9 @@
 """Classes of the user's own: the examples of docs/extending.md are trained, resumed, raced and refused."""
 
+import json
 import re
+import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import torch
 import yaml
 
 from deepracer_exp import load_policy
+from deepracer_exp.analysis.next_steps import next_steps
 from deepracer_exp.config import own_class
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
@@ -109,6 +113,21 @@ def test_a_run_is_raced_where_its_classes_are_named_again(run):
     assert ended.code == 0, ended.stderr
 
 
+def test_the_lines_to_paste_name_the_classes_again(run, tmp_path):
+    home = shutil.copytree(at_home(run), tmp_path / "home", symlinks=True)
+    copy = home / run.relative_to(at_home(run))
+    steps = [line for line, _ in next_steps(copy, json.loads((copy / "summary.json").read_text()))]
+    short = ("evaluation.trials=1", "evaluation.laps=1", "evaluation.time_s=5", "evaluation.held_out=null")
+    assert len(steps) == 4
+    for line in steps:
+        own_class._allowed.clear()
+        command, *words = shlex.split(line)[1:]
+        if "--video" not in words:  # needs a renderer
+            extra = short if command == "evaluate" else ("budget.env_steps=1024",) * (command == "clone")
+            ended = call_in(home, command, *words, *extra)
+            assert ended.code == 0, (line, ended.stderr)
+
+
 def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path):
     write_examples(tmp_path)
     options = (*IN_PROCESS, *OWN, "tracking=my_tracker:JsonTracker")
@@ -123,7 +142,7 @@ def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path)
 def test_a_resumed_run_needs_the_same_class_importable(run, tmp_path):
     ended = call_in(tmp_path, "evaluate", str(run), *NAMED)
     assert ended.code == 2
-    assert "observation.target=my_features:SideForce: ModuleNotFoundError" in ended.complaint
+    assert "network.target=my_network:ResidualNet: ModuleNotFoundError" in ended.complaint
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.runs.files import RunRecord
-from deepracer_exp.runs.result import FIGURES, read_result
+from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
+from deepracer_exp.runs.files import RunRecord, read_config
+from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, FIGURES, INTERRUPTED, read_result
 
 COMMAND = "deepracer-exp"
 
@@ -46,28 +47,42 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
 
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return commands for a run folder with its summary.json, each with what it does, the first to be used first."""
-    word = shlex.quote(run_word(run))
-    resume = f"{COMMAND} resume {word}"
+    word, config = run_word(run), read_config(run)
+    resume = command_line("resume", word, config)
     steps = []
     if summary["iteration"]:
+        evaluate = command_line("evaluate", word, config, OF_POLICY)
         steps += [
-            (f"{COMMAND} evaluate {word}", "race the best checkpoint"),
-            (f"{COMMAND} evaluate {word} --video lap.mp4", "film its fastest lap"),
-            (f"{COMMAND} clone {word}", "train on from it, at a tenth of the learning rate"),
+            (evaluate, "race the best checkpoint"),
+            (f"{evaluate} --video lap.mp4", "film its fastest lap"),
+            (command_line("clone", word, config), "train it further, at a tenth of the learning rate"),
         ]
-    if summary["status"] in ("interrupted", "failed"):
+    if summary["status"] in (INTERRUPTED, FAILED):
         return [(resume, "continue it from its last checkpoint"), *steps]
-    rule, _, limit = str(summary["reason"]).partition("budget reached: ")
+    rule, _, limit = str(summary["reason"]).partition(BUDGET_REACHED)
     spent = {
         "env_steps": summary["env_steps"],
         "iterations": summary["iteration"],
         "minutes": math.ceil(summary["wall_clock_s"] / 60),
     }
     if rule:
+        resume = command_line("resume", word, config, [group for group in GROUPS if group != "stopping"])
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides
         steps.append((f"{resume} budget.{limit}={2 * spent[limit]}", "continue it for as long again"))
     return steps
+
+
+def command_line(command: str, word: str, config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> str:
+    """Return a command for the run that `word` names, with the user's own classes that it needs.
+
+    Args:
+        command: its name.
+        word: any name of the run.
+        config: of the run.
+        groups: whose classes the command needs.
+    """
+    return " ".join([COMMAND, command, shlex.quote(word), *named_again(config, groups)])
 
 
 def run_word(run: Path) -> str:

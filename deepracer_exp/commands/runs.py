@@ -350,15 +350,17 @@ def _value(value: object) -> str:
 
 
 def _promote(args: argparse.Namespace) -> int:
+    from deepracer_exp.analysis.next_steps import command_line
     from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.evaluation import checked_checkpoint_name
+    from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
     from deepracer_exp.runs.files import read_config
     from deepracer_exp.runs.resolve import resolve
     from deepracer_exp.tracking.registry import check_alias, check_model, promote
 
     name, overrides = run_and_overrides(args)
-    stores = read_stores(overrides, ["checkpoint"])
+    stores = read_stores(allow_given(overrides), ["checkpoint"])
     check_alias("--alias", args.alias)
     if args.model is not None:
         check_model("--model", args.model)
@@ -371,7 +373,8 @@ def _promote(args: argparse.Namespace) -> int:
 
     from deepracer_exp.env.observation import feature_names
 
-    observation = parse_config(read_config(run.path).get("observation", {}), ObservationConfig)
+    config = read_config(run.path)
+    observation = parse_config(config.get("observation", {}), ObservationConfig)
     registered = promote(
         run.path,
         checkpoint or run.checkpoint or "best",
@@ -385,7 +388,7 @@ def _promote(args: argparse.Namespace) -> int:
     print(f"{registered}: version {registered.version}")
     print(f"  run         {run.path}")
     print(f"  checkpoint  {registered.checkpoint}, sha256 {registered.sha256[:12]}")
-    print(f"\n  race it     deepracer-exp evaluate {registered}")
+    print(f"\n  race it     {command_line('evaluate', str(registered), config, OF_POLICY)}")
     return 0
 
 
