@@ -133,12 +133,12 @@ _RESUME_EPILOG = """\
   deepracer-exp resume RUN stopping=none                    a run that was ended by its stopping rule uses up its
                                                             budget
 
-The run continues from its last checkpoint, in its own folder and in the same MLflow run; whatever it wrote after that
-checkpoint is overwritten. With collector=sync and collector=in_process the result equals that of an uninterrupted
-run, bit for bit. With collector=async, or a budget in minutes or money, it cannot. A reward function that keeps
-state between calls starts without it.
+The run continues from its last checkpoint, in its own folder and in the same MLflow run; what it wrote after that
+checkpoint is overwritten. With collector=sync, in_process or ray the result equals that of an uninterrupted run, bit
+for bit. It cannot with collector=async, nor with a budget in minutes or money or one that several runs share. A reward
+function that keeps something between calls starts without it.
 
-If a finished run was recorded while MLflow did not answer, resume delivers the missing points.
+If MLflow did not answer when a run ended, resume delivers the points that it lacks.
 """
 
 
