@@ -6,7 +6,21 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .agents.ppo import PPO, Algorithm
     from .agents.schedules import Schedule
-    from .api import Callback, Trainer, compose, evaluate, load_policy, make_env, read_run, train
+    from .api import (
+        Callback,
+        ComposedExperiment,
+        Evaluation,
+        RaceEnv,
+        RunTables,
+        Trainer,
+        TrainResult,
+        compose,
+        evaluate,
+        load_policy,
+        make_env,
+        read_run,
+        train,
+    )
     from .env.observation import ObservationPart
     from .runs.convergence import Decision, StoppingRule
     from .tracking.tracker import Tracker
@@ -16,11 +30,16 @@ __all__ = [
     "PPO",
     "Algorithm",
     "Callback",
+    "ComposedExperiment",
     "Decision",
+    "Evaluation",
     "ObservationPart",
+    "RaceEnv",
+    "RunTables",
     "Schedule",
     "StoppingRule",
     "Tracker",
+    "TrainResult",
     "Trainer",
     "__version__",
     "compose",

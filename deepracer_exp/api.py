@@ -28,7 +28,10 @@ from deepracer_exp.training.trainer import Callback, Trainer, TrainResult
 __all__ = [
     "Callback",
     "ComposedExperiment",
+    "Evaluation",
+    "RaceEnv",
     "RunTables",
+    "TrainResult",
     "Trainer",
     "compose",
     "evaluate",

@@ -1,11 +1,13 @@
 """What the commands do can be done from Python, without private names."""
 
+import inspect
 import subprocess
 import sys
 
 import torch
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
+import deepracer_exp
 from deepracer_exp import Callback, compose, evaluate, load_policy, make_env, read_run, train
 
 TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
@@ -46,6 +48,12 @@ def test_a_stored_policy_drives_the_environment(trained):
         first, second = (env.rollout(5, policy, auto_reset=True)["action"] for _ in range(2))
     assert first.shape[:2] == (3, 5)
     assert first.dtype == second.dtype == torch.int64
+
+
+def test_what_a_public_function_returns_is_public():
+    for call in (compose, evaluate, make_env, read_run, train):
+        returned = inspect.signature(call, eval_str=True).return_annotation
+        assert getattr(deepracer_exp, returned.__name__) is returned
 
 
 def test_importing_the_package_imports_no_torch():
