@@ -22,10 +22,11 @@ COMMANDS_HEAD = """\
 
     deepracer-exp COMMAND [RUN] [OVERRIDES] [--FLAGS]
 
-Overrides (`GROUP=OPTION`, `KEY=VALUE`) say what is done, in [Hydra's
-grammar](https://hydra.cc/docs/advanced/override_grammar/basic/); flags only say what is printed or written, and where.
-Two overrides mean the same in every command: `runs_dir=DIR` is where runs are (default `runs`), `tracking.uri=URI` is
-the MLflow store (default: `mlflow.db` in `runs_dir`).
+Overrides (`GROUP=OPTION`, `KEY=VALUE`) set the configuration, in [Hydra's
+grammar](https://hydra.cc/docs/advanced/override_grammar/basic/). Flags set what belongs to the command itself: what it
+prints and writes and where, and choices such as `--strict` and `--apply`. Two overrides mean the same in every command:
+`runs_dir=DIR` is where runs are (default `runs`), `tracking.uri=URI` is the MLflow store (default: `mlflow.db` in
+`runs_dir`).
 
 `RUN` is a run's folder, its name or the beginning of its name, its MLflow id, `best:EXPERIMENT`, or the alias of a
 promoted model ([the ways to name a run](lineage.md#how-to-name-a-run)).
