@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 from torchrl.checkpoint import Checkpoint
 
-from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.tracking.metrics import BEST, metric_name
 from deepracer_exp.training.metrics import TIMES
 

@@ -29,10 +29,10 @@ from deepracer_exp.addresses import redact, with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
 from deepracer_exp.tracking.store import check_database_file, one_line
 
+from . import DEFAULT_FILE
+
 Result = TypeVar("Result")
 
-DEFAULT_FILE = "sweeps.db"
-"""In `runs_dir`."""
 DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInternalError)
 """Errors of a database that is down or locked, among others; see `_may_pass`."""
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")

@@ -13,9 +13,10 @@ from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
 
+from . import DEFAULT_FILE
 from .objectives import MEASURES
 from .space import SearchSpace
-from .storage import DEFAULT_FILE, Storage, open_storage
+from .storage import Storage, open_storage
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),

@@ -1,7 +1,6 @@
 """Arguments of a command line: RUN, overrides, where runs are, old spellings, and shell completion."""
 
 import argparse
-import glob
 import itertools
 import re
 import shlex
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.runs.files import run_folders
 
 RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
 STORES = ("runs_dir", "tracking.uri")
@@ -177,8 +177,8 @@ def _path(text: str) -> Path:
 def complete_runs(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
     """Return the names of runs that begin with what was typed."""
     words = [word for word in _words(parsed_args) if is_override(word)]
-    folders = split_stores(words)[0].runs_dir.glob(f"*/{glob.escape(prefix)}*/config.yaml")
-    return [file.parent.name for file in folders] + complete_overrides(prefix, parsed_args)
+    found = run_folders(split_stores(words)[0].runs_dir, prefix)
+    return [folder.name for folder in found] + complete_overrides(prefix, parsed_args)
 
 
 def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:

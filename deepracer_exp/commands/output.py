@@ -8,15 +8,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from deepracer_exp.runs.files import BEST_LAP, LEARNING, REPORT
+
 if TYPE_CHECKING:
     from rich.console import Console
 
     from deepracer_exp.training.trainer import TrainResult
 
 _FILES = {
-    "report.html": "findings and figures",
-    "best_lap.png": "the fastest lap",
-    "learning.png": "the learning curves",
+    REPORT: "findings and figures",
+    BEST_LAP: "the fastest lap",
+    LEARNING: "the learning curves",
 }
 
 

@@ -11,7 +11,7 @@ from string import ascii_uppercase
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY
+from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY, run_folders
 
 from .arguments import (
     STORES,
@@ -158,7 +158,7 @@ def _list(args: argparse.Namespace) -> int:
     runs_dir = read_stores(args.overrides).runs_dir
     if not runs_dir.is_dir():
         raise BadInput(f"runs_dir={runs_dir}: is not a folder; `deepracer-exp train` creates it")
-    folders = {file.parent: _began_s(file.parent) for file in runs_dir.glob(f"*/*/{CONFIG}")}
+    folders = {folder: _began_s(folder) for folder in run_folders(runs_dir)}
     if not folders:
         print(f"no runs in {runs_dir}")
         return 0

@@ -105,12 +105,13 @@ def _show_study(word: str, *arguments: str) -> int:
         raise BadInput(f"sweep {word}: accepted: one study, as in `deepracer-exp sweep {word} lr_entropy`")
 
     from deepracer_exp.config.experiment import safe_name
+    from sweeps import DEFAULT_FILE
 
     with reading(f"sweep {word} {names[0]}"):
         safe_name(names[0])
     runs_dir, storage = stores.runs_dir, stores.values.get("sweep.storage")
-    if storage is None and not (runs_dir / "sweeps.db").is_file():
-        raise BadInput(f"runs_dir={runs_dir}: has no sweeps.db; give runs_dir=DIR or sweep.storage=URL")
+    if storage is None and not (runs_dir / DEFAULT_FILE).is_file():
+        raise BadInput(f"runs_dir={runs_dir}: has no {DEFAULT_FILE}; give runs_dir=DIR or sweep.storage=URL")
 
     from sweeps.storage import open_storage
     from sweeps.study import load_study

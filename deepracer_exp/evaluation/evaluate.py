@@ -16,7 +16,7 @@ from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.files import atomic_write
-from deepracer_exp.runs.files import EVALUATIONS
+from deepracer_exp.runs.files import EVALUATIONS, FILMS
 from deepracer_exp.runs.read_checkpoint import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.delivery import deliver_evaluation
@@ -154,7 +154,7 @@ def evaluate(
         out.print(f"  video    {film.file}", soft_wrap=True, highlight=False)
     tracking = run.experiment.tracking
     uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
-    files = {file: "evaluations"} | ({} if film is None else {film.file: "films"})
+    files = {file: EVALUATIONS} | ({} if film is None else {film.file: FILMS})
     metrics = _metrics(evaluation, trained_on)
     runs_dir = run.path.resolve().parents[1]
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)

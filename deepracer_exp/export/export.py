@@ -11,7 +11,7 @@ from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import REWARD
+from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun, resolve
@@ -30,12 +30,13 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
         RunFailed: the ONNX file differs from the network.
     """
     run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
+    exports = run.path / EXPORTS
     if config.format == "onnx":
         checkpoint = run.choose_checkpoint(config.checkpoint)
-        return _onnx(run, checkpoint, Path(output or run.path / "export" / "policy.onnx"), out)
+        return _onnx(run, checkpoint, Path(output or exports / "policy.onnx"), out)
     if config.format == "aws-logs":
-        return _aws_logs(run, Path(output or run.path / "export" / "aws-logs"), config.layout, out)
-    return _aws(run, Path(output or run.path / "export" / "aws"), out)
+        return _aws_logs(run, Path(output or exports / "aws-logs"), config.layout, out)
+    return _aws(run, Path(output or exports / "aws"), out)
 
 
 def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:

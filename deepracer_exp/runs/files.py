@@ -1,5 +1,6 @@
 """The files of a run folder: their names, and what a training wrote into them."""
 
+import glob
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ RUNNING = ".running"
 """Locked by the process that trains in the folder, and there as long as it does."""
 HEARTBEAT = ".heartbeat"
 CHECKPOINTS, TRACE, EVALUATIONS, FILMS, CRASH_DUMPS = "checkpoints", "trace", "evaluations", "films", "faults"
+EXPORTS, TENSORBOARD, WANDB = "export", "tensorboard", "wandb"
 """Folders within."""
 BEST_OF_SWEEP = "best_of_sweep.json"
 """Beside the runs of a sweep."""
@@ -39,6 +41,11 @@ MLFLOW_DB = "mlflow.db"
 def is_run(folder: Path) -> bool:
     """Return whether a folder is that of a run."""
     return (folder / CONFIG).is_file()
+
+
+def run_folders(runs_dir: Path, beginning: str = "") -> list[Path]:
+    """Return the folders of the runs whose names begin so, of all experiments."""
+    return sorted(file.parent for file in runs_dir.glob(f"*/{glob.escape(beginning)}*/{CONFIG}"))
 
 
 @dataclass(frozen=True)
@@ -116,7 +123,7 @@ def read_run_id(path: Path) -> str | None:
     """
     run_id = read_object(path / TRACKING).get("run_id")
     if not isinstance(run_id, str | None):
-        raise BadInput(f"{path / 'tracking.json'}: run_id: {run_id!r} is no text")
+        raise BadInput(f"{path / TRACKING}: run_id: {run_id!r} is not a string")
     return run_id
 
 

@@ -139,10 +139,9 @@ class RunFolder:
         self.write_metrics(rows)
         for name in (SUMMARY, REPORT, BEST_LAP, LEARNING):
             (self.path / name).unlink(missing_ok=True)
-        for file in (self.path / TRACE).glob("*"):
-            number = file.name.partition("-")[0]
-            if not number.isdigit() or int(number) > len(rows):
-                file.unlink()
+        from .trace import rewind_trace  # imports pyarrow, which `is_held` does without
+
+        rewind_trace(self.path / TRACE, len(rows))
         shutil.rmtree(self.path / CRASH_DUMPS, ignore_errors=True)
 
     def write(self, name: str, text: str) -> Path:

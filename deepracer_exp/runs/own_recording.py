@@ -33,6 +33,7 @@ from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
+from .trace import trace_files
 
 _CONSTANT = {"stream": TRAINING, "worker": 0, "wall_clock": np.nan}
 _READ = [name for name in STEP_COLUMNS if name not in _CONSTANT]
@@ -92,11 +93,7 @@ def read_own_recording(folder: Path) -> Recording:
 
 def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
     """Read the newest files of the trace that together have no more than `MOST_STEPS` rows."""
-    found = sorted(path for path in (folder / TRACE).glob("*-iteration.parquet") if path.name[0] != ".")
-    if not found:
-        raise BadInput(
-            f"{folder / TRACE}: no *-iteration.parquet; accepted: the folder of a run with its trace"
-        )
+    found = trace_files(folder / TRACE)
     tables: dict[Path, pa.Table] = {}
     rows = left_out = 0
     for path in reversed(found):

@@ -17,7 +17,7 @@ from deepracer_exp.tracking.registry import Registered, is_alias, look_up
 from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
 from .checkpoint_files import LINKS, checkpoint_sha256, verify
-from .files import BEST_OF_SWEEP, CHECKPOINTS, CONFIG, is_run, read_config
+from .files import BEST_OF_SWEEP, CHECKPOINTS, CONFIG, is_run, read_config, run_folders
 from .result import RunResult, read_result
 
 logger = logging.getLogger("deepracer_exp")
@@ -97,7 +97,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
         return StoredRun(_present(run, folder_of(run, tracking_uri, runs_dir), runs_dir))
     if "@" in run and "/" not in run:
         return _of_registered(run, look_up(run, tracking_uri, runs_dir), runs_dir)
-    folders = sorted(file.parent for file in runs_dir.glob(f"*/*/{CONFIG}"))
+    folders = run_folders(runs_dir)
     matches = [folder for folder in folders if folder.name == run]
     matches = matches or [folder for folder in folders if folder.name.startswith(run)]
     if len(matches) == 1:
@@ -137,7 +137,7 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
         return of_sweep
     runs = sorted(file.parent for file in folder.glob(f"*/{CONFIG}"))
     if not runs:
-        known = sorted({file.parents[1].name for file in runs_dir.glob(f"*/*/{CONFIG}")})
+        known = sorted({run.parent.name for run in run_folders(runs_dir)})
         raise BadInput(
             f"{what}: no run of such an experiment in {runs_dir}{nearest(experiment, known)}; "
             f"experiments there: {', '.join(known[:10]) or 'none'}"

@@ -28,7 +28,7 @@ from deepracer_exp.config.running import (
     WandbTracking,
 )
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import SUMMARY, read_object
+from deepracer_exp.runs.files import SUMMARY, TENSORBOARD, WANDB, read_object
 
 from .metadata import END_TAG, Scalar, param_text
 from .metrics import Point, now_ms, points_of
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _POINTS_PER_CALL = 1000
-TENSORBOARD, WANDB = "tensorboard", "wandb"
-"""Folders of a run, with the files of each logger."""
 
 
 class Tracker:

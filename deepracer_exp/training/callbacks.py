@@ -9,7 +9,6 @@ from rich.console import Console
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
@@ -30,6 +29,7 @@ from deepracer_exp.runs.files import (
     TRACE,
 )
 from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
+from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
 from deepracer_exp.tracking.tracker import Tracker

@@ -18,7 +18,7 @@ from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
 from deepracer_exp.collectors.base import Collector, cores, worker_count
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.trace import TraceWriter, to_table
+from deepracer_exp.deepracer.trace import to_table
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed, reading
@@ -29,6 +29,7 @@ from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.read_checkpoint import read_agent
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED
+from deepracer_exp.runs.trace import TraceWriter
 
 from .budget import Budget
 from .metrics import NOT_EVALUATED, EvalResult, Finished, RunMetrics, track_names

@@ -9,9 +9,9 @@ import pytest
 
 from deepracer_exp.deepracer import log_blocks, sim_trace
 from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.deepracer.training_log import TrainingLog, read_training_logs
 from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.trace import read_trace
 
 from . import made_up_logs as made
 

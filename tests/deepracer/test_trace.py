@@ -18,11 +18,10 @@ from deepracer_exp.deepracer.trace import (
     SCHEMA,
     STATUS_CODE,
     TRACE_COLUMNS,
-    TraceWriter,
-    read_trace,
     to_table,
 )
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.runs.trace import TraceWriter, read_trace
 
 CONSOLE = (
     Path(__file__).parents[2] / "../shared/reference/console_training/sim-trace/training/training-simtrace"
@@ -154,5 +153,5 @@ def test_a_corrupt_file_is_named(tmp_path: Path, content: bytes | None) -> None:
 
 def test_a_folder_without_a_trace_is_named(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(BadInput, match=r"accepted: the trace folder"):
+        with pytest.raises(BadInput, match=r"accepted: the folder of a run with its trace"):
             read_trace(folder)

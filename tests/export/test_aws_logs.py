@@ -8,7 +8,7 @@ import pytest
 from deepracer.logs import AnalysisUtils, DeepRacerLog, LogFolderType, TrainingMetrics
 
 from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.runs.trace import read_trace
 
 RENAMED = {
     "X": "x",

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.runs.trace import read_trace
 
 
 def _assert_whole(ended, code):

@@ -12,9 +12,9 @@ from deepracer_exp.deepracer.recording import (
     STEP_COLUMNS,
     UPDATE_COLUMNS,
 )
-from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.own_recording import is_own_run, read_own_recording
+from deepracer_exp.runs.trace import read_trace
 
 OWN = ("stream", "worker", "wall_clock")
 """Columns that a trace of ours does not have."""

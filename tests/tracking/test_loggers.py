@@ -6,8 +6,9 @@ import struct
 import pytest
 
 from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
+from deepracer_exp.runs.files import TENSORBOARD, WANDB
 from deepracer_exp.tracking.metrics import METRICS, metric_name
-from deepracer_exp.tracking.tracker import TENSORBOARD, WANDB, Tracker, open_tracker
+from deepracer_exp.tracking.tracker import Tracker, open_tracker
 
 ROWS = [
     {"env_steps": 100 * k, "wall_clock_s": 2.0 * k, "mean_return": float(k), "eval_lap_time_s": None}

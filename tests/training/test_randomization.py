@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from deepracer_exp.config.driving import OFF, QUANTITIES
-from deepracer_exp.deepracer.trace import read_trace
+from deepracer_exp.runs.trace import read_trace
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")

@@ -13,8 +13,8 @@ from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.trace import read_trace
 from deepracer_exp.env.observation import Features, observation_shape
+from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.training.metrics import TIMES
 from deepracer_exp.training.run import train
 

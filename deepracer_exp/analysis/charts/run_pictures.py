@@ -59,7 +59,7 @@ def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
     Lines are coloured by measured speed, on one scale.
 
     Args:
-        trace: rows as `deepracer.trace.read_trace` gives them.
+        trace: rows as `runs.trace.read_trace` gives them.
         tracks: the courses by their names in the trace; one that was not driven on is shown empty.
     """
     one = len(tracks) == 1
