@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from .bounds import Natural, NonNegative, UpTo1000
 
@@ -19,6 +19,11 @@ def checked_checkpoint_name(name: str) -> str:
     if not re.fullmatch(r"best|last|\d{1,9}", name):
         raise ValueError("a checkpoint is best, last or the number of an iteration")
     return name
+
+
+def _renamed(failed_lap: object) -> object:
+    # As it is in runs that were trained before the value had its present name.
+    return "restarts_lap" if failed_lap == "starts_anew" else failed_lap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +45,8 @@ class EvaluationConfig:
     """Duration of a trial, penalties included; a lap that is not complete by then does not count."""
     resets_per_lap: Natural
     """How often in a lap the car is put back at its last progress, standing; after one more the lap has failed."""
-    failed_lap: Literal["ends_trial", "starts_anew"]
-    """After a failed lap the trial ends, or the car starts the next lap, standing."""
+    failed_lap: Annotated[Literal["ends_trial", "restarts_lap"], BeforeValidator(_renamed)]
+    """After a failed lap the trial ends, or the car starts a new lap, standing."""
     penalty_s: PenaltyConfig
     trials: Trials
     """Number of trials on each track, for each of `usual` and `held_out`."""
@@ -90,7 +95,7 @@ class ExportConfig:
     """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
     of a registered model."""
     format: Literal["onnx", "aws", "aws-logs"]
-    """The network as a file, a model for AWS to train on from, or the run's logs as AWS writes them."""
+    """The network as a file, a model for AWS to continue from, or the run's logs as AWS writes them."""
     layout: Literal["console", "deepracer-for-cloud"]
     """The folder layout of `aws-logs`."""
     checkpoint: Annotated[str, AfterValidator(checked_checkpoint_name)] | None
