@@ -1,4 +1,4 @@
-"""The two ways a command ends badly, their exit codes, and the boundary around what a user gave."""
+"""The two ways a command ends badly, their exit codes, the boundary around what a user gave, and words of messages."""
 
 import difflib
 from collections.abc import Iterable, Iterator
@@ -76,6 +76,11 @@ def _one_line(text: str) -> str:
         return line
     half = _LONGEST_LINE // 2
     return f"{line[:half]} … {line[-half:]}"
+
+
+def count(number: int, what: str) -> str:
+    """Return a number of things: ``1 lap``, ``2,000 laps``."""
+    return f"{number:,} {what}{'s' * (number != 1)}"
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

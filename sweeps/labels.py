@@ -31,8 +31,8 @@ OUTCOMES: Mapping[str, OutcomeStyle] = {
     "failed": OutcomeStyle("#000000", "longdashdot", "ended by an error"),
     "running": OutcomeStyle("#9A9A9A", "dot", "still running"),
 }
-"""By the trial's attribute `fate`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from them
-for colour-blind readers, too, or are drawn with another dash."""
+"""By the trial's attribute `outcome`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from
+them for colour-blind readers, too, or are drawn with another dash."""
 
 _BY_STATE = {TrialState.COMPLETE: "finished", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
@@ -41,8 +41,13 @@ def outcome_of(trial: FrozenTrial) -> str:
     """Return how a trial ended, a key of OUTCOMES."""
     if not trial.state.is_finished():
         return "running"
-    stored = str(trial.user_attrs.get("fate"))
+    stored = stored_outcome(trial.user_attrs)
     return stored if stored in OUTCOMES else _BY_STATE[trial.state]
+
+
+def stored_outcome(attrs: Mapping[str, Any]) -> str:
+    """Return the outcome among the attributes of a trial or one of its runs, empty if there is none."""
+    return str(attrs.get("outcome") or attrs.get("fate") or "")  # the second in older studies
 
 
 def outcome_words(outcome: str) -> str:

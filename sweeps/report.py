@@ -13,7 +13,7 @@ from deepracer_exp.analysis.next_steps import COMMAND, command_line
 from deepracer_exp.analysis.next_steps import outcome as outcome_of_run
 from deepracer_exp.analysis.page import plot, render
 from deepracer_exp.config.own_class import OF_POLICY
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write, read_bytes
 from deepracer_exp.runs.files import BEST_LAP, read_config, read_head
 
@@ -90,8 +90,8 @@ def study_summary(study: optuna.Study) -> list[str]:
     share = f", {100 * wasted / spent:.0f} % of them in trials that were pruned or failed" if spent else ""
     return [
         *sentences,
-        f"{len(ended)} of {total} trials ended, {len(complete)} of them complete; they drove {steps(spent)} control "
-        f"steps{share}.",
+        f"{len(ended)} of {count(total, 'trial')} ended, {len(complete)} of them complete; they drove {steps(spent)} "
+        f"control steps{share}.",
     ]
 
 

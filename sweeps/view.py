@@ -12,10 +12,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from deepracer_exp.errors import count
 from deepracer_exp.training.display import sparkline
 
 from .claims import Claim, TrialResult
-from .labels import duration, outcome_words, parameter, short_keys
+from .labels import duration, outcome_words, parameter, short_keys, stored_outcome
 from .objectives import NONE, cost, shown_values
 from .worker_config import WorkerConfig
 
@@ -49,8 +50,8 @@ class SweepView:
         if self._live is not None:
             self._live.start()
         else:
-            total = self._sweep.trials
-            self._line(f"{self._study}: {total} trials, {self._workers} workers; runs in {self._folder}")
+            trials, workers = count(self._sweep.trials, "trial"), count(self._workers, "worker")
+            self._line(f"{self._study}: {trials}, {workers}; runs in {self._folder}")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -174,7 +175,7 @@ def _values(result: TrialResult, objectives: Sequence[str]) -> str:
 
 
 def _sentence(claim: Claim, result: TrialResult, objectives: Sequence[str]) -> str:
-    outcome, steps = outcome_words(result.attrs.get("fate", "")), result.attrs.get("env_steps", 0)
+    outcome, steps = outcome_words(stored_outcome(result.attrs)), result.attrs.get("env_steps", 0)
     end = _values(result, objectives) if result.values else result.attrs.get("reason", "")
     values = f" with {params}" if (params := _params(claim)) else ""
     return f"trial {_number(claim)}{values} {_STATES[result.state]} ({outcome}) after {steps:,} steps: {end}"

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from deepracer_exp.errors import count
 from deepracer_exp.runs.convergence import POOR, convergence, convergence_rule, overfitting
 from deepracer_exp.runs.result import RunResult
 
 from . import candidates as chosen
 from . import off_track
 from .candidates import candidates, evaluated_candidates
-from .log_tables import count
 from .log_view import LogView
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .sectors import Sector, sector_at, sectors_of, times_by_sector
@@ -126,11 +126,11 @@ def _converged(view: LogView) -> Finding:
     elif found.completion > found.completion_before + rule.completion_gain:
         sentence = (
             f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f} % in "
-            f"the last {found.patience} iterations. Train on."
+            f"the last {count(found.patience, 'iteration')}. Keep training."
         )
     else:
         what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still changes"
-        sentence = f"Not converged yet: completion is {found.completion:.0f} %, but {what}. Train on."
+        sentence = f"Not converged yet: completion is {found.completion:.0f} %, but {what}. Keep training."
     thresholds = {
         "completion_gain": rule.completion_gain,
         "reward_gain": rule.return_gain,

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from deepracer_exp.deepracer.recording import Recording, readable
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head
 
@@ -17,7 +17,7 @@ from .charts import actions, driving_line, laps, mistakes, rewards, training
 from .charts.figure import Chart
 from .charts.runs import generalisation_matrix, generations, run_folder, runs_compared
 from .findings import Finding, findings
-from .log_tables import best_laps, candidate_rows, count, facts, headline, iteration_rows, problem_rows
+from .log_tables import best_laps, candidate_rows, facts, headline, iteration_rows, problem_rows
 from .log_view import LogView, prepare
 from .next_steps import next_steps, outcome
 from .page import Plot, plot_of, render

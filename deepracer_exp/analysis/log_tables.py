@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from deepracer_exp.errors import count
+
 from .candidates import candidates_of
 from .log_view import LogView
 
@@ -153,8 +155,3 @@ def headline(view: LogView) -> str:
         return f"{sentence}; no complete lap."
     best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
     return f"{sentence}; {count(laps, 'complete lap')}{best}."
-
-
-def count(number: int, what: str) -> str:
-    """Return a number of things in words."""
-    return f"{number:,} {what}{'s' * (number != 1)}"

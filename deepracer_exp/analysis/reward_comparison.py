@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.errors import count
+
 from .charts.figure import Chart, Panel, colored_points, line, points
 from .charts.maps import map_panel
 from .charts.style import BLUE, ORANGE
-from .log_tables import Table, count, table_of
+from .log_tables import Table, table_of
 from .log_view import LogView
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, reading
+from deepracer_exp.errors import BadInput, count, reading
 from deepracer_exp.files import LOG_BYTES, open_user_file
 from deepracer_exp.runs.files import REPORT
 
@@ -82,7 +82,7 @@ def _analyze(args: argparse.Namespace) -> int:
 
     from deepracer_exp.analysis.findings import findings
     from deepracer_exp.analysis.log_report import LogPage, write_page
-    from deepracer_exp.analysis.log_tables import count, headline
+    from deepracer_exp.analysis.log_tables import headline
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.analysis.reward_comparison import compare_rewards
     from deepracer_exp.evaluation.reward_replay import replay_reward

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from deepracer_exp.errors import count
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, REPORT
 
 if TYPE_CHECKING:
@@ -65,8 +66,8 @@ def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
         return
     print(f"\n{outcome.status}: {outcome.reason}")
     print(
-        f"  {_count(summary['iteration'], 'iteration')}, {_count(summary['env_steps'], 'step')} in "
-        f"{summary['wall_clock_s']:.0f} s; in training {_count(summary['episodes'], 'episode')}, {_laps(summary)}"
+        f"  {count(summary['iteration'], 'iteration')}, {count(summary['env_steps'], 'step')} in "
+        f"{summary['wall_clock_s']:.0f} s; in training {count(summary['episodes'], 'episode')}, {_laps(summary)}"
     )
     result = result_of(summary)
     if result is not None and result.evaluated:
@@ -85,7 +86,7 @@ def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
 
 def print_results(outcomes: "Sequence[TrainResult]") -> None:
     """Print one line per run."""
-    print(f"\n{len(outcomes)} runs:")
+    print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
         print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
 
@@ -114,8 +115,4 @@ def _laps(summary: Mapping[str, Any]) -> str:
     if tracks is not None:
         return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
     best = summary["best_lap_time_s"]
-    return f"{_count(summary['laps'], 'lap')}, the fastest in {best:.2f} s" if best is not None else "no lap"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'s' * (number != 1)}"
+    return f"{count(summary['laps'], 'lap')}, the fastest in {best:.2f} s" if best is not None else "no lap"

@@ -16,7 +16,7 @@ from rich.table import Table
 from deepracer_exp.analysis.charts.runs import speed_and_stability
 from deepracer_exp.analysis.page import write_chart
 from deepracer_exp.config.evaluation import EvaluateConfig
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.read_checkpoint import check, read_policy
 from deepracer_exp.runs.resolve import StoredRun, resolve
@@ -247,7 +247,7 @@ def show_checkpoints(
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, run.experiment.evaluation if own_trials else config.evaluation)
     err.print(
-        f"{run.path.name}: {len(kept)} checkpoint{'s' * (len(kept) > 1)}, {len(evaluator.trials)} trials each",
+        f"{run.path.name}: {count(len(kept), 'checkpoint')}, {count(len(evaluator.trials), 'trial')} each",
         soft_wrap=True,
     )
     with err.status("") as status:

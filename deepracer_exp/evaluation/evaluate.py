@@ -14,7 +14,7 @@ from rich.table import Table
 
 from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
 from deepracer_exp.config.running import MLflowTracking
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import RunFailed, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
 from deepracer_exp.runs.read_checkpoint import StoredPolicy, read_checkpoint
@@ -140,7 +140,8 @@ def evaluate(
     evaluator = Evaluator(run.experiment, config.evaluation)
     film = _film(evaluator, *video) if video is not None else None
     err.print(
-        f"{run.path.name}, checkpoint {stored.path.name}: {len(evaluator.trials)} trials", highlight=False
+        f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
+        highlight=False,
     )
     evaluation = evaluator(stored.networks.policy, film.record if film is not None else None)
     file = write_evaluation(run.path, evaluation, config.evaluation, stored)

@@ -17,7 +17,7 @@ from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import model_metadata_text
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 
 from .aws_files import hyperparameters_of, write_texts, writing
 
@@ -86,7 +86,12 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     log = folder / f"logs/training/training-{job}-robomaker.log"
     with writing():
         _write_trace(numbered, folder / _PLACES[layout]["trace"], log, head)
-    what = f"{len(numbered.rows):,} rows, {len(numbered.episodes):,} episodes, {numbered.iterations:,} iterations"
+    counts = (
+        (len(numbered.rows), "row"),
+        (len(numbered.episodes), "episode"),
+        (numbered.iterations, "iteration"),
+    )
+    what = ", ".join(count(number, noun) for number, noun in counts)
     return [f"{what}, as {layout} has them", *_notes(numbered, experiment)]
 
 

@@ -24,6 +24,7 @@ from deepracer_exp.config.stopping import (
     ReliableStopping,
     StoppingConfig,
 )
+from deepracer_exp.errors import count
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -198,7 +199,7 @@ class TrendRule(StoppingRule):
             return None
         return _decision(
             "plateau",
-            f"{config.metric} has not grown for {config.patience} iterations",
+            f"{config.metric} has not grown for {count(config.patience, 'iteration')}",
             {f"{config.metric}_before": before, f"{config.metric}_since": since},
             config,
         )
@@ -304,7 +305,8 @@ class TrendRule(StoppingRule):
             return None
         return _decision(
             "converged",
-            f"{completion.now:.1f} % completion, entropy {entropy.now:.1%}, no growth for {rule.patience} iterations",
+            f"{completion.now:.1f} % completion, entropy {entropy.now:.1%}, no growth for "
+            f"{count(rule.patience, 'iteration')}",
             values,
             rule,
         )
@@ -420,10 +422,10 @@ def convergence(
             LOG_RULE.
     """
     table = iterations[iterations["episodes"] > 0]
-    count = len(table)
+    rows = len(table)
     rule = convergence_rule(stopping)
-    patience = max(rule.patience, math.ceil(PATIENCE_SHARE * count) if rule is LOG_RULE else 0)
-    if count <= patience:
+    patience = max(rule.patience, math.ceil(PATIENCE_SHARE * rows) if rule is LOG_RULE else 0)
+    if rows <= patience:
         return None
     grown = ("completion_mean", "reward_mean", "lap_share")
     series = {name: moving_average(table[name].to_numpy(np.float64)) for name in grown}
@@ -433,7 +435,7 @@ def convergence(
         "reward_mean": rule.return_gain * float(np.ptp(series["reward_mean"])),
         "lap_share": rule.laps_gain,
     }
-    still = np.ones(count, bool)
+    still = np.ones(rows, bool)
     for name, gain in gains.items():
         best = np.maximum.accumulate(series[name])
         still &= best[-1] <= best + gain
@@ -441,7 +443,7 @@ def convergence(
     flat = not change > rule.entropy_change
     since = int(still.argmax())
     near = completion[-1] >= completion.max() - rule.completion_near
-    converged = flat and near and since <= count - 1 - patience
+    converged = flat and near and since <= rows - 1 - patience
     return Convergence(
         iteration=int(table["iteration"].iloc[since]) if converged else None,
         completion=float(completion[-1]),
@@ -449,7 +451,7 @@ def convergence(
         completion_best=float(completion.max()),
         entropy_change=change,
         patience=patience,
-        iterations=count,
+        iterations=rows,
         entropy_flat=flat,
     )
 

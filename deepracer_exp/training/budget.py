@@ -1,4 +1,4 @@
-"""The budget: how much of it a run and all runs of its experiment have used, what is left, and alerts at shares of it."""
+"""The budget: what a run and all runs of its experiment have used of it, whether any is left, and alerts."""
 
 import json
 import logging
@@ -9,7 +9,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lifeline import running
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_object
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, INTERRUPTED
@@ -28,11 +28,11 @@ _PATIENCE_S = 20.0
 """That an alert may take."""
 _REFRESH_S = 10.0  # between two looks at what other runs have used
 _TAIL_BYTES = 16_384  # more than any line of metrics.jsonl
-_UNITS = {
-    "env_steps": "{:,.0f} steps",
-    "iterations": "{:,.0f} iterations",
-    "minutes": "{:,.4g} min",
-    "max_cost": "{:,.2f} in cost",
+_WORDS: dict[str, Callable[[float], str]] = {
+    "env_steps": lambda used: count(round(used), "step"),
+    "iterations": lambda used: count(round(used), "iteration"),
+    "minutes": "{:,.4g} min".format,
+    "max_cost": "{:,.2f} in cost".format,
 }
 _EXPERIMENT = "experiment_"
 """Beginning of the keys of limits that all runs of an experiment share."""
@@ -80,10 +80,8 @@ class Budget:
             spent = own + others
             percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
             if not first and percent > self._alerted[limit]:
-                number = _UNITS[limit.removeprefix(_EXPERIMENT)]
-                message = (
-                    f"{percent} % of budget.{limit} used: {number.format(spent)} of {number.format(most)}"
-                )
+                words = _WORDS[limit.removeprefix(_EXPERIMENT)]
+                message = f"{percent} % of budget.{limit} used: {words(spent)} of {words(most)}"
                 passed.append(Alert(limit=limit, percent=percent, message=message))
             self._alerted[limit] = max(percent, self._alerted.get(limit, 0))
         return passed
@@ -95,11 +93,9 @@ class Budget:
 
     def __str__(self) -> str:
         """Return the limits in words, e.g. ``3,000,000 steps``."""
-        words = [_UNITS[name].format(most) for name, most in _limits(self._config).items()]
-        words += [
-            f"{_UNITS[name].format(most)} of all runs"
-            for name, most in _limits(self._config, _EXPERIMENT).items()
-        ]
+        words = [_WORDS[name](most) for name, most in _limits(self._config).items()]
+        shared = _limits(self._config, _EXPERIMENT)
+        words += [f"{_WORDS[name](most)} of all runs" for name, most in shared.items()]
         return " or ".join(words)
 
     def _spent(
@@ -267,12 +263,12 @@ def _webhook_address(config: BudgetConfig) -> str | None:
 
 def _limits(config: BudgetConfig, prefix: str = "") -> dict[str, float]:
     """Return the limits that are set, by their keys without the prefix."""
-    return {name: limit for name in _UNITS if (limit := getattr(config, f"{prefix}{name}", None)) is not None}
+    return {name: limit for name in _WORDS if (limit := getattr(config, f"{prefix}{name}", None)) is not None}
 
 
 def _spent_in(folder: Path, config: BudgetConfig, besides: str | None = None) -> dict[str, float]:
     """Return what all run folders in `folder` but the one called `besides` have used, by the limits' keys."""
-    spent = dict.fromkeys(_UNITS, 0.0)
+    spent = dict.fromkeys(_WORDS, 0.0)
     runs = [run for run in folder.iterdir() if run.name != besides] if folder.is_dir() else []
     for row in map(_last_row, runs):
         if row:

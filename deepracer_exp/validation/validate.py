@@ -14,7 +14,7 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.routes import recognise
 from deepracer_exp.deepracer.worlds import UNITS_PER_M
-from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.errors import BadInput, RunFailed, count
 from deepracer_exp.runs.files import METRICS, read_metrics
 
 from .check import Check, look_closer, other_direction, read, try_named_situations
@@ -179,16 +179,15 @@ def _verdict(out: Console, check: Check, strict: bool) -> int:
     if check.failures:
         _line(out, f"Verdict: cannot be used: {check.failures[0]}", "bold red")
         return 2
-    findings = f"{len(check.console)} finding{'s' if len(check.console) > 1 else ''}"
+    findings = count(len(check.console), "finding")
     if strict and check.console:
         _line(out, f"Verdict: the AWS console would reject it: {findings}", "bold red")
         return 2
-    count = len(check.warnings)
-    warnings = f", with {count} warning{'s' if count > 1 else ''}" if count else ""
+    warnings = f", with {count(len(check.warnings), 'warning')}" if check.warnings else ""
     refused = f"; the AWS console would reject it: {findings}" if check.console else ""
     _line(
         out,
         f"Verdict: can be trained{warnings}{refused}",
-        "bold yellow" if count or refused else "bold green",
+        "bold yellow" if warnings or refused else "bold green",
     )
     return 0
