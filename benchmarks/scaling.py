@@ -54,7 +54,7 @@ class Relay:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def taken(self) -> dict[str, int]:
-        """Return the counts, and begin anew."""
+        """Return the counts, and start again from zero."""
         with self._lock:
             counts, self.counts = self.counts, dict.fromkeys(self.counts, 0)
         return counts
@@ -186,10 +186,10 @@ def fill(storage: Storage, study: str, trials: int) -> None:
         "reason": "x" * 60,
         "status": "finished",
         "value": [10.0],
-        "fate": "finished",
+        "outcome": "finished",
     }
     attrs = json.dumps({"overrides": ["x" * 40] * 8, "runs": [run], "env_steps": 10**6, "reason": "x" * 60})
-    row = {"attempt": 1, "owner": "bench:1:a", "state": "told", "expires_s": 0.0, "outcome": "COMPLETE"}
+    row = {"attempt": 1, "owner": "bench:1:a", "state": "reported", "expires_s": 0.0, "outcome": "COMPLETE"}
     TrialClaims(storage.engine, study)
     there = sa.Table("deepracer_slots", sa.MetaData(), autoload_with=storage.engine)
     rows = [

@@ -21,7 +21,7 @@ the sweep on average. Two things are not replayed: what the sampler would have d
 Winners are chosen as the sweep does it: of the `sweep.rerank` complete trials with the best values the one that is best
 on `sweep.rerank_laps` more laps. For the sweep itself this must be the winner that it has reported.
 
-- `minutes`, `trials_per_hour`, `env_steps`, `steps_by_fate`, `trials_by_fate`: the last two by outcome;
+- `minutes`, `trials_per_hour`, `env_steps`, `steps_by_outcome`, `trials_by_outcome`: the last two by outcome;
 - `steps_saved`: share of the control steps without pruning that were not needed;
 - `lap_time_loss`: how much slower the winner's mean lap is than that of the winner without pruning, as a share;
 - `best`: its trial, its value (the race score in seconds) in the sweep and on the re-ranking's laps, and its laps;
@@ -49,6 +49,7 @@ from optuna.trial import TrialState
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import Pruner, compose_sweep
 from sweeps.best import best_trial
+from sweeps.labels import outcome_of
 from sweeps.objectives import cost
 from sweeps.pruners import build_pruner
 from sweeps.rerank import fresh
@@ -114,8 +115,8 @@ def figures(ended: Sequence[Ended], minutes: float, unpruned: Sequence[Ended]) -
         "minutes": round(minutes, 2),
         "trials_per_hour": round(60 * len(ended) / minutes, 1),
         "env_steps": steps,
-        "steps_by_fate": dict(sorted(by_outcome.items())),
-        "trials_by_fate": dict(sorted(collections.Counter(one.outcome for one in ended).items())),
+        "steps_by_outcome": dict(sorted(by_outcome.items())),
+        "trials_by_outcome": dict(sorted(collections.Counter(one.outcome for one in ended).items())),
         "steps_saved": round(1 - steps / every, 4),
     }
 
@@ -139,12 +140,12 @@ def markdown(result: dict[str, Any]) -> str:
         )
         for name, one in ways.items()
     ]
-    outcomes = sorted({outcome for one in ways.values() for outcome in one["steps_by_fate"]})
+    outcomes = sorted({outcome for one in ways.values() for outcome in one["steps_by_outcome"]})
     spent = [
         (
             name,
             *(
-                f"{one['trials_by_fate'].get(each, 0)}: {one['steps_by_fate'].get(each, 0) / 1e6:.2f} M"
+                f"{one['trials_by_outcome'].get(each, 0)}: {one['steps_by_outcome'].get(each, 0) / 1e6:.2f} M"
                 for each in outcomes
             ),
         )
@@ -172,7 +173,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         trial.number: folder / "runs" / request.study / Path(trial.user_attrs["run_dir"] or "").name
         for trial in trials
     }
-    cut_short = [trial.number for trial in trials if trial.user_attrs["fate"] not in ("finished", "failed")]
+    cut_short = [trial.number for trial in trials if outcome_of(trial) not in ("finished", "failed")]
     resumed = at_once(
         options.workers,
         [partial(whole_run, own_runs[number], folder / "whole" / f"{number:03d}") for number in cut_short],
@@ -187,7 +188,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
             number=trial.number,
             points=(),
             env_steps=trial.user_attrs["env_steps"],
-            outcome=trial.user_attrs["fate"],
+            outcome=outcome_of(trial),
             value=trial.values[0] if trial.state == TrialState.COMPLETE else None,
         )
         for trial in trials

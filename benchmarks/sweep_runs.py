@@ -30,6 +30,7 @@ from deepracer_exp.runs.files import TRACKING, read_config, read_object
 from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.runs.result import BUDGET_REACHED
+from sweeps.labels import outcome_of
 from sweeps.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary
@@ -247,7 +248,7 @@ def hold_against(trial: FrozenTrial, course: Course) -> None:
     Raises:
         SystemExit: naming the trial and the difference.
     """
-    outcome, until = trial.user_attrs["fate"], trial.user_attrs["env_steps"]
+    outcome, until = outcome_of(trial), trial.user_attrs["env_steps"]
     if outcome == "failed":
         return
     reports = {step: value for step, (at, value) in enumerate(course.points, 1) if at <= until}

@@ -31,7 +31,7 @@ Value = TypeVar("Value")
 _log = logging.getLogger("deepracer_exp")
 
 _TABLE = "deepracer_slots"
-_CLAIMED, _SETTLED, _REPORTED = "claimed", "settled", "told"
+_CLAIMED, _SETTLED, _REPORTED = "claimed", "settled", "reported"
 _RELEASED = 0.0
 _RENEWALS = 12
 """Renewals within one lease; the live view is at most one of them behind."""
@@ -88,7 +88,7 @@ class Claim:
     """1 for the first owner, one more for each takeover."""
     owner: str
     state: str
-    """`claimed`, `settled` (has its result) or `told` (Optuna has the result, too)."""
+    """`claimed`, `settled` (has its result) or another: Optuna has the result, too."""
     result: TrialResult | None
     trial_id: int | None
     """Optuna's id of the trial."""
@@ -149,7 +149,7 @@ class TrialClaims:
         live view; None: unchanged.
         """
         more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
-        return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more}, (_CLAIMED,))
+        return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more})
 
     def record(
         self,
@@ -167,7 +167,7 @@ class TrialClaims:
             values[_of.runs] = json.dumps(runs)
         if progress is not None:
             values[_of.progress] = json.dumps(dict(progress))
-        return self._update_held(claim, values, (_CLAIMED,))
+        return self._update_held(claim, values)
 
     def settle(self, claim: Claim, result: TrialResult) -> bool:
         """Store the result of a trial; return False if another worker has taken the trial over.
@@ -180,7 +180,7 @@ class TrialClaims:
             _of.objective_values: json.dumps(result.values),
             _of.attrs: json.dumps(result.attrs),
         }
-        return self._update_held(claim, values, (_SETTLED, _REPORTED))
+        return self._update_held(claim, values, settled=True)
 
     def unreported(self) -> list[Claim]:
         """Return the claims whose result Optuna does not have yet."""
@@ -214,7 +214,7 @@ class TrialClaims:
     def is_done(self, total: int) -> bool:
         """Return whether the first `total` trials have their results."""
         ended = sa.select(sa.func.count()).where(
-            _of.study == self.study, _of.slot < total, _of.state.in_((_SETTLED, _REPORTED))
+            _of.study == self.study, _of.slot < total, _of.state != _CLAIMED
         )
         with self._engine.connect() as connection:
             return connection.execute(ended).scalar_one() >= total
@@ -275,8 +275,8 @@ class TrialClaims:
         mine = (row.owner, row.attempt, row.state) == (owner, seen.attempt + 1, _CLAIMED)
         return _as_claim(row) if mine else None
 
-    def _update_held(self, claim: Claim, values: Mapping[Any, Any], afterwards: tuple[str, ...]) -> bool:
-        """Change a claim if its owner still holds it; return whether it does and is in one of these states now."""
+    def _update_held(self, claim: Claim, values: Mapping[Any, Any], *, settled: bool = False) -> bool:
+        """Change a claim if its owner still holds it; return whether it does, and the trial has its result or not."""
         held = (
             _of.slot == claim.index,
             _of.owner == claim.owner,
@@ -287,7 +287,7 @@ class TrialClaims:
             if values:
                 connection.execute(self._statement(values, *held))
             row = connection.execute(self._select(_of.slot == claim.index)).one()
-        return (row.owner, row.attempt) == (claim.owner, claim.attempt) and row.state in afterwards
+        return (row.owner, row.attempt) == (claim.owner, claim.attempt) and settled == (row.state != _CLAIMED)
 
 
 class Lease:
@@ -363,7 +363,7 @@ def report_results(claims: TrialClaims, storage: BaseStorage) -> None:
         try:
             for key, value in claim.result.attrs.items():
                 storage.set_trial_user_attr(claim.trial_id, key, value)
-            # Not by `Study.tell`, which ends the process's study with the last point of a grid.
+            # Not by a method of `Study`, which ends the process's study with the last point of a grid.
             state, values = TrialState[claim.result.state], claim.result.values
             if state == TrialState.PRUNED:
                 values = _last_value(storage.get_trial(claim.trial_id))
@@ -379,13 +379,13 @@ def fail_unclaimed_trials(claims: TrialClaims, storage: BaseStorage) -> None:
     study_id = storage.get_study_id_from_name(claims.study)
     for trial in storage.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,)):
         if trial._trial_id not in known:
-            storage.set_trial_user_attr(trial._trial_id, "fate", "failed")
+            storage.set_trial_user_attr(trial._trial_id, "outcome", "failed")
             storage.set_trial_user_attr(trial._trial_id, "reason", "its worker was lost before it began")
             storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 
 
 def _last_value(trial: FrozenTrial) -> list[float] | None:
-    """Return the last value of a pruned trial, as `Study.tell` records it."""
+    """Return the last value of a pruned trial, which Optuna records as its result."""
     return None if trial.last_step is None else [trial.intermediate_values[trial.last_step]]
 
 

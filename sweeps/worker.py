@@ -45,6 +45,7 @@ from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
 from .claims import Claim, Lease, TrialClaims, TrialResult, report_results
+from .labels import stored_outcome
 from .objectives import intermediate_value, values_of
 from .pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
 from .samplers import build_sampler
@@ -259,7 +260,7 @@ class TrialRun(Callback):
             is_last = len(so_far) == config.seeds
             if not is_last and "wilcoxon" in config.pruners and is_worse_across_seeds(self._study, so_far):
                 reason = f"worse than the best trial on {len(so_far)} seeds"
-                run |= {"fate": "wilcoxon", "reason": reason}
+                run |= {"outcome": "wilcoxon", "reason": reason}
                 return self._with_attrs("PRUNED", None, overrides)
         by_seed = [run["value"] for run in self._runs]
         values = [sum(column) / len(column) for column in zip(*by_seed, strict=True)]
@@ -306,7 +307,7 @@ class TrialRun(Callback):
             **self._runs[index],
             "status": outcome.status,
             "reason": outcome.reason,
-            "fate": self._pruned_by or decision.get("rule", "finished"),
+            "outcome": self._pruned_by or decision.get("rule", FINISHED),
             "env_steps": outcome.summary["env_steps"],
             "wall_clock_s": outcome.summary["wall_clock_s"],
         }
@@ -443,7 +444,7 @@ class TrialRun(Callback):
             "attempt": self._lease.claim.attempt,
             "runs": self._runs,
             "run_dir": self._runs[0]["run_dir"],
-            "fate": last["fate"],
+            "outcome": stored_outcome(last),
             "reason": last["reason"],
             "env_steps": sum(run["env_steps"] for run in self._runs),
             "wall_clock_s": sum(run["wall_clock_s"] for run in self._runs),
@@ -455,7 +456,7 @@ class TrialRun(Callback):
 
 
 def _as_failed(run: Run, reason: str, trace: str) -> Run:
-    return {**run, "status": "failed", "fate": "failed", "reason": reason, "traceback": trace}
+    return {**run, "status": FAILED, "outcome": FAILED, "reason": reason, "traceback": trace}
 
 
 def _rows(run_dir: Path) -> list[dict[str, Any]]:

@@ -95,8 +95,8 @@ def test_steps_are_saved_against_the_same_trials_without_pruning() -> None:
     pruned.append(ended(3, 500, None, "collapsed"))
     found = sweep.figures(pruned, 12.0, unpruned)
     assert found["steps_saved"] == 0.5
-    assert found["steps_by_fate"] == {"collapsed": 1500, "converged": 2500, "finished": 4000}
-    assert found["trials_by_fate"] == {"collapsed": 2, "converged": 1, "finished": 1}
+    assert found["steps_by_outcome"] == {"collapsed": 1500, "converged": 2500, "finished": 4000}
+    assert found["trials_by_outcome"] == {"collapsed": 2, "converged": 1, "finished": 1}
     assert (found["env_steps"], found["trials_per_hour"]) == (8000, 20)
     assert sweep.figures(unpruned, 12.0, unpruned)["steps_saved"] == 0
 
@@ -122,7 +122,7 @@ def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused()
     whole = course(0, [12.0, 10.0, 9.0, 8.0])
 
     def trial(reports: dict[int, float]) -> FrozenTrial:
-        attrs = {"env_steps": 2500, "fate": "collapsed"}
+        attrs = {"env_steps": 2500, "outcome": "collapsed"}
         return create_trial(state=TrialState.PRUNED, intermediate_values=reports, user_attrs=attrs)
 
     sweep_runs.hold_against(trial({1: 12.0, 2: 10.0}), whole)

@@ -104,7 +104,7 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS):
     opened = open_storage(storage, cwd / "runs")
     found = TrialClaims(opened.engine, "s").all()
     assert [claim.index for claim in found] == list(range(trials))
-    assert {claim.state for claim in found} == {"told"}
+    assert {claim.state for claim in found} == {"reported"}
     known = {one._trial_id: one for one in optuna.load_study(study_name="s", storage=opened.optuna).trials}
     assert {claim.trial_id for claim in found} == {
         key for key, one in known.items() if one.state == optuna.trial.TrialState.COMPLETE
@@ -217,7 +217,7 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
         )
         assert taken.owner != held.owner
         running.wait_for(
-            lambda: next(s for s in claims(tmp_path) if s.index == held.index).state == "told", "result"
+            lambda: next(s for s in claims(tmp_path) if s.index == held.index).state == "reported", "result"
         )
     finally:
         late.resume()

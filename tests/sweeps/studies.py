@@ -70,7 +70,7 @@ def add(
         write_metrics(run_dir, metrics, 1e4 if outcome == "not_learning" else 20.0 + 7 * (number % 8))
     attributes = {
         "slot": number,
-        "fate": outcome,
+        "outcome": outcome,
         "reason": f"{outcome.replace('_', ' ')}: for a reason",
         "attempt": 1,
     }

@@ -3,6 +3,8 @@
 import random
 import time
 
+import sqlalchemy as sa
+
 from sweeps.claims import TrialClaims, TrialResult
 
 THREE = ("anna", "ben", "cleo")
@@ -41,10 +43,10 @@ def test_no_write_of_a_late_owner_is_kept(claims):
     before = claims.all()
     assert not claims.renew(late, HOUR_S, {"completion": 100.0})
     assert not claims.record(late, trial_id=8, runs=[])
-    assert not claims.settle(late, result(values=[1.0], fate="finished"))
+    assert not claims.settle(late, result(values=[1.0], outcome="finished"))
     assert claims.release("late") == 0
     assert claims.all() == before
-    assert claims.settle(heir, result("PRUNED", fate="collapsed"))
+    assert claims.settle(heir, result("PRUNED", outcome="collapsed"))
     assert not claims.settle(late, result(values=[1.0]))
     assert claims.all()[0].result.state == "PRUNED"
 
@@ -86,7 +88,7 @@ def test_an_owner_that_claims_again_gets_its_trial_again(claims):
 
 def test_a_second_result_is_accepted_and_the_first_one_stays(claims):
     claim = claims.claim("one", 1, HOUR_S)
-    first = result(values=[12.5], fate="finished")
+    first = result(values=[12.5], outcome="finished")
     assert claims.settle(claim, first)
     assert claims.settle(claim, result("FAIL"))
     claims.mark_reported(0)
@@ -94,7 +96,18 @@ def test_a_second_result_is_accepted_and_the_first_one_stays(claims):
     assert not claims.renew(claim, HOUR_S)
     assert not claims.record(claim, trial_id=1)
     (stored,) = claims.all()
-    assert (stored.state, stored.result) == ("told", first)
+    assert (stored.state, stored.result) == ("reported", first)
+
+
+def test_a_study_of_before_is_done_when_its_trials_are(claims):
+    claim = claims.claim("one", 1, HOUR_S)
+    claims.settle(claim, result(values=[12.5]))
+    with claims._engine.begin() as connection:  # as earlier versions called what Optuna has
+        connection.execute(sa.text("UPDATE deepracer_slots SET state = 'told'"))
+    assert claims.is_done(1)
+    assert claims.settle(claim, result("FAIL"))
+    assert claims.unreported() == []
+    assert claims.claim("two", 1, HOUR_S) is None
 
 
 def test_a_release_frees_the_trials_of_that_owner_only(claims):

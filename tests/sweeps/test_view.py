@@ -12,12 +12,12 @@ CONFIG = SimpleNamespace(trials=4, objectives=("race_score",))
 WORKER_CONFIG = SimpleNamespace(study="spring", config=CONFIG, folder="runs/spring")
 
 
-def claim(number, outcome=None, values=None, share=0.0, params=None, **attrs):
+def claim(number, state=None, values=None, share=0.0, params=None, **attrs):
     progress = {"number": number, "env_steps": 8192, "completion": 51.0, "entropy": 2.31}
     progress |= {"share": share, "params": params or {}}
-    result = outcome and TrialResult(state=outcome, values=values, attrs={"number": number, **attrs})
+    result = state and TrialResult(state=state, values=values, attrs={"number": number, **attrs})
     return Claim(
-        index=number, attempt=1, owner="host:1:a", state="told" if outcome else "claimed",
+        index=number, attempt=1, owner="host:1:a", state="reported" if state else "claimed",
         result=result, trial_id=number, runs=(), progress=progress, expired=False,
     )  # fmt: skip
 
@@ -33,8 +33,8 @@ def shown(claims, is_terminal=True, first=(), after_s=0.0):
 
 
 ENDED = [
-    claim(0, "COMPLETE", [8.25], fate="converged", env_steps=8192, lap_time_s=8.1, completion=98.0),
-    claim(1, "PRUNED", None, fate="collapsed", env_steps=4096, reason="collapsed: entropy 0.01"),
+    claim(0, "COMPLETE", [8.25], outcome="converged", env_steps=8192, lap_time_s=8.1, completion=98.0),
+    claim(1, "PRUNED", None, outcome="collapsed", env_steps=4096, reason="collapsed: entropy 0.01"),
 ]
 
 
