@@ -117,7 +117,7 @@ def measure_long(path: Path, gigabytes: float) -> dict[str, float]:
 def write_long_log(source: Path, target: Path, size_bytes: int) -> int:
     """Write the log again and again, whole, until the target has the size; return the number of trace lines.
 
-    Lines that number episodes themselves are left out: they would tell other numbers than the steps.
+    Lines that number episodes themselves are left out: their numbers would differ from those of the steps.
 
     Raises:
         SystemExit: there is no trace line.

@@ -40,7 +40,7 @@ def scalar_setup(experiment: Experiment) -> RaceSetup:
 class SameDriving:
     """One pass of random driving that can be timed with the whole environment and with the physics alone.
 
-    Both times the same cars do the same: the actions are drawn beforehand, the race begins anew from its seed, and
+    Both times the same cars do the same: the actions are drawn beforehand, the race begins again from its seed, and
     every step of the bare physics starts from the state in which the environment's began.
     """
 

@@ -74,7 +74,7 @@ def _points(key: str, points: Sequence[tuple[int, float]]) -> "Counter[Any]":
 
 
 def _same(one: Any, other: Any) -> bool:
-    # JSON text tells every bit of a number, and takes NaN for the same as NaN.
+    # JSON text holds every bit of a number, and takes NaN for the same as NaN.
     return json.dumps(one) == json.dumps(other)
 
 

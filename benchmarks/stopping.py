@@ -9,7 +9,7 @@ beginning of that one: the rule is applied to its metrics.jsonl. One run, the fi
 run with the rule; it must end after the same iteration with the same metrics and best, or this benchmark fails.
 
 The kept checkpoint is the best evaluated one of the beginning, the other the best of the whole run, both by the
-evaluations of the training. Then both drive anew: 64 laps on usual and 64 on held-out conditions, with starts and
+evaluations of the training. Then both drive again: 64 laps on usual and 64 on held-out conditions, with starts and
 draws that no evaluation of the training had, so that the figures are not those by which they were chosen.
 
 - `steps_saved`: share of all runs' control steps that need not have been driven;
@@ -45,6 +45,7 @@ from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.runs.checkpoints import checkpoint_name
 from deepracer_exp.runs.files import read_run
 from deepracer_exp.runs.read_checkpoint import read_training
+from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.training.stopping_replay import replay
 
 from .command import at_once, read_metrics, read_summary, train
@@ -71,11 +72,7 @@ def trained(folder: Path, overrides: Sequence[str]) -> Path:
     for summary in sorted(folder.glob("runs/*/*/summary.json")):
         run = summary.parent
         stored = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
-        if stored == list(overrides) and read_summary(run)["status"] in (
-            "finished",
-            "stopped early",
-            "hopeless",
-        ):
+        if stored == list(overrides) and read_summary(run)["status"] in (FINISHED, STOPPED_EARLY):
             return run
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
@@ -210,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--tracks", default=",".join(TRACKS), help="options of the group track")
     parser.add_argument("--jobs", type=int, default=2, help="trainings at once")
     parser.add_argument("--steps", type=int, default=3_000_000, help="control steps of the full budget")
-    parser.add_argument("--trials", type=int, default=TRIALS, help="laps that each checkpoint drives anew")
+    parser.add_argument("--trials", type=int, default=TRIALS, help="laps that each checkpoint drives again")
     parser.add_argument(
         "--reuse", type=Path, metavar="DIR", help="keep runs here, and take the finished ones"
     )

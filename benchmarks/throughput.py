@@ -8,7 +8,7 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
   and starts of the next figure's driving and is checked to end in the same state; only the time inside the call
   counts.
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
-  experiment's without its `reward_batch`), episodes begun anew as they end.
+  experiment's without its `reward_batch`), episodes begun again as they end.
 - `all_tracks_over_one_env` (a ratio): the same on eighteen tracks at once, over the figure on one track.
 - `collect_steps_per_s`: batches of an iteration's frames through `LocalCollector` in sync mode with 1 and 2 worker
   processes, the experiment's cars per process, its network sampling actions with its first weights.

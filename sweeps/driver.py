@@ -50,7 +50,7 @@ class Driver:
         """Return when all trials are made: None, or the exit code when interrupted.
 
         Raises:
-            RunFailed: all trials fail, workers die again and again, or the database stays away.
+            RunFailed: all trials fail, workers keep dying, or the database stays away.
         """
         self._config.folder.mkdir(parents=True, exist_ok=True)
         # Workers killed on this machine, mostly with their driver: their trials need not wait for the end of a lease.
@@ -99,7 +99,7 @@ class Driver:
                 logs = [str(log) for log in self._config.folder.glob("workers*.log") if log.stat().st_size]
                 why = f"see {' and '.join(logs)}" if logs else "a reward function can do that"
                 raise RunFailed(
-                    f"workers die again and again, the last with exit code {one.exitcode}; {why}; "
+                    f"workers keep dying, the last one with exit code {one.exitcode}; {why}; "
                     f"{self._how_to_resume()}"
                 )
             self._start()

@@ -75,7 +75,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "clone",
         _clone,
         help="start a new run from another run's policy",
-        description="Train on from another run's checkpoint, at a tenth of its learning rate unless another is given.",
+        description="Continue from another run's checkpoint in a new run, at a tenth of its learning rate unless "
+        "another one is given.",
         epilog=_CLONE_EPILOG,
         runs_rewards=True,
     )

@@ -152,7 +152,7 @@ def check_database_file(file: Path, shown: str) -> None:
     if file.is_dir():
         raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
     try:
-        # SQLite keeps two files beside it. Permissions alone do not tell: root has all of them, even in /proc.
+        # SQLite keeps two files beside it. Permissions alone do not decide it: root has all of them, even in /proc.
         tempfile.TemporaryFile(dir=file.parent).close()
         writable = not file.exists() or os.access(file, os.W_OK)
     except OSError:

@@ -109,7 +109,7 @@ def test_words_of_page_and_figures_can_be_read_in_light_and_in_the_dark(page, ta
     assert (max(map(int, re.findall(r"\d+", background))) < 60) == (scheme == "dark")
     found = tab.tell(CONTRAST)
     assert any(name.startswith("text ") for name in found)
-    # WCAG 2.2, 1.4.3; it leaves out what is no text to read.
+    # WCAG 2.2, 1.4.3; it leaves out what is not text to read.
     assert {name: ratio for name, ratio in found.items() if ratio < 4.5} == {}
 
 

@@ -179,7 +179,7 @@ def test_a_fit_finds_the_parameters_of_the_car_that_was_recorded_and_leaves_the_
 
 
 def test_what_the_recordings_do_not_determine_is_named_and_kept_where_it_began(recorded):
-    # Whoever drives straight ahead says nothing about the tyres' hold across.
+    # Driving straight ahead says nothing about the tyres' sideways grip.
     straight = record(CAR, cars=10, episodes=2)
     straight["steer"] = 0.0
     windows = cut_windows(record_again(straight), CAR.front_point_m, 15)

@@ -80,7 +80,7 @@ def test_a_race_continues_from_a_state_as_the_race_it_was_taken_of(everything, s
             other.load_state_dict(state)
             np.testing.assert_equal(other.state_dict(), kept)
             assert_same(future(other, seed, 30), expected)
-        # Whoever drove, the state is still what it was.
+        # Whichever race drove, the state is still what it was.
         np.testing.assert_equal(state, kept)
 
 

@@ -128,7 +128,7 @@ def test_every_reward_is_finite_in_every_state(name: str, road: str) -> None:
 @pytest.mark.parametrize("road", ROADS)
 @pytest.mark.parametrize("name", STATELESS)
 def test_the_batch_formula_is_the_scalar_formula(name: str, road: str) -> None:
-    n = 4 if name == "racing_line" else 200  # each car's module works the line out anew
+    n = 4 if name == "racing_line" else 200  # each car's module works the line out again
     columns, track_params = anywhere(road, n)
     scalar = zoo(name, n, scalar=True)(columns, track_params, None)
     np.testing.assert_allclose(zoo(name, n)(columns, track_params, None), scalar, rtol=1e-9, atol=1e-12)

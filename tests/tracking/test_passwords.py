@@ -163,7 +163,7 @@ def test_no_password_reaches_an_output_a_file_a_database_or_mlflow(
     client = MlflowClient(tracking_uri=server.uri)
     kept = [client.get_experiment_by_name(name) for name in ("of_file", "typed", "mine")]
     runs = client.search_runs([one.experiment_id for one in kept])
-    assert len(runs) == 5, "recorded all the same"
+    assert len(runs) == 5, "recorded anyway"
     stdouts = "\n".join(said)
     database = all_rows(storage)
     assert "algorithm.lr" in database
