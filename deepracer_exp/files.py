@@ -199,7 +199,7 @@ def _check_structure(text: str) -> None:
             anchor, values, levels = event.anchor, 1, 0
         elif isinstance(event, yaml.AliasEvent):
             if event.anchor not in known:
-                raise ValueError(f"alias *{event.anchor} of something that is not complete or not there")
+                raise ValueError(f"alias *{event.anchor} refers to something that is incomplete or missing")
             anchor, (values, levels) = None, known[event.anchor]
         else:
             continue

@@ -50,7 +50,7 @@ class Driver:
         """Return when all trials are made: None, or the exit code when interrupted.
 
         Raises:
-            RunFailed: all trials fail, workers keep dying, or the database stays away.
+            RunFailed: all trials fail, workers keep dying, or the database does not answer.
         """
         self._config.folder.mkdir(parents=True, exist_ok=True)
         # Workers killed on this machine, mostly with their driver: their trials need not wait for the end of a lease.

@@ -44,7 +44,7 @@ class RayLauncher:
             if not room:
                 raise BadInput(
                     f"sweep.executor.cpus_per_worker={executor.cpus_per_worker}, "
-                    f"gpus_per_worker={executor.gpus_per_worker:g}: no node of the Ray cluster has as many"
+                    f"gpus_per_worker={executor.gpus_per_worker:g}: no node of the Ray cluster has that many"
                 )
             refuse_files(config.storage, runs_dir, store, ray_cluster.node_addresses())
         except BadInput:

@@ -116,7 +116,7 @@ class SearchSpace:
             if one.options is not None:
                 raise BadInput(
                     f"sweep.sampler=grid: {one.key} counts only for {one.group}={','.join(map(str, one.options))}, "
-                    "and a grid knows no conditions; accepted: another sampler, or one option"
+                    "and a grid has no conditions; accepted: another sampler, or one option"
                 )
             what = dimension(one.key, one.expression)
             values = list(what.values) if isinstance(what, Choices) else what.values()

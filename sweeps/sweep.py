@@ -51,7 +51,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
 
     Raises:
         BadInput: before anything is begun; nothing is left behind.
-        RunFailed: all trials fail, or the database stays away.
+        RunFailed: all trials fail, or the database does not answer.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     overrides, request, known = load_request(overrides)

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 
 
 class Collector(ABC):
@@ -100,6 +100,6 @@ def refuse_other_cars(state: Mapping[str, Any], names: set[str]) -> None:
     """Refuse the state of other workers than those of these names; an empty one fits all."""
     if state and set(state) != names:
         raise BadInput(
-            f"the checkpoint does not fit: it has the cars of {len(state)} processes that wait for one another; "
+            f"the checkpoint does not fit: it has the cars of {count(len(state), 'synchronous worker')}; "
             f"accepted by this collector: {len(names)}"
         )

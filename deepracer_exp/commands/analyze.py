@@ -18,7 +18,7 @@ _EPILOG = """\
   deepracer-exp analyze RUN                                 one of our runs
   deepracer-exp analyze ~/Downloads/training.tar.gz         logs of the service, the console or deepracer-for-cloud:
                                                             a folder, an archive or a file of any layout
-  deepracer-exp analyze RUN --compare RUN logs/             others beside it: how each of them learned
+  deepracer-exp analyze RUN --compare RUN logs/             compare how it and others learned
   deepracer-exp analyze RUN --reward racing_line            what another reward function would have paid for
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
 
@@ -42,11 +42,18 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     what.completer = complete_runs  # type: ignore[attr-defined]
     add_overrides(parser, "runs_dir=DIR | tracking.uri=URI")
     parser.add_argument(
-        "--compare", nargs="+", action="extend", default=[], metavar="RUN | LOGS", help="others beside it"
+        "--compare",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="RUN | LOGS",
+        help="runs or logs to compare it with",
     )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(
-        "--reward", metavar="NAME | FILE", help="of the reward zoo, or a file: replayed on the recorded steps"
+        "--reward",
+        metavar="NAME | FILE",
+        help="reward function, of the zoo or a file, to replay on its steps",
     )
     parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
     parser.add_argument(

@@ -118,7 +118,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add_run(promote, f"checkpoint=best|last|N | {where}")
     promote.add_argument("--model", help="name of the model (default: the experiment's)")
     promote.add_argument(
-        "--alias", default="champion", help="moves here from the version that has it (default: champion)"
+        "--alias",
+        default="champion",
+        help="alias for it, taken from the version that has it (default: champion)",
     )
 
     clean = add_command(

@@ -31,10 +31,10 @@ how
   deepracer-exp sweep study=NAME sweep.trials=120           makes more trials
   deepracer-exp sweep report NAME [sweep.storage=URL]       writes the study's page and prints where it is
   deepracer-exp sweep best NAME                             prints the winning command
-  deepracer-exp clone best:NAME                             trains on from the winner
+  deepracer-exp clone best:NAME                             trains the winner further
   deepracer-exp sweep sweep=NAME --cfg                      prints the sweep and stops
 
-exit code: 0 all trials are done; 2 bad input; 3 all trials failed, or the database stayed away; 130, 143 interrupted
+exit code: 0 all trials are done; 2 bad input; 3 all trials failed, or the database did not answer; 130, 143 interrupted
 """
 _WORDS = ("report", "best")
 _PRELOADED = "sweeps.worker"

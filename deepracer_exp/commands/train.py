@@ -131,8 +131,8 @@ _RESUME_EPILOG = """\
   deepracer-exp resume RUN budget.env_steps=5000000         values that do not affect learning may be changed:
                                                             budget, stopping, tracking, checkpoints.keep and time
                                                             limits
-  deepracer-exp resume RUN stopping=none                    a run that was ended by its stopping rule uses up its
-                                                            budget
+  deepracer-exp resume RUN stopping=none                    resume a run that its stopping rule ended, until its
+                                                            budget is used
 
 The run continues from its last checkpoint, in its own folder and in the same MLflow run; what it wrote after that
 checkpoint is overwritten. With collector=sync, in_process or ray the result equals that of an uninterrupted run, bit

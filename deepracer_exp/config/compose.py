@@ -44,7 +44,7 @@ from .track_options import GROUP as TRACK
 Config = TypeVar("Config")
 
 MOST_RUNS = 1000
-"""Limit of one `-m`: one after the other they take a day."""
+"""Limit of one `-m`: so many runs, one after the other, take a day."""
 
 _FILES = (".json", ".npy", ".py", ".yaml", ".yml")
 _NO_EXPERIMENT = ("experiment", None)
@@ -160,7 +160,9 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         except (HydraException, OmegaConfBaseException) as error:
             raise BadInput(_explain(entry, parsed, error)) from error
     if has_tracks and TRACK in mapping and TRACK not in choices:
-        raise BadInput("track: a list of tracks in a file; several are chosen as an override: track=[A,B]")
+        raise BadInput(
+            "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"
+        )
     if several is None and has_tracks and isinstance(mapping.get(TRACK), dict):
         mapping[TRACK] = complete(choices[TRACK], mapping[TRACK])
     elif several is not None:

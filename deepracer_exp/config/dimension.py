@@ -75,8 +75,8 @@ def dimension(key: str, expression: str) -> Choices | Range:
     override = parse_sweep(f"{key}={expression}")
     if not override.is_sweep_override():
         raise BadInput(
-            f"{key}={expression}: one value is nothing to search; accepted: A,B, choice(A,B), range(FROM,BELOW,STEP), "
-            "interval(LOW,HIGH), tag(log,interval(LOW,HIGH)) and glob(PATTERN)"
+            f"{key}={expression}: nothing to search in a single value; accepted: A,B, choice(A,B), "
+            "range(FROM,BELOW,STEP), interval(LOW,HIGH), tag(log,interval(LOW,HIGH)) and glob(PATTERN)"
         )
     return _dimension(override)
 

@@ -127,11 +127,11 @@ def _check_shape(key: str, track: TrackConfig) -> None:
     if (knots is None) != (width_m is None):
         there, missing = ("width_m", "knots") if knots is None else ("knots", "width_m")
         raise BadInput(
-            f"{key}.{there} without {key}.{missing}: a track of your own has both, a world neither"
+            f"{key}.{there} without {key}.{missing}: a track of your own needs both, a world of the service has neither"
         )
     if knots is not None and isinstance(width_m, tuple) and len(width_m) != len(knots):
         raise BadInput(
-            f"{key}.width_m has {len(width_m)} values and {key}.knots {len(knots)}: accepted: one, or one a knot"
+            f"{key}.width_m has {len(width_m)} values and {key}.knots {len(knots)}: accepted: 1, or as many as knots"
         )
     if knots is None and track.file is None and track.name not in worlds():
         raise BadInput(

@@ -121,5 +121,5 @@ class BudgetConfig:
         for name in ("max_cost", "experiment_max_cost"):
             if getattr(self, name) is not None and self.price_per_hour is None:
                 raise ValueError(
-                    f"{name} is {getattr(self, name):g} and price_per_hour null; give the price as well"
+                    f"{name} is {getattr(self, name):g} but price_per_hour is null; give the price as well"
                 )

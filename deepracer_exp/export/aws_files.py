@@ -59,7 +59,7 @@ def writing() -> Iterator[None]:
         yield
     except OSError as error:
         raise BadInput(
-            f"{error.filename}: cannot be written: {error.strerror}; give another folder by -o"
+            f"{error.filename}: cannot be written: {error.strerror}; give another folder with -o"
         ) from error
 
 

@@ -131,7 +131,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Read metrics.jsonl; a last line without an end, cut off by a kill, is left out.
 
     Raises:
-        BadInput: the file cannot be read, or a line is no JSON object.
+        BadInput: the file cannot be read, or a line is not a JSON object.
     """
     lines = _text(path).split("\n")
     return [_object(path, line, f" line {number}") for number, line in enumerate(lines[:-1], 1)]
@@ -145,5 +145,5 @@ def _object(path: Path, text: str, where: str = "") -> dict[str, Any]:
     with reading(f"{path}{where}: is not valid JSON"):
         value = json.loads(text)
     if not isinstance(value, dict):
-        raise BadInput(f"{path}{where}: {text[:40]!r} is no JSON object")
+        raise BadInput(f"{path}{where}: {text[:40]!r} is not a JSON object")
     return value

@@ -125,7 +125,7 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
     of their training. The newest of equals is taken.
 
     Raises:
-        BadInput: there is no such experiment, none of its runs has a result, they do not compare (another car,
+        BadInput: there is no such experiment, none of its runs has a result, they cannot be ranked (another car,
             track, evaluation or measure), or the best run of a sweep is gone.
     """
     what = f"{BEST}{experiment}"
@@ -139,7 +139,7 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
     if not runs:
         known = sorted({run.parent.name for run in run_folders(runs_dir)})
         raise BadInput(
-            f"{what}: no run of such an experiment in {runs_dir}{nearest(experiment, known)}; "
+            f"{what}: no such experiment in {runs_dir}{nearest(experiment, known)}; "
             f"experiments there: {', '.join(known[:10]) or 'none'}"
         )
     results = {run: result for run in runs if (result := _result(run)) is not None}
@@ -217,8 +217,9 @@ def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:
         for key, value in terms[first].items():
             if terms[run][key] != value:
                 raise BadInput(
-                    f"{what}: its runs do not compare: {key} is {_short(value)} in {first.name} and "
-                    f"{_short(terms[run][key])} in {run.name}; give a run, and other experiments another name="
+                    f"{what}: its runs cannot be ranked: {key} is {_short(value)} in {first.name} and "
+                    f"{_short(terms[run][key])} in {run.name}; name one of them, and train what differs under another "
+                    "name="
                 )
 
 

@@ -65,7 +65,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
         raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused it: {one_line(error)}") from error
     except StoreUnavailableError as error:
         raise RunFailed(
-            f"{run_dir}: MLflow ({store.shown}) does not answer; the folder has what is missing there:"
+            f"{run_dir}: MLflow ({store.shown}) does not answer; the run folder keeps what is missing there:"
             f" {one_line(error)}"
         ) from error
     return written

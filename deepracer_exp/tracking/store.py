@@ -139,7 +139,7 @@ def _check_sqlite_uri(uri: str, shown: str) -> str:
 def _check_sqlite_file(file: Path, shown: str) -> None:
     # SQLAlchemy splits the uri at the first "?" and does not unquote the path, so no escape exists.
     if "?" in str(file):
-        raise BadInput(f"{shown}: MLflow's SQLite store cannot lie under a path with '?' ({file}); rename it")
+        raise BadInput(f"{shown}: MLflow's SQLite store cannot be at a path with '?' ({file}); rename it")
     check_database_file(file, shown)
 
 

@@ -127,7 +127,7 @@ def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) 
         return stopping.observe(row)
     except KeyError as error:
         raise BadInput(
-            f"{record.path / METRICS} line {number}: has no {error.args[0]}; this is no row of a training"
+            f"{record.path / METRICS} line {number}: has no {error.args[0]}; this is not a row that a training writes"
         ) from error
 
 

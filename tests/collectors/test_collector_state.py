@@ -180,7 +180,7 @@ def test_asynchronous_workers_have_no_state_and_begin_again(driver_of):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (SYNC, "has the cars of 1 processes that wait for one another; accepted by this collector: 2"),
+        (SYNC, "has the cars of 1 synchronous worker; accepted by this collector: 2"),
         (("collector=async", "collector.processes=1"), "accepted by this collector: 0"),
         (("collector=sync", "collector.processes=1", "collector.cars=3"), "'physics' of its cars has shape"),
     ],

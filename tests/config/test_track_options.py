@@ -89,7 +89,7 @@ def test_a_list_in_an_experiments_file_is_refused(tmp_path, monkeypatch):
     file = tmp_path / "conf/experiment/mine.yaml"
     file.parent.mkdir(parents=True)
     file.write_text("# @package _global_\ndefaults:\n  - override /track: [Oval_track, Monaco]\n")
-    assert refusal("experiment=mine").startswith("track: a list of tracks in a file")
+    assert refusal("experiment=mine").startswith("track: an option file cannot choose several tracks")
 
 
 def test_the_last_choice_counts():

@@ -165,7 +165,7 @@ def test_a_last_line_cut_off_by_a_kill_is_left_out(make_run):
     ("name", "text", "words"),
     [
         ("metrics.jsonl", '{"iteration": 1}\n{"iter\n{"iteration": 3}\n', "line 2: is not valid JSON"),
-        ("metrics.jsonl", "[1]\n", "is no JSON object"),
+        ("metrics.jsonl", "[1]\n", "is not a JSON object"),
         ("config.yaml", "a: [", "not YAML"),
         ("config.yaml", "", "holds no values"),
         ("summary.json", "{", "is not valid JSON"),
