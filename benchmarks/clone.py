@@ -1,4 +1,4 @@
-"""Is a clone that learns at a tenth of the rate better than one that goes on at the same rate?
+"""Is a clone that learns at a tenth of the rate better than one that continues at the same rate?
 
     python -m benchmarks.clone [--seeds 5] [--steps 1000000] [--more 500000] [--jobs 2] [--json FILE] [OVERRIDE...]
 

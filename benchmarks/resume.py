@@ -64,7 +64,7 @@ def latest_kill_s(pace: Pace, iteration: int, left: int) -> float:
 
     Args:
         pace: of the undisturbed run.
-        iteration: from which the process goes on.
+        iteration: from which the process continues.
         left: kills that are left to do, the next one included.
     """
     remaining_s = pace.work_s * (1 - iteration / pace.iterations)

@@ -22,10 +22,10 @@ The tracks differ in length and shape: the default one (17.7 m, 0.76 m wide), th
 wide) and a real circuit more than three times as long, driven clockwise (Spain_track, 60.0 m).
 
 The thresholds of the rule were chosen by looking at the seeds 0 to 4 of these tracks; `--first-seed 5` asks seeds that
-nobody has looked at.
+no one has looked at.
 
-`--reuse DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark goes on, and
-a changed rule costs no new training.
+`--reuse DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark continues,
+and a changed rule costs no new training.
 """
 
 import argparse

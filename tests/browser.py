@@ -1,4 +1,4 @@
-"""A headless Chromium that opens a page and tells what it did: for pages that must need nothing beside them."""
+"""A headless Chromium that opens a page and reports what it did: for pages that must need nothing beside them."""
 
 import base64
 import json
@@ -55,7 +55,7 @@ class Tab:
     def draw_all(self) -> None:
         """Let all figures be drawn by printing the page."""
         for event in ("beforeprint", "afterprint"):
-            self.tell(f"window.dispatchEvent(new Event('{event}'))")
+            self.evaluate(f"window.dispatchEvent(new Event('{event}'))")
 
     def prefer(self, scheme: str) -> None:
         """Let pages know that the reader prefers `light` or `dark`."""
@@ -66,7 +66,7 @@ class Tab:
         """Return the page as PDF."""
         return base64.b64decode(self.call("Page.printToPDF")["data"])
 
-    def tell(self, expression: str) -> Any:
+    def evaluate(self, expression: str) -> Any:
         """Return what an expression comes to."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
@@ -75,7 +75,7 @@ class Tab:
     def wait_for(self, condition: str) -> None:
         """Wait until an expression is true."""
         give_up_at = time.monotonic() + PATIENCE_S
-        while not self.tell(condition):
+        while not self.evaluate(condition):
             assert time.monotonic() < give_up_at, (
                 f"not within {PATIENCE_S:.0f} s: {condition}; {self.complaints}"
             )
@@ -83,7 +83,7 @@ class Tab:
 
     def picture(self, path: Path, selector: str = "html") -> Path:
         """Write a picture of an element, at once."""
-        box = self.tell(
+        box = self.evaluate(
             f"(({{x, y, width, height}}) => ({{x: x + scrollX, y: y + scrollY, width, height}}))"
             f"(document.querySelector({json.dumps(selector)}).getBoundingClientRect())"
         )
@@ -96,13 +96,13 @@ class Tab:
         """Errors and warnings of the console, exceptions, and what the page's policy refused."""
         found = []
         for event in self.events:
-            told = event["params"]
+            params = event["params"]
             if event["method"] == "Runtime.exceptionThrown":
-                found.append(str(told["exceptionDetails"]))
-            elif event["method"] == "Runtime.consoleAPICalled" and told["type"] in ("error", "assert"):
-                found.append(str(told["args"]))
-            elif event["method"] == "Log.entryAdded" and told["entry"]["level"] == "error":
-                found.append(told["entry"]["text"])
+                found.append(str(params["exceptionDetails"]))
+            elif event["method"] == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
+                found.append(str(params["args"]))
+            elif event["method"] == "Log.entryAdded" and params["entry"]["level"] == "error":
+                found.append(params["entry"]["text"])
         return found
 
     @property

@@ -1,4 +1,4 @@
-"""The analysis of a training of the AWS console: the figures that deepracer-utils and the service tell."""
+"""The analysis of a training of the AWS console: the figures that deepracer-utils and the service give."""
 
 import contextlib
 import io

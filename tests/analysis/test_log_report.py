@@ -125,13 +125,13 @@ def test_a_browser_draws_every_figure_without_a_complaint_and_asks_for_nothing(p
         for file in (path, dirty):
             tab.open(file)
             tab.draw_all()
-            assert tab.tell("document.querySelectorAll('[data-state=failed]').length") == 0
-            assert tab.tell("document.querySelectorAll('[data-state=drawn]').length") > 10
-            assert tab.tell("document.documentElement.scrollWidth <= innerWidth")
+            assert tab.evaluate("document.querySelectorAll('[data-state=failed]').length") == 0
+            assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") > 10
+            assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
         assert tab.complaints == []
         assert tab.asked_for <= {"file", "data", "blob"}
         assert not [event for event in tab.events if event["method"] == "Page.javascriptDialogOpening"]
-        assert not tab.tell(
+        assert not tab.evaluate(
             "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
         )
 
@@ -141,17 +141,17 @@ def test_the_policy_of_the_page_refuses_scripts_and_addresses(path, tmp_path):
     with browser(tmp_path / "profile") as tab:
         tab.open(path)
         added = "const s = document.createElement('script'); s.textContent = 'window.got = 1'; document.body.append(s)"
-        tab.tell(added)
-        assert tab.tell("window.got === undefined")
-        assert tab.tell("fetch('data:,x').then(() => 'sent', () => 'refused')") == "refused"
+        tab.evaluate(added)
+        assert tab.evaluate("window.got === undefined")
+        assert tab.evaluate("fetch('data:,x').then(() => 'sent', () => 'refused')") == "refused"
 
 
 @needs_chromium
 def test_figures_are_drawn_when_they_come_into_sight(path, tmp_path):
     with browser(tmp_path / "profile") as tab:
         tab.open(path, height=500)
-        assert tab.tell("document.querySelector('[data-plot=waypoint_map]').dataset.state === undefined")
-        tab.tell("document.querySelector('[data-plot=waypoint_map]').scrollIntoView()")
+        assert tab.evaluate("document.querySelector('[data-plot=waypoint_map]').dataset.state === undefined")
+        tab.evaluate("document.querySelector('[data-plot=waypoint_map]').scrollIntoView()")
         tab.wait_for("document.querySelector('[data-plot=waypoint_map]').dataset.state === 'drawn'")
 
 
@@ -228,17 +228,17 @@ class Replayed:
 
 
 def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
-    told = compare_rewards(view, Replayed())
-    assert told.sentences[0] == (
+    comparison = compare_rewards(view, Replayed())
+    assert comparison.sentences[0] == (
         "Of 3 complete laps mine would have paid best the one of episode 0 (10.00 s, 1st by time, 3rd by the recorded "
         "reward); the fastest lap (10.00 s) is 1st instead of 3rd."
     )
-    assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in told.sentences[1]
-    assert "waypoint 0 gains most and waypoint 20 loses most" in told.sentences[2]
-    assert told.laps.rows[0][:3] == ("1", "3", "1")
-    assert [chart.name for chart in told.charts] == ["replayed_laps", "replayed_places"]
-    text = Html(page_html(LogPage(view, findings(view), replay=told))).text
-    assert text.index(told.sentences[0]) < text.rindex("The best laps")
+    assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in comparison.sentences[1]
+    assert "waypoint 0 gains most and waypoint 20 loses most" in comparison.sentences[2]
+    assert comparison.laps.rows[0][:3] == ("1", "3", "1")
+    assert [chart.name for chart in comparison.charts] == ["replayed_laps", "replayed_places"]
+    text = Html(page_html(LogPage(view, findings(view), replay=comparison))).text
+    assert text.index(comparison.sentences[0]) < text.rindex("The best laps")
 
 
 def test_the_gallery_lists_every_figure_of_the_page_and_every_finding_names_one_of_them():

@@ -55,22 +55,22 @@ def test_the_contents_stay_in_sight_wherever_one_reads(page, tab):
     head = "document.querySelector('.contents summary').getBoundingClientRect()"
     for width in (1400, 420):
         tab.open(page, width=width)
-        tab.tell("scrollTo(0, document.body.scrollHeight)")
-        assert tab.tell(f"{box}.top >= 0 && {head}.bottom <= innerHeight")
-        assert tab.tell("document.querySelector('.contents > details').open") == (width == 1400)
+        tab.evaluate("scrollTo(0, document.body.scrollHeight)")
+        assert tab.evaluate(f"{box}.top >= 0 && {head}.bottom <= innerHeight")
+        assert tab.evaluate("document.querySelector('.contents > details').open") == (width == 1400)
 
 
 def test_no_page_is_wider_than_a_phone(page, tab):
     tab.open(page, width=420)
     tab.draw_all()
-    assert tab.tell("document.documentElement.scrollWidth") <= 420
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 420
     wider = (
         "[...document.querySelectorAll('main *')].filter(one => one.getBoundingClientRect().right > innerWidth"
         " && !one.closest('.wide')).map(one => one.outerHTML.slice(0, 200))"
     )
-    assert tab.tell(wider) == []
+    assert tab.evaluate(wider) == []
     narrow = "[...document.querySelectorAll('[data-plot]')].filter(one => !one.style.minWidth)"
-    assert max(tab.tell(f"{narrow}.map(one => one.layout.width)")) <= 420
+    assert max(tab.evaluate(f"{narrow}.map(one => one.layout.width)")) <= 420
 
 
 CONTRAST = """
@@ -105,9 +105,9 @@ def test_words_of_page_and_figures_can_be_read_in_light_and_in_the_dark(page, ta
     tab.prefer(scheme)
     tab.open(page)
     tab.draw_all()
-    background = tab.tell("getComputedStyle(document.body).backgroundColor")
+    background = tab.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (max(map(int, re.findall(r"\d+", background))) < 60) == (scheme == "dark")
-    found = tab.tell(CONTRAST)
+    found = tab.evaluate(CONTRAST)
     assert any(name.startswith("text ") for name in found)
     # WCAG 2.2, 1.4.3; it leaves out what is not text to read.
     assert {name: ratio for name, ratio in found.items() if ratio < 4.5} == {}
@@ -116,7 +116,7 @@ def test_words_of_page_and_figures_can_be_read_in_light_and_in_the_dark(page, ta
 def test_figures_follow_when_the_reader_goes_from_light_to_dark(page, tab):
     tab.open(page, height=3000)
     paper = "document.querySelector('[data-state=drawn]').layout.paper_bgcolor"
-    assert tab.tell(paper) == "#ffffff"
+    assert tab.evaluate(paper) == "#ffffff"
     tab.prefer("dark")
     tab.wait_for(f"{paper} !== '#ffffff'")
 
@@ -125,33 +125,33 @@ def test_a_printed_page_has_every_figure_and_what_was_folded_without_scrolling(p
     tab.prefer("dark")
     tab.open(page, height=300)
     drawn = "document.querySelectorAll('[data-state=drawn]').length"
-    assert tab.tell(drawn) < tab.tell("document.querySelectorAll('[data-plot]').length")
-    tab.tell("document.querySelectorAll('main details').forEach(one => { one.open = false })")
-    tab.tell(
+    assert tab.evaluate(drawn) < tab.evaluate("document.querySelectorAll('[data-plot]').length")
+    tab.evaluate("document.querySelectorAll('main details').forEach(one => { one.open = false })")
+    tab.evaluate(
         "addEventListener('beforeprint', () => {"
         " window.printed = [...document.querySelectorAll('[data-plot]')]"
         " .map(one => [one.dataset.state, one.layout.paper_bgcolor, one.getBoundingClientRect().height > 100]);"
         " window.closed = document.querySelectorAll('main details:not([open])').length })"
     )
     assert tab.print().startswith(b"%PDF")
-    assert {tuple(one) for one in tab.tell("window.printed")} == {("drawn", "#ffffff", True)}
-    assert tab.tell("window.closed") == 0
-    assert tab.tell("document.querySelectorAll('main details[open]').length") == 0
+    assert {tuple(one) for one in tab.evaluate("window.printed")} == {("drawn", "#ffffff", True)}
+    assert tab.evaluate("window.closed") == 0
+    assert tab.evaluate("document.querySelectorAll('main details[open]').length") == 0
     assert tab.complaints == []
 
 
 def test_a_section_that_was_folded_stays_so_when_the_page_is_loaded_again(page, tab):
     tab.open(page)
     part = "document.querySelectorAll('details.part')[1]"
-    tab.tell(f"{part}.open = true")
+    tab.evaluate(f"{part}.open = true")
     height = f"{part}.getBoundingClientRect().height"
-    before = tab.tell(height)
-    tab.tell(f"{part}.querySelector('summary').click()")
+    before = tab.evaluate(height)
+    tab.evaluate(f"{part}.querySelector('summary').click()")
     tab.wait_for(f"!{part}.open && history.state?.open?.includes(false)")
-    assert tab.tell(height) < min(before, 60)
+    assert tab.evaluate(height) < min(before, 60)
     tab.call("Page.reload")
     tab.wait_for(f"document.readyState === 'complete' && !{part}.open")
-    tab.tell(f"{part}.open = true")
+    tab.evaluate(f"{part}.open = true")
 
 
 def test_the_button_beside_a_command_copies_it(tab, folder):
@@ -159,9 +159,9 @@ def test_the_button_beside_a_command_copies_it(tab, folder):
     tab.call("Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"])
     tab.open(page)
     tab.call("Page.bringToFront")
-    lines = tab.tell("[...document.querySelectorAll('.command code')].map(one => one.textContent)")
+    lines = tab.evaluate("[...document.querySelectorAll('.command code')].map(one => one.textContent)")
     assert any(line.startswith("deepracer-exp train ") for line in lines)
     for at, line in enumerate(lines):
-        tab.tell(f"document.querySelectorAll('.command button')[{at}].click()")
+        tab.evaluate(f"document.querySelectorAll('.command button')[{at}].click()")
         tab.wait_for(f"document.querySelectorAll('.command button')[{at}].textContent === 'Copied'")
-        assert tab.tell("navigator.clipboard.readText()") == line
+        assert tab.evaluate("navigator.clipboard.readText()") == line

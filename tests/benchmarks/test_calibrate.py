@@ -271,9 +271,9 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
         "4",
     ]
     assert calibrate.main(arguments) == 0
-    told = capsys.readouterr().out
-    assert "held out, middle" in told
-    assert "0 left out" in told
+    printed = capsys.readouterr().out
+    assert "held out, middle" in printed
+    assert "0 left out" in printed
     monkeypatch.chdir(tmp_path)
     mine, base = car_named("mine"), car_named("deepracer_v4")
     assert mine.name == "mine"
@@ -286,7 +286,7 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "words"),
     [
         (["--traces", "nowhere"], "nowhere: no such file or folder"),
         (["--traces", "empty"], "empty: no recorded steps"),
@@ -300,7 +300,7 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
     ],
 )
 def test_bad_input_is_refused_in_one_line_before_the_fit(
-    recorded, tmp_path, capsys, monkeypatch, arguments, told
+    recorded, tmp_path, capsys, monkeypatch, arguments, words
 ):
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
@@ -308,7 +308,7 @@ def test_bad_input_is_refused_in_one_line_before_the_fit(
     write(recorded[recorded["worker"] == 3], Path("few"))
     assert calibrate.main(arguments) == 2
     error = capsys.readouterr().err.strip()
-    assert told in error
+    assert words in error
     assert "\n" not in error
     assert not Path("missing").exists()
 

@@ -68,9 +68,12 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
     names = ("console_v5_reinvent_base.log.gz", "drfc_v5_FS_June2020.log.gz", "droa_v6_training.tar.gz")
     arguments = ["--traces", *(str(RACE_PACE / name) for name in names), "--held-out", "--json", str(file)]
     assert fidelity.main([*arguments, "--figures", str(tmp_path / "figures")]) == 0
-    told = json.loads(file.read_text())["versions"]
-    assert {version: of["car"] for version, of in told.items()} == {"5": "deepracer_v5", "6": "deepracer_v6"}
-    five = told["5"]
+    versions = json.loads(file.read_text())["versions"]
+    assert {version: of["car"] for version, of in versions.items()} == {
+        "5": "deepracer_v5",
+        "6": "deepracer_v6",
+    }
+    five = versions["5"]
     assert set(five["bands"]) == {*BANDS, "all"}
     for band in BANDS:
         of = five["bands"][band]
@@ -85,15 +88,15 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "words"),
     [
         (["--traces", "nowhere"], "nowhere: no such file or folder"),
         (["--traces", ".", "--car", "lorry"], "lorry"),
     ],
 )
-def test_bad_input_is_refused_in_one_line(arguments, told, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_refused_in_one_line(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert fidelity.main(arguments) == 2
     error = capsys.readouterr().err.strip()
-    assert told in error
+    assert words in error
     assert "\n" not in error

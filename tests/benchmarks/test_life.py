@@ -273,7 +273,7 @@ for number in range(done + 1, 11):
     aside.replace(run / "checkpoints" / "last")
 (run / "summary.json").write_text('{"status": "finished"}')
 """
-"""Counts to ten, and goes on where it was killed."""
+"""Counts to ten, and continues where it was killed."""
 
 
 def test_a_run_is_killed_as_often_as_asked_even_if_it_is_much_faster_than_expected(

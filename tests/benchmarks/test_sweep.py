@@ -84,7 +84,7 @@ def test_hyperband_lets_a_third_of_a_rung_continue() -> None:
         min_resource=1, max_resource=2, reduction_factor=3
     )  # one bracket: 1, 3, 9 evaluations
     found = replay(courses, pruner, "hyperband", pace=PACE, workers=1)
-    # The first is alone at its rung; each new best of a third goes on.
+    # The first is alone at its rung; each new best of a third continues.
     assert [one.env_steps for one in found] == [3000, 1000, 1000, 3000, 1000]
     assert [one.outcome for one in found] == ["finished", "hyperband", "hyperband", "finished", "hyperband"]
 

@@ -32,9 +32,9 @@ def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_
     assert f"page  {run_dir / 'report.html'}" in ended.stdout
     text = findings_told(run_dir / "report.html")
     assert "16,384 control steps" in text
-    told = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]
-    assert len(told) >= 3
-    assert all(" ".join(line.split()) in text for line in told)
+    printed = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]
+    assert len(printed) >= 3
+    assert all(" ".join(line.split()) in text for line in printed)
 
 
 @pytest.mark.parametrize("what", ["{name}", "tiny/{name}", "{begin}", "best:tiny"])

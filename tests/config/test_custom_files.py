@@ -30,7 +30,7 @@ def composed(folder: Path, *overrides: str) -> tuple[Experiment, Composition]:
     return compose_experiment([f"custom_files={folder}", *overrides])
 
 
-def told(folder: Path, *overrides: str) -> FileOverrides:
+def overrides_of(folder: Path, *overrides: str) -> FileOverrides:
     """Return what the files stand for, without composing it."""
     return file_overrides(
         read_custom_files(str(folder)), {text.partition("=")[0]: text for text in overrides}
@@ -39,7 +39,7 @@ def told(folder: Path, *overrides: str) -> FileOverrides:
 
 def refusal(folder: Path) -> str:
     with pytest.raises(BadInput) as caught:
-        told(folder)
+        overrides_of(folder)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -110,8 +110,8 @@ def test_the_folder_of_a_trained_model_is_understood(custom_files):
     files = read_custom_files(str(folder))
     assert files.learning["batch_size"] == 64
     assert len(files.action_space["actions"]) == 5
-    assert "model/model_metadata.json" in told(folder).notes[0]
-    assert "ip/hyperparameters.json" in told(folder).notes[0]
+    assert "model/model_metadata.json" in overrides_of(folder).notes[0]
+    assert "ip/hyperparameters.json" in overrides_of(folder).notes[0]
 
 
 def test_a_grid_of_folders_is_a_run_each(custom_files):
@@ -149,8 +149,8 @@ def test_every_hyperparameter_is_taken_or_named(custom_files, key):
         "term_cond_avg_score": 1.0,
         "sac_alpha": 0.5,
     }[key]
-    before = told(custom_files())
-    after = told(custom_files(HYPERPARAMETERS | {key: other}))
+    before = overrides_of(custom_files())
+    after = overrides_of(custom_files(HYPERPARAMETERS | {key: other}))
     named = [note for note in after.notes if f"{key}={other}: not applicable: " in note]
     assert len(named) == (key not in TAKEN)
     new = set(after.lines) - set(before.lines)
@@ -158,7 +158,7 @@ def test_every_hyperparameter_is_taken_or_named(custom_files, key):
 
 
 def test_every_key_of_the_metadata_is_taken_or_named(custom_files):
-    notes = told(custom_files()).notes
+    notes = overrides_of(custom_files()).notes
     for key in model_metadata.KEYS:
         named = any(re.match(rf"model_metadata.json: {key}\b.*: not applicable: ", note) for note in notes)
         assert named == (key not in ("action_space", "action_space_type", "training_algorithm"))
@@ -167,13 +167,13 @@ def test_every_key_of_the_metadata_is_taken_or_named(custom_files):
 def test_notes_name_unknown_keys_and_ignored_indices(custom_files):
     space = [dict(action, index=9) for action in METADATA["action_space"]]
     folder = custom_files(HYPERPARAMETERS | {"momentum": 1}, METADATA | {"foo": 2, "action_space": space})
-    notes = told(folder).notes
+    notes = overrides_of(folder).notes
     for part in ("hyperparameters.json: momentum: ignored", "model_metadata.json: foo: ignored", "index"):
         assert any(part in note for note in notes), part
 
 
 def test_values_beyond_the_consoles_limits_are_used_and_noted(custom_files):
-    found = told(custom_files(HYPERPARAMETERS | {"batch_size": 1024}))
+    found = overrides_of(custom_files(HYPERPARAMETERS | {"batch_size": 1024}))
     assert "algorithm.batch_size=1024" in found.lines
     assert any("batch_size=1024: used" in note for note in found.notes)
 
@@ -204,7 +204,7 @@ def test_a_value_given_wins_over_the_files_wherever_it_stands(custom_files, firs
     ],
 )
 def test_a_choice_given_takes_the_place_of_a_file(custom_files, override, group):
-    found = told(custom_files(), override)
+    found = overrides_of(custom_files(), override)
     assert not any(re.match(rf"{group}\b", line) for line in found.lines)
     assert found.lines
     assert group not in found.names

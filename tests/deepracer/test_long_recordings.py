@@ -73,7 +73,7 @@ def test_of_many_files_the_first_of_the_training_go_and_evaluations_stay(tmp_pat
     whole = read_recording(tmp_path)
     training = (whole.steps["stream"] == "training").sum()
     iterations = sorted(set(whole.steps.loc[whole.steps["stream"] == "training", "iteration"]))
-    most_steps(len(whole.steps) + training - 1)  # the log tells the same steps again
+    most_steps(len(whole.steps) + training - 1)  # the log repeats the same steps
     short = read_recording(tmp_path)
     assert len(short.steps) == len(whole.steps)
     most_steps(len(whole.steps) - 1)
@@ -81,9 +81,11 @@ def test_of_many_files_the_first_of_the_training_go_and_evaluations_stay(tmp_pat
     rest = short.steps[short.steps["stream"] == "training"]
     assert sorted(set(rest["iteration"])) == iterations[1:]
     assert len(short.steps) - len(rest) == len(whole.steps) - training
-    told = [problem for problem in short.problems if "steps are left out: only the last" in problem.reason]
-    assert any(f"{training - len(rest)} steps are" in problem.reason for problem in told)
-    assert all(str(tmp_path) in problem.file for problem in told)
+    reported = [
+        problem for problem in short.problems if "steps are left out: only the last" in problem.reason
+    ]
+    assert any(f"{training - len(rest)} steps are" in problem.reason for problem in reported)
+    assert all(str(tmp_path) in problem.file for problem in reported)
 
 
 def test_of_a_run_of_ours_the_last_iterations_are_read(trained, most_steps):

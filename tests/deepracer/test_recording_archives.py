@@ -66,8 +66,8 @@ def test_what_lies_unpacked_beside_an_archive_is_read_once(beside, tmp_path):
     recording = read_recording(tmp_path)
     assert len(made.training(recording)) == made.ROWS["console"]
     (problem,) = recording.problems
-    told = f"{len(files)} of {len(files)} files are not read: the same are unpacked beside it"
-    assert str(problem) == f"{tmp_path / 'week-one.tar.gz'}: {told}"
+    reason = f"{len(files)} of {len(files)} files are not read: the same are unpacked beside it"
+    assert str(problem) == f"{tmp_path / 'week-one.tar.gz'}: {reason}"
 
 
 def test_what_is_missing_beside_an_archive_is_read_out_of_it(tmp_path):

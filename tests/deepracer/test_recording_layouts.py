@@ -98,12 +98,12 @@ def test_policy_updates_stand_with_their_iterations(place, layout):
 @pytest.mark.parametrize("layout", ["drfc_single", "drfc_workers", "console", "droa"])
 def test_metrics_report_the_episodes_of_the_trace(place, layout):
     recording = read_recording(place(LAYOUTS[layout]()))
-    told = recording.metrics[recording.metrics["stream"] == "training"].set_index("episode")
+    logged = recording.metrics[recording.metrics["stream"] == "training"].set_index("episode")
     driven = made.training(recording).groupby("episode")
-    assert sorted(told.index) == sorted(driven.groups)
-    assert (told["reward"] == driven["reward"].sum().astype(int)[told.index]).all()
-    assert (told["worker"] == driven["worker"].first()[told.index]).all()
-    assert set(told["episode_status"]) == {"lap_complete"}
+    assert sorted(logged.index) == sorted(driven.groups)
+    assert (logged["reward"] == driven["reward"].sum().astype(int)[logged.index]).all()
+    assert (logged["worker"] == driven["worker"].first()[logged.index]).all()
+    assert set(logged["episode_status"]) == {"lap_complete"}
     if layout != "drfc_workers":
         evaluated = recording.metrics[recording.metrics["stream"] != "training"].iloc[0]
         assert evaluated["stream"] in set(recording.steps["stream"])
@@ -199,9 +199,9 @@ def test_metrics_report_the_iterations_of_episodes_whose_traces_are_missing(plac
         item["trial"] = number % 2 + 1
     files["metrics/TrainingMetrics.json"] = json.dumps(items)
     recording = read_recording(place(files))
-    told = recording.metrics[recording.metrics["stream"] == "training"]
+    logged = recording.metrics[recording.metrics["stream"] == "training"]
     assert set(made.training(recording)["iteration"]) == {1}
-    assert told["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
+    assert logged["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
 
 
 def test_clones_continue_where_the_one_before_ended(place):
@@ -297,9 +297,9 @@ def test_a_name_that_is_no_utf_8_can_be_shown(tmp_path):
     (folder / "robomaker.log").write_text(made.log_text(made.drives([0])) + "SIM_TRACE_LOG:1\n")
     recording = read_recording(folder)
     assert len(recording.steps) == 6
-    told = [recording.name, *map(str, recording.problems), *recording.steps["stream"].unique()]
-    assert "tr\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}[31m" in "".join(told)
-    assert "".join(told).isprintable()
+    logged = [recording.name, *map(str, recording.problems), *recording.steps["stream"].unique()]
+    assert "tr\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}[31m" in "".join(logged)
+    assert "".join(logged).isprintable()
 
 
 def test_nothing_readable_is_refused_in_one_line(tmp_path):
@@ -321,6 +321,6 @@ def test_unrelated_files_are_named(tmp_path):
     (tmp_path / "other.json").write_text("[1, 2]")
     recording = read_recording(tmp_path)
     assert len(made.training(recording)) == 36
-    told = "\n".join(map(str, recording.problems))
+    logged = "\n".join(map(str, recording.problems))
     for name in ("invoice.docx", "prices.csv", "other.json"):
-        assert name in told
+        assert name in logged

@@ -132,9 +132,9 @@ def test_incomplete_lines_are_listed_with_their_numbers_and_the_others_are_read(
     recording = read_recording(log)
     assert len(recording.steps) == len(ROWS) - 4
     assert [problem.line for problem in recording.problems] == [4, 9, 11, 19]
-    told = [problem.reason for problem in recording.problems]
-    assert "incomplete" in told[0]
-    assert told[1] == "done is 'Fal'; accepted: True or False"
+    reasons = [problem.reason for problem in recording.problems]
+    assert "incomplete" in reasons[0]
+    assert reasons[1] == "done is 'Fal'; accepted: True or False"
     assert all(str(problem).startswith(f"{log}:") for problem in recording.problems)
 
 

@@ -1,4 +1,4 @@
-"""What the real service wrote is read as it was told."""
+"""What the real service wrote is read as it was written."""
 
 import math
 import tarfile
@@ -41,10 +41,10 @@ def test_the_best_lap_took_what_the_service_says(recording, training):
     time_s = training.groupby("episode")["tstamp"].agg(lambda of: of.max() - of.min())
     laps = time_s[training.groupby("episode")["progress"].max() == 100]
     assert laps.min() == pytest.approx(14.13, abs=0.01)
-    told = recording.metrics[
+    logged = recording.metrics[
         (recording.metrics["phase"] == "training") & (recording.metrics["completion"] == 100)
     ]
-    assert sorted(told.loc[told["episode"] < 560, "episode"]) == sorted(laps.index)
+    assert sorted(logged.loc[logged["episode"] < 560, "episode"]) == sorted(laps.index)
 
 
 def test_the_text_log_reports_the_same_rows_and_the_iteration_that_was_not_finished(
@@ -78,18 +78,18 @@ def test_the_entropy_begins_at_that_of_a_policy_that_knows_nothing(recording):
 
 
 def test_metrics_and_trace_report_the_same_episodes(recording, training):
-    told = recording.metrics[
+    logged = recording.metrics[
         (recording.metrics["stream"] == "training") & (recording.metrics["phase"] == "training")
     ]
-    told = told[told["episode"] < 560].set_index("episode")
+    logged = logged[logged["episode"] < 560].set_index("episode")
     driven = training.groupby("episode", observed=True)
-    assert told.index.tolist() == list(driven.groups)
+    assert logged.index.tolist() == list(driven.groups)
     # The service rounds to whole numbers and counts from the moment of the release.
-    assert np.abs(told["reward"] - driven["reward"].sum()).max() <= 1
-    assert np.abs(told["completion"] - driven["progress"].max()).max() <= 1
-    assert (told["episode_status"].astype(str) == driven["episode_status"].last().astype(str)).all()
+    assert np.abs(logged["reward"] - driven["reward"].sum()).max() <= 1
+    assert np.abs(logged["completion"] - driven["progress"].max()).max() <= 1
+    assert (logged["episode_status"].astype(str) == driven["episode_status"].last().astype(str)).all()
     duration_s = driven["tstamp"].max() - driven["tstamp"].min()
-    assert np.abs(told["time_s"] - duration_s).max() < 0.2
+    assert np.abs(logged["time_s"] - duration_s).max() < 0.2
 
 
 def test_evaluations_and_races_stand_beside_the_training(recording):
@@ -97,9 +97,9 @@ def test_evaluations_and_races_stand_beside_the_training(recording):
     assert next(iter(sizes)) == "training"
     assert sorted(list(sizes.values())[1:]) == [725, 735, 737, 742]
     assert sum(name.startswith("leaderboard") for name in sizes) == 2
-    told = recording.metrics[recording.metrics["stream"] != "training"]
-    assert told.groupby("stream", observed=True).size().tolist() == [3, 3]
-    assert set(told["stream"]) <= set(sizes)
+    logged = recording.metrics[recording.metrics["stream"] != "training"]
+    assert logged.groupby("stream", observed=True).size().tolist() == [3, 3]
+    assert set(logged["stream"]) <= set(sizes)
 
 
 def test_settings_are_those_of_the_training(recording):

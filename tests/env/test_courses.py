@@ -20,13 +20,13 @@ def reward_function(params):
     seen.append(params)
     return 1.0
 """
-TOLD = """
+GIVEN = """
 import numpy as np
 def reward_function(params):
     return params["track_length"] + 1000 * params["is_reversed"] + len(params["waypoints"]) / 1000
 def reward_batch(params):
-    told = params["track_length"] + 1000 * params["is_reversed"] + len(params["waypoints"]) / 1000
-    return np.full(len(params["x"]), told)
+    given = params["track_length"] + 1000 * params["is_reversed"] + len(params["waypoints"]) / 1000
+    return np.full(len(params["x"]), given)
 """
 
 
@@ -116,11 +116,11 @@ def test_a_reward_function_gets_its_cars_own_course(setup_of, tmp_path):
 
 
 def test_the_batch_form_is_called_for_each_course(setup_of, tmp_path):
-    (tmp_path / "told.py").write_text(TOLD)
-    scalar = TOLD.replace("reward_batch", "unused")
+    (tmp_path / "given.py").write_text(GIVEN)
+    scalar = GIVEN.replace("reward_batch", "unused")
     (tmp_path / "scalar.py").write_text(scalar)
     paid = []
-    for name in ("told", "scalar"):
+    for name in ("given", "scalar"):
         race = Race(setup_of(*THREE, f"reward.file={tmp_path / name}.py"), 7)
         drive(race, np.zeros((2, 7), np.int64))
         paid.append(race.reward)

@@ -191,9 +191,9 @@ def test_constant_noise_has_its_mean_and_deviation(disturb_commands):
 
 def test_a_delayed_command_reaches_the_car_exactly_so_many_steps_later(disturb_commands):
     race = race_of(action_delay_steps=(0, 4), max_steps=12, n_cars=12)
-    log, told, steps, delays = disturb_commands(race), [], [], []
+    log, commanded, steps, delays = disturb_commands(race), [], [], []
     for action in random_actions(40, 12):
-        told.append(race.setup.actions.commands(action))
+        commanded.append(race.setup.actions.commands(action))
         delays.append(drawn_of(race, "action_delay_steps").astype(int))
         race.step(action)
         steps.append(race.trace[:, PACKED["steps"]].astype(int))
@@ -203,9 +203,9 @@ def test_a_delayed_command_reaches_the_car_exactly_so_many_steps_later(disturb_c
         delay, (steering, speed, moving) = delays[t][car], log[t]
         assert moving[car] == (steps[t][car] > 1 + delay)
         if moving[car]:
-            told_deg, told_mps = told[t - delay]
-            assert steering[car] == pytest.approx(told_deg[car], abs=1e-12)
-            assert speed[car] == told_mps[car]
+            commanded_deg, commanded_mps = commanded[t - delay]
+            assert steering[car] == pytest.approx(commanded_deg[car], abs=1e-12)
+            assert speed[car] == commanded_mps[car]
 
 
 def test_a_late_car_stands_until_its_first_command_arrives():
@@ -231,10 +231,10 @@ def test_the_largest_delay_that_is_accepted_lets_a_car_drive():
 def test_a_battery_loses_its_share_of_the_speed_over_twenty_seconds_and_no_more(disturb_commands):
     race = race_of(battery_sag=(0.3, 0.3), max_steps=0)
     log = disturb_commands(race)
-    told = race.setup.actions.commands(np.zeros((1, 2)))[1][0]
+    commanded = race.setup.actions.commands(np.zeros((1, 2)))[1][0]
     for _ in range(320):
         race.step(np.zeros((1, 2)))
-    share = np.array([entry[1][0] for entry in log[1:]]) / told
+    share = np.array([entry[1][0] for entry in log[1:]]) / commanded
     assert share[0] == 1
     np.testing.assert_allclose(np.diff(share[:301]), -0.3 / 300, atol=1e-7)
     np.testing.assert_allclose(share[300:], 0.7, atol=1e-6)

@@ -1,4 +1,4 @@
-"""A recording that is killed with SIGKILL again and again and goes on each time: RUN_DIR URI KILLS.
+"""A recording that is killed with SIGKILL again and again and resumes each time: RUN_DIR URI KILLS.
 
 It stands for a training whose repeated iterations differ (`collector=async`). It forks, so that MLflow is imported
 once.
@@ -85,7 +85,7 @@ def main(run_dir: Path, uri: str, kills: int) -> None:
         before = lines(metrics)
         child = fork(lambda: record(run_dir, uri))
         if number < kills:
-            # While it starts or tells again, or after some iterations.
+            # While it starts or replays its metrics, or after some iterations.
             wanted = min(before + random.choice((0, 10, 20)), ITERATIONS - 20)
             while lines(metrics) < wanted:
                 time.sleep(0.001)

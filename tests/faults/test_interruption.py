@@ -61,7 +61,7 @@ def test_an_interruption_before_the_run_has_a_folder_is_reported_by_the_exit_cod
 
 @pytest.mark.slow
 def test_a_second_interruption_ends_at_once(start_training, tmp_path):
-    """The iteration would go on for minutes: cars that sleep."""
+    """The iteration would take minutes: cars that sleep."""
     (tmp_path / "slow.py").write_text(
         "import time\ndef reward_function(params):\n    time.sleep(0.2)\n    return 1.0\n"
     )

@@ -1,4 +1,4 @@
-"""Recordings that are killed and go on: MLflow has what metrics.jsonl has, once."""
+"""Recordings that are killed and resumed: MLflow has what metrics.jsonl has, once."""
 
 import json
 import subprocess

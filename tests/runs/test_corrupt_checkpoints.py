@@ -43,7 +43,7 @@ def tiny() -> Experiment:
 
 @pytest.fixture(scope="module")
 def four(tiny, tmp_path_factory) -> Path:
-    """Checkpoints 10, 20, 30 and 40; 20 is the best, 40 the last, and from 30 no training can go on."""
+    """Checkpoints 10, 20, 30 and 40; 20 is the best, 40 the last, and no training can resume from 30."""
     store = CheckpointStore(tmp_path_factory.mktemp("run"), keep=4)
     for iteration in (10, 20, 30, 40):
         counters = {"iteration": iteration, "env_steps": 1000 * iteration}

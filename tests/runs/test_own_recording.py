@@ -45,7 +45,7 @@ def test_rows_of_an_episode_keep_their_own_iterations(trained):
     steps = read_own_recording(trained().folder).steps
     iterations = steps.groupby("episode")["iteration"].nunique()
     assert iterations.max() > 1
-    # The steps of each go on by one.
+    # The steps of each follow one another.
     assert set(steps.groupby("episode")["steps"].diff().dropna()) == {1}
 
 

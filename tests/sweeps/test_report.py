@@ -37,9 +37,9 @@ def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, 
     with browser(tmp_path / "profile") as tab:
         tab.open(path)
         tab.draw_all()
-        assert tab.tell("document.querySelectorAll('[data-state=drawn]').length") == 5
-        assert not tab.tell("document.body.innerText.includes('WebGL')")
-        assert not tab.tell(
+        assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") == 5
+        assert not tab.evaluate("document.body.innerText.includes('WebGL')")
+        assert not tab.evaluate(
             "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
         )
         assert tab.complaints == []

@@ -44,16 +44,16 @@ def run_dir(tmp_path, away):
 
 
 def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, store, tmp_path, caplog):
-    moved = run_dir.rename(tmp_path / "moved")  # what was told is found there, too
+    moved = run_dir.rename(tmp_path / "moved")  # what was logged is found there, too
     assert not is_delivered(moved, store.uri, tmp_path)
     assert deliver(moved, store.uri, tmp_path) == 9
     assert is_delivered(moved, store.uri, tmp_path)
     client = MlflowClient(tracking_uri=store.uri)
     (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
-    told = read_tracked_run(moved / "tracking.json")
+    tracked = read_tracked_run(moved / "tracking.json")
     assert (run.info.run_name, run.info.status) == ("run", "FINISHED")
     assert (run.info.run_id, run.info.start_time, run.info.end_time) == (
-        told.run_id, told.start_ms, told.end_ms,
+        tracked.run_id, tracked.start_ms, tracked.end_ms,
     )  # fmt: skip
     assert run.data.params == {"seed": "1"}
     wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "stopped early: collapsed"}
@@ -68,9 +68,9 @@ def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, sto
 
 
 def test_a_run_killed_before_it_logged_its_end_is_ended_by_its_summary(run_dir, store, tmp_path):
-    told = json.loads((run_dir / "tracking.json").read_text())
-    del told["tags"]["end"]
-    (run_dir / "tracking.json").write_text(json.dumps({**told, "status": None, "end_ms": None}))
+    tracked = json.loads((run_dir / "tracking.json").read_text())
+    del tracked["tags"]["end"]
+    (run_dir / "tracking.json").write_text(json.dumps({**tracked, "status": None, "end_ms": None}))
     deliver(run_dir, store.uri, tmp_path)
     run_id = read_tracked_run(run_dir / "tracking.json").run_id
     run = MlflowClient(tracking_uri=store.uri).get_run(run_id)

@@ -78,11 +78,11 @@ def test_a_busy_store_blocks_nothing_and_gets_every_point_later(store, wait_unti
 def test_repeating_a_call_changes_nothing(store):
     run = MLflowRun(store)
     run.connect()
-    told = TrackedRun(None, "run", "race", 1234, store.shown)
-    run.create(told, again=False)
+    tracked = TrackedRun(None, "run", "race", 1234, store.shown)
+    run.create(tracked, again=False)
     repeated = MLflowRun(store)
     repeated.connect()
-    repeated.create(told, again=True)
+    repeated.create(tracked, again=True)
     assert repeated.run_id == run.run_id
     for _ in range(2):
         run.log_params({"seed": "1"})

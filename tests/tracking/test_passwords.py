@@ -154,7 +154,7 @@ def test_no_password_reaches_an_output_a_file_a_database_or_mlflow(
         run(0, *sweep, f"sweep.storage={storage}", alone=True)
         run(0, "sweep", "best", "mine", f"sweep.storage={storage}")
         run(2, "runs", "promote", str(trained), f"tracking.uri={uri.replace(quote(USER), 'somebody')}")
-    run(2, "runs", "promote", str(trained), f"tracking.uri={uri}")  # which nobody serves any more
+    run(2, "runs", "promote", str(trained), f"tracking.uri={uri}")  # which no server answers any more
     run(2, *sweep, f"sweep.storage={postgres.url('nowhere')}")
     run(2, *sweep, f"sweep.storage={storage.replace('+psycopg', '+nope')}")
     run(2, "train", *TINY, f"tracking.uri=ftp://me:{quote(PASSWORD, safe='')}@host")

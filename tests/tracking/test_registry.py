@@ -59,7 +59,7 @@ def test_a_promoted_version_has_metrics_signature_report_and_description(season,
     ]
     rows[1] |= {"eval_completion": 98.7654, "eval_race_score_s": 9.5}
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    (run / "report.html").write_text("<p>what the training tells")
+    (run / "report.html").write_text("<p>what the training reports")
     client.log_metric(run_id, "race/score_s", 9.5, 1234, 2000)
     promote(run, "best", "model", "champion", FEATURES, None, season.runs_dir)
     version = client.get_model_version_by_alias("model", "champion")

@@ -110,13 +110,13 @@ def test_a_run_that_was_never_created_begins_when_it_began(store, client, identi
     away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
     log(away, [row(1)])
     away.finish("KILLED", deadline_s=0)
-    told = read_tracked_run(identity)
+    tracked = read_tracked_run(identity)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     log(tracker, [row(1), row(2)])
     assert tracker.finish("FINISHED") == 0
     (run,) = runs(client)
-    assert (told.run_id, run.info.start_time, run.info.run_name) == (None, told.start_ms, "run")
+    assert (tracked.run_id, run.info.start_time, run.info.run_name) == (None, tracked.start_ms, "run")
     assert (run.data.params, run.data.tags["track"]) == ({"seed": "1"}, "oval")
     assert points(client, run.info.run_id) == [(100, 1 / 3), (200, 2 / 3)]
 

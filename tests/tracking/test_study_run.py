@@ -19,7 +19,7 @@ BASE = ["track=reinvent_base", "+reward.constants.X=a<b"]
 
 
 def progress(ended=3, **changes) -> Progress:
-    told = {
+    known = {
         "total": 60,
         "complete": ended - 2,
         "pruned": 1,
@@ -27,13 +27,13 @@ def progress(ended=3, **changes) -> Progress:
         "env_steps": 12_000,
         "best_trial": 7,
     }
-    told |= {
+    known |= {
         "best_values": {"race_score": 9.5},
         "best_shown": "race score 9.50 s",
         "best_line": "deepracer-exp train a=1",
         "lap_time_s": 9.4,
     }
-    return Progress(**(told | {"completion": 98.0} | changes))
+    return Progress(**(known | {"completion": 98.0} | changes))
 
 
 def runs_of(store: Store, name="spring"):
@@ -137,19 +137,19 @@ def test_another_search_of_the_same_name_gets_a_run_of_its_own(store):
 
 
 def test_of_two_runs_created_at_the_same_moment_the_older_one_stays(store, monkeypatch):
-    told = TrackedRun(None, "sweep", "spring", 2000, store.shown, tags={"sweep.study": "spring"})
+    tracked = TrackedRun(None, "sweep", "spring", 2000, store.shown, tags={"sweep.study": "spring"})
     mine, theirs = MLflowRun(store), MLflowRun(store)
     mine.connect()
     theirs.connect()
     create = MLflowRun.create
 
-    def create_after_the_other(run, told, *, again):
+    def create_after_the_other(run, tracked, *, again):
         # The other one looked before this run was there, and created its own a little earlier.
-        create(theirs, TrackedRun(None, "sweep", "spring", 1000, store.shown, tags=told.tags), again=False)
-        create(run, told, again=again)
+        create(theirs, TrackedRun(None, "sweep", "spring", 1000, store.shown, tags=tracked.tags), again=False)
+        create(run, tracked, again=again)
 
     monkeypatch.setattr(MLflowRun, "create", create_after_the_other)
-    mine.create_once(told, ["sweep.study"])
+    mine.create_once(tracked, ["sweep.study"])
     assert mine.run_id == theirs.run_id
     assert [run.info.run_id for run in runs_of(store)] == [theirs.run_id]
 

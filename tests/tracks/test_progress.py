@@ -53,7 +53,7 @@ def published(reference: Path) -> Track:
 def test_every_recorded_progress_is_reproduced(recording, published):
     found = published.project(recording[["X", "Y"]].to_numpy())
     assert len(recording) == 44_247
-    # The service moves the start by 0.05 after every episode; the first row tells by how much so far.
+    # The service moves the start by 0.05 after every episode; the first row shows by how much so far.
     start = recording.assign(at=found.ndist).groupby("episode")[["at", "progress"]].transform("first")
     start_ndist = np.round((start["at"] - start["progress"] / 100).to_numpy() * 20) / 20 % 1
     shown = np.empty(len(recording))

@@ -46,7 +46,7 @@ def webhook(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     webhook.server.shutdown()
 
 
-def tell(run_dir: Path, message: str, *overrides: str) -> None:
+def send(run_dir: Path, message: str, *overrides: str) -> None:
     alerts = Alerts(compose_experiment(list(overrides))[0].budget)
     alerts.send(message, run_dir)
     alerts.close()
@@ -60,20 +60,20 @@ def script(folder: Path, line: str) -> Path:
 
 
 def test_a_command_gets_the_message_and_the_runs_folder(tmp_path):
-    command = script(tmp_path, f'printf "%s: %s in %s" "$@" > {tmp_path}/told')
-    tell(tmp_path, "80 % of budget.minutes used", f"budget.alert_command='{command} alert'")
-    assert (tmp_path / "told").read_text() == f"alert: 80 % of budget.minutes used in {tmp_path}"
+    command = script(tmp_path, f'printf "%s: %s in %s" "$@" > {tmp_path}/sent')
+    send(tmp_path, "80 % of budget.minutes used", f"budget.alert_command='{command} alert'")
+    assert (tmp_path / "sent").read_text() == f"alert: 80 % of budget.minutes used in {tmp_path}"
 
 
 def test_a_webhook_gets_the_message(tmp_path, webhook):
-    tell(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
+    send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
     assert webhook.posted == [{"text": "50 % used", "content": "50 % used"}]
 
 
 @pytest.mark.parametrize("webhook", [404], indirect=True)
 def test_a_webhook_that_refuses_is_logged_without_its_address(tmp_path, webhook, caplog):
     caplog.set_level(logging.INFO)
-    tell(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
+    send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
     assert "budget.alert_webhook answered 404" in caplog.text
     assert "secret-path" not in caplog.text
 
@@ -82,7 +82,7 @@ def test_a_webhook_that_is_down_is_logged_without_its_address(tmp_path, webhook,
     caplog.set_level(logging.INFO)
     webhook.server.shutdown()
     webhook.server.server_close()
-    tell(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
+    send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
     assert "budget.alert_webhook cannot be reached" in caplog.text
     assert "secret-path" not in caplog.text
 
@@ -90,23 +90,23 @@ def test_a_webhook_that_is_down_is_logged_without_its_address(tmp_path, webhook,
 def test_a_command_that_fails_is_logged_with_its_last_word(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     command = script(tmp_path, "echo no such phone >&2; exit 7")
-    tell(tmp_path, "50 % used", f"budget.alert_command={command}")
+    send(tmp_path, "50 % used", f"budget.alert_command={command}")
     assert "budget.alert_command ended with exit code 7: no such phone" in caplog.text
 
 
 def test_a_command_that_is_not_there_is_logged(tmp_path, caplog):
     caplog.set_level(logging.INFO)
-    tell(tmp_path, "50 % used", "budget.alert_command=no-such-program")
+    send(tmp_path, "50 % used", "budget.alert_command=no-such-program")
     assert "budget.alert_command cannot be run: No such file" in caplog.text
 
 
 def test_a_command_whose_quotes_do_not_close_is_refused(tmp_path):
     with pytest.raises(BadInput, match=r"budget\.alert_command=say 'it: No closing quotation"):
-        tell(tmp_path, "50 % used", 'budget.alert_command="say \'it"')
+        send(tmp_path, "50 % used", 'budget.alert_command="say \'it"')
 
 
 def test_without_command_and_webhook_nothing_is_sent(tmp_path):
-    tell(tmp_path, "50 % used")
+    send(tmp_path, "50 % used")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -117,5 +117,5 @@ def test_a_webhook_whose_variable_holds_no_address_is_refused(tmp_path, monkeypa
     else:
         monkeypatch.setenv(VARIABLE, address)
     with pytest.raises(BadInput, match=f"budget.alert_webhook={VARIABLE}: ") as refusal:
-        tell(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
+        send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
     assert address is None or address not in str(refusal.value)

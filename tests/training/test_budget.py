@@ -78,7 +78,7 @@ def test_minutes_and_costs_are_summed_at_each_runs_own_price(run):
 
 
 def test_a_run_that_continues_or_was_killed_counts_with_its_last_whole_row(run):
-    sibling(run, "goes on", ended=False, env_steps=500)
+    sibling(run, "continues", ended=False, env_steps=500)
     assert Budget(limits(experiment_env_steps=1000), run).used(250, 0, 0.0)[1] == 0.5
 
 
@@ -113,10 +113,10 @@ def test_an_experiment_that_has_used_everything_starts_no_run(run):
 
 def test_each_share_of_a_limit_is_reported_once():
     budget = Budget(limits(env_steps=1000))
-    told = [[alert.percent for alert in budget.alerts(steps, 0, 0.0)] for steps in range(0, 1200, 100)]
-    assert [percent for alerts in told for percent in alerts] == [50, 80, 100]
-    assert told[5] == [50]
-    assert told[10] == [100]
+    percents = [[alert.percent for alert in budget.alerts(steps, 0, 0.0)] for steps in range(0, 1200, 100)]
+    assert [percent for alerts in percents for percent in alerts] == [50, 80, 100]
+    assert percents[5] == [50]
+    assert percents[10] == [100]
 
 
 def test_shares_that_are_passed_together_are_one_alert():

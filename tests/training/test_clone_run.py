@@ -1,4 +1,4 @@
-"""`deepracer-exp clone`: a new run with another run's policy, and what it is told of its parent."""
+"""`deepracer-exp clone`: a new run with another run's policy, and what it records of its parent."""
 
 import json
 import shutil
@@ -83,11 +83,11 @@ def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_it
 def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(parent, call):
     child = child_of(parent, call("clone", parent.name, "budget.iterations=1"))
     best = (parent / "checkpoints" / "best").resolve()
-    told = lineage(child)
-    assert told["parent"] == parent.name
-    assert told["checkpoint"] == best.name
-    assert told["sha256"] == checkpoint_sha256(best)
-    assert told["generation"] == 1
+    recorded = lineage(child)
+    assert recorded["parent"] == parent.name
+    assert recorded["checkpoint"] == best.name
+    assert recorded["sha256"] == checkpoint_sha256(best)
+    assert recorded["generation"] == 1
     assert list(pinned(parent / "checkpoints")) == [best.name]
     ended = call("clone", child.name, "checkpoint=last", "budget.iterations=1")
     assert ended.code == 0, ended.stderr

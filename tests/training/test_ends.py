@@ -1,4 +1,4 @@
-"""What ends a run, and what is told of it: stopping rules and budgets in real trainings."""
+"""What ends a run, and what is reported of it: stopping rules and budgets in real trainings."""
 
 import os
 import shlex
@@ -52,17 +52,17 @@ def test_a_run_that_its_budget_ends_has_no_decision(trained):
 
 def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
     command = tmp_path / "alert.sh"
-    command.write_text('#!/bin/sh\necho "$1" >> told.txt\n')
+    command.write_text('#!/bin/sh\necho "$1" >> alerts.txt\n')
     command.chmod(0o755)
     ended = trained(f"budget.alert_command={command}")
     # Commands run beside the training and each other.
-    told = sorted((ended.cwd / "told.txt").read_text().splitlines())
-    assert told == [
+    sent = sorted((ended.cwd / "alerts.txt").read_text().splitlines())
+    assert sent == [
         "100 % of budget.env_steps used: 4,096 steps of 4,096 steps",
         "50 % of budget.env_steps used: 2,048 steps of 4,096 steps",
     ]
     log = (ended.folder / "log.txt").read_text()
-    assert all(message in log for message in told)
+    assert all(message in log for message in sent)
 
 
 def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):

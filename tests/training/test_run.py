@@ -47,7 +47,7 @@ def same_weights(one, other) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def assert_trace_tells_the_metrics(ended) -> None:
+def assert_trace_gives_the_metrics(ended) -> None:
     """Recompute every iteration's row from the trace."""
     trace = read_trace(ended.folder / "trace")
     metrics = pd.DataFrame(ended.metrics, index=range(1, len(ended.metrics) + 1))
@@ -102,7 +102,7 @@ def test_a_finished_run_says_so_and_names_its_folder(trained):
 def test_metrics_and_trace_agree(trained):
     ended = trained(*OVERRIDES)
     assert ended.summary["episodes"] > 50
-    assert_trace_tells_the_metrics(ended)
+    assert_trace_gives_the_metrics(ended)
 
 
 def test_the_same_seed_gives_the_same_run(trained, train_here):
@@ -145,7 +145,7 @@ def test_asynchronous_collection_numbers_and_counts_every_step(call):
         "train", "experiment=tiny", "tracking=off", "collector=async", "collector.processes=2", *OVERRIDES
     )
     assert ended.code == 0, ended.stderr
-    assert_trace_tells_the_metrics(ended)
+    assert_trace_gives_the_metrics(ended)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ SEVERAL = (*OVERRIDES, f"track=[{','.join(TRACKS)}]", "track.Oval_track.directio
 def test_several_tracks_train_together_and_each_has_its_metrics(trained):
     ended = trained(*SEVERAL)
     assert ended.code == 0, ended.stderr
-    assert_trace_tells_the_metrics(ended)
+    assert_trace_gives_the_metrics(ended)
     trace = read_trace(ended.folder / "trace")
     ends = trace[trace.done]
     assert set(trace.track) == set(TRACKS)
@@ -226,7 +226,7 @@ def test_every_kind_of_choice_trains(trained, overrides):
     ended = trained("budget.iterations=2", *overrides)
     assert ended.code == 0, ended.stderr
     assert all(math.isfinite(row["policy_loss"]) for row in ended.metrics)
-    assert_trace_tells_the_metrics(ended)
+    assert_trace_gives_the_metrics(ended)
 
 
 def test_iterations_of_episodes_have_at_least_that_many(trained):
@@ -236,7 +236,7 @@ def test_iterations_of_episodes_have_at_least_that_many(trained):
         "algorithm.batch_size=64",
     )
     assert ended.code == 0, ended.stderr
-    assert_trace_tells_the_metrics(ended)
+    assert_trace_gives_the_metrics(ended)
     episodes = [0] + [row["episodes"] for row in ended.metrics]
     assert len(episodes) > 2
     assert (np.diff(episodes) >= 20).all()

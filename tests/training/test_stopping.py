@@ -284,11 +284,11 @@ def every_decision() -> Iterator[Decision]:
 def test_a_decision_reports_rule_values_and_thresholds_as_json_and_tags():
     rules = set()
     for decision in every_decision():
-        told = json.loads(json.dumps(decision.as_dict()))
-        assert told["rule"] in str(decision).replace(" ", "_")
-        assert told["values"]
-        assert told["thresholds"]["patience"] > 0
-        assert all(math.isfinite(value) for value in told["values"].values())
+        stored = json.loads(json.dumps(decision.as_dict()))
+        assert stored["rule"] in str(decision).replace(" ", "_")
+        assert stored["values"]
+        assert stored["thresholds"]["patience"] > 0
+        assert all(math.isfinite(value) for value in stored["values"].values())
         tags = decision.tags()
         assert tags["stopping.rule"] == decision.rule
         assert {f"stopping.threshold.{key}" for key in decision.thresholds} <= tags.keys()

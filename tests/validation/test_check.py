@@ -87,10 +87,10 @@ def test_prints_and_changed_params_do_no_harm(check_of, capsys):
 def test_branches_that_are_never_taken_are_reported_with_their_lines(check_of):
     loop = 'for d in params["objects_distance"]:\n    r -= d'
     body = f'r = params["speed"]\nif r > 100:\n    r = 7\n    r += 1\n{loop}\nreturn r'
-    told = [line for line in check_of(function(body)).warnings if "never reaches" in line]
-    assert "lines 4 to 5 in 406 situations: r = 7" in told[0]
-    assert "line 7" in told[1]
-    assert told[1].endswith("(there are no objects on the track here)")
+    found = [line for line in check_of(function(body)).warnings if "never reaches" in line]
+    assert "lines 4 to 5 in 406 situations: r = 7" in found[0]
+    assert "line 7" in found[1]
+    assert found[1].endswith("(there are no objects on the track here)")
 
 
 CONDITIONS = [
@@ -108,18 +108,18 @@ CONDITIONS = [
 
 def test_what_happens_in_a_training_is_no_unreachable_branch(check_of):
     branches = "".join(f"if {condition}:\n    r += {i}\n" for i, condition in enumerate(CONDITIONS))
-    told = check_of(function(f'r = params["speed"]\n{branches}return r')).warnings
-    assert not any("never reaches" in line for line in told)
+    found = check_of(function(f'r = params["speed"]\n{branches}return r')).warnings
+    assert not any("never reaches" in line for line in found)
 
 
 def test_a_constant_reward_is_reported_in_one_line(check_of):
-    (told,) = check_of(function("return 1.0")).warnings
-    assert "always returns 1, whatever the car does" in told
+    (found,) = check_of(function("return 1.0")).warnings
+    assert "always returns 1, whatever the car does" in found
 
 
 def test_a_reward_of_chance_is_reported(check_of):
-    told = check_of(function("return random.random()", "import random\n")).warnings
-    assert any("draws random numbers" in line for line in told)
+    found = check_of(function("return random.random()", "import random\n")).warnings
+    assert any("draws random numbers" in line for line in found)
 
 
 def test_a_function_that_divides_by_the_length_between_waypoints_is_warned_of_the_seam(check_of):
