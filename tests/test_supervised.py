@@ -10,7 +10,7 @@ import pytest
 
 HEAD = """
 import os, signal, sys, time
-from deepracer_exp.commands.supervised import supervised
+from deepracer_exp.cli import supervised
 from deepracer_exp.training.signals import Interruption
 def call():
     {body}
