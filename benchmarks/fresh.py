@@ -10,7 +10,7 @@ from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
 TRIALS = 64

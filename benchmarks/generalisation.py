@@ -26,7 +26,7 @@ import torch
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
 from .command import train

@@ -42,9 +42,8 @@ import yaml
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
-from deepracer_exp.runs.checkpoints import checkpoint_name
+from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
 from deepracer_exp.runs.files import read_run
-from deepracer_exp.runs.read_checkpoint import read_training
 from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.training.stopping_replay import replay
 

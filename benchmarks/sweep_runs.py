@@ -26,8 +26,8 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.runs.result import BUDGET_REACHED
 from sweeps.labels import outcome_of

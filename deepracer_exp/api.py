@@ -18,9 +18,9 @@ from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate as evaluate_run
 from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.own_recording import read_own_recording
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.run import train as train_run
 from deepracer_exp.training.trainer import Callback, Trainer, TrainResult

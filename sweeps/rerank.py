@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
 from .best import complete_trials

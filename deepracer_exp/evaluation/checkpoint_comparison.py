@@ -18,7 +18,7 @@ from deepracer_exp.analysis.page import write_chart
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
-from deepracer_exp.runs.read_checkpoint import check, read_policy
+from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.runs.result import CRITERIA
 

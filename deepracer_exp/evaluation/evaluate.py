@@ -16,8 +16,8 @@ from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import RunFailed, count
 from deepracer_exp.files import atomic_write
+from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
-from deepracer_exp.runs.read_checkpoint import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels

@@ -11,9 +11,9 @@ from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.validation.console import console_findings
 

@@ -1,19 +1,231 @@
-"""Checkpoints of a run: the best, the last and the newest few."""
+"""Checkpoints of a run, kept and read safely: tensors and JSON only, never a pickle, never an incomplete one."""
 
 import contextlib
+import logging
+import re
 import shutil
+import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
+from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
 from deepracer_exp.agents.ppo import Algorithm
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.errors import BadInput, RunFailed
 
-from .checkpoint_files import pinned, write_hashes
+from .checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, pinned, verify, write_hashes
 from .files import CHECKPOINTS
-from .read_checkpoint import AGENT, TRAINING, State
+
+logger = logging.getLogger("deepracer_exp")
+
+AGENT, TRAINING = "agent", "training"
+"""Components: the networks with what improves them, and what a resumed training needs besides."""
+_MANIFEST = "manifest.json"
+_STATE = {"state.json", "state.tdz"}
+_MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPolicy:
+    """The networks of a checkpoint."""
+
+    networks: ActorCritic
+    path: Path
+    """Its own folder, not a link to it."""
+    counters: dict[str, Any]
+    """Iteration, env steps and the like at which it was saved."""
+
+
+def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
+    """Read the networks of a checkpoint, or of the newest intact one if `best` or `last` is corrupt.
+
+    Args:
+        experiment: of the run.
+        folder: `checkpoints/` of its run.
+        name: `best`, `last` or the number of an iteration.
+
+    Raises:
+        BadInput: as for `intact_checkpoint` and `read_policy`.
+    """
+    return read_policy(experiment, intact_checkpoint(folder, name))
+
+
+def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Path:
+    """Return the folder of a checkpoint whose files all match their hashes.
+
+    If `best` or `last` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning.
+
+    Args:
+        folder: `checkpoints/` of a run.
+        name: `best`, `last` or the number of an iteration.
+        resumable: require one that a training can resume from.
+
+    Raises:
+        BadInput: there is no such checkpoint, it lies elsewhere, or it is corrupt and so are all others. Files that
+            could contain a pickle are rejected unread.
+    """
+    path, reasons = find_checkpoint(folder, name), list[str]()
+    others = [] if name.isdecimal() else kept_checkpoints(folder)
+    for candidate in (path, *others):
+        if candidate is not path and path.exists() and candidate.samefile(path):
+            continue
+        try:
+            found = check(candidate, resumable=resumable)
+        except BadInput as error:
+            if name.isdecimal():
+                raise
+            reasons.append(str(error))
+            continue
+        if reasons:
+            why = "; ".join(reasons)
+            logger.warning("checkpoint=%s: %s; using %s, the newest intact one", name, why, found.name)
+        return found
+    raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
+
+
+def check(path: Path, *, resumable: bool = False) -> Path:
+    """Return the resolved folder of an intact checkpoint; with `resumable`, one that a training can resume from.
+
+    Raises:
+        BadInput: any other.
+    """
+    if not path.is_dir():
+        kind = "a broken link" if path.is_symlink() else "no folder"
+        raise BadInput(f"{path}: is {kind}; a pickle is never loaded")
+    path = path.resolve()
+    entries = list(path.rglob("*"))
+    links = [entry for entry in entries if entry.is_symlink()]
+    if links:
+        raise BadInput(f"{links[0]}: is a link; the files of a checkpoint must be in its own folder")
+    files = {file.name for file in entries if not file.is_dir()}
+    foreign = sorted(files - _STATE - {_MANIFEST, HASHES})
+    if foreign:
+        raise BadInput(
+            f"{path}: contains {foreign[0]}; accepted: the tensors and JSON files of a checkpoint; a pickle is "
+            "never loaded"
+        )
+    for name in (_MANIFEST, HASHES):
+        if name not in files:
+            raise BadInput(f"{path}: has no {name}: incomplete, or written by an older version")
+    verify(path)
+    try:
+        components = Checkpoint.manifest(path)["components"]
+    except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
+        raise BadInput(f"{path}: not a checkpoint of deepracer-exp: {_one_line(error)}") from error
+    if AGENT not in components or not components.keys() <= {AGENT, TRAINING}:
+        held = ", ".join(components) or "nothing"
+        raise BadInput(f"{path}: not a checkpoint of deepracer-exp: holds {held}")
+    for name, record in components.items():
+        folder = path / record["path"]  # torchrl lets no absolute path and no `..` pass
+        there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
+        if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
+            parts = " and ".join(sorted(_STATE))
+            raise BadInput(f"{path}: not a checkpoint of deepracer-exp: {name} is not {parts}")
+        _check_archive(folder / "state.tdz")
+    if resumable and TRAINING not in components:
+        raise BadInput(f"{path}: contains only the policy, so a training cannot resume from it")
+    return path
+
+
+def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
+    """Read the networks of a checkpoint that `check` has accepted.
+
+    Raises:
+        BadInput: it does not fit the experiment, or a weight is not finite.
+    """
+    networks = build_actor_critic(
+        experiment.network,
+        observation_shape(experiment.observation),
+        build_action_space(experiment.action_space).n,
+        torch.Generator(),
+    )
+    counters = _load(path, AGENT, _NetworksOf(networks), "does not fit the run's config.yaml")
+    for key, value in networks.state_dict().items():
+        if not torch.isfinite(value).all():
+            raise BadInput(f"{path}: {key} is not finite; choose another checkpoint")
+    return StoredPolicy(networks, path, counters)
+
+
+def read_agent(path: Path, agent: Algorithm) -> None:
+    """Give an agent the networks, optimizer and schedule of a checkpoint that `check` has accepted.
+
+    Raises:
+        BadInput: it does not fit.
+    """
+    _load(path, AGENT, agent, "cannot be used")
+
+
+def read_training(path: Path) -> dict[str, Any]:
+    """Return what `CheckpointStore.save` was given as `training`.
+
+    Args:
+        path: a checkpoint that `check` has accepted.
+
+    Raises:
+        BadInput: there is none, or it cannot be read.
+    """
+    state = State({})
+    _load(path, TRAINING, state, "a training cannot resume from it")
+    return dict(state.values)
+
+
+class State:
+    """Plain values as a component of a checkpoint."""
+
+    def __init__(self, values: Mapping[str, Any]):
+        self.values = values
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the values."""
+        return dict(self.values)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Replace the values."""
+        self.values = state
+
+
+class _NetworksOf:
+    """Loads the networks of an agent's state and skips the optimizer."""
+
+    def __init__(self, networks: ActorCritic):
+        self._networks = networks
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"networks": self._networks.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._networks.load_state_dict(state["networks"])
+
+
+def _load(path: Path, component: str, target: Any, problem: str) -> dict[str, Any]:
+    """Load a component into `target` and return the checkpoint's counters."""
+    archive = Checkpoint().register(component, target, adapter=StateDictCheckpointAdapter("archive"))
+    try:
+        return dict(archive.load(path).manifest["metadata"])
+    except (CheckpointError, OSError) as error:
+        raise BadInput(f"{path}: {problem}: {_one_line(error)}") from error
+
+
+def _check_archive(file: Path) -> None:
+    """Refuse an archive with anything but tensors."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise BadInput(f"{file}: corrupt: {error}") from error
+    if foreign:
+        raise BadInput(f"{file}: contains {foreign[0]}, which is not a tensor; a pickle is never loaded")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
 
 
 class CheckpointStore:

@@ -15,9 +15,9 @@ from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_a
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, read_config, read_object, read_run_id
 from deepracer_exp.runs.lineage import Lineage, read_lineage
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun, resolve
 
 SLOWER = 0.1

@@ -22,6 +22,7 @@ from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.runs.checkpoints import intact_checkpoint, read_training
 from deepracer_exp.runs.convergence import UNDECIDED
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
@@ -37,7 +38,6 @@ from deepracer_exp.runs.files import (
 from deepracer_exp.runs.fingerprint import refuse_changes
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
-from deepracer_exp.runs.read_checkpoint import intact_checkpoint, read_training
 from deepracer_exp.runs.result import INTERRUPTED
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking import tracking_file

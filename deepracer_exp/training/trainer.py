@@ -22,12 +22,11 @@ from deepracer_exp.deepracer.trace import to_table
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed, reading
-from deepracer_exp.runs.checkpoints import CheckpointStore
+from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
 from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.read_checkpoint import read_agent
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED
 from deepracer_exp.runs.trace import TraceWriter
 

@@ -15,7 +15,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluate import results_table
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import Evaluation, Group
-from deepracer_exp.runs.read_checkpoint import read_checkpoint
+from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
 

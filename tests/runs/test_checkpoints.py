@@ -20,8 +20,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin, verify
-from deepracer_exp.runs.checkpoints import CheckpointStore
-from deepracer_exp.runs.read_checkpoint import read_training
+from deepracer_exp.runs.checkpoints import CheckpointStore, read_training
 
 TRAINING = {"iteration": 0}
 

@@ -20,8 +20,7 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import pin, write_hashes
-from deepracer_exp.runs.checkpoints import CheckpointStore
-from deepracer_exp.runs.read_checkpoint import intact_checkpoint, read_checkpoint
+from deepracer_exp.runs.checkpoints import CheckpointStore, intact_checkpoint, read_checkpoint
 
 STATE = {"cars": torch.arange(6.0), "streams": {"seed": 3}}
 

@@ -10,9 +10,9 @@ from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.runs.checkpoint_files import verify
+from deepracer_exp.runs.checkpoints import read_checkpoint, read_training
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.read_checkpoint import read_checkpoint, read_training
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.metrics import TIMES
 from deepracer_exp.training.trainer import Trainer
