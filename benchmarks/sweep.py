@@ -52,9 +52,9 @@ from sweeps.best import best_trial
 from sweeps.labels import outcome_of
 from sweeps.objectives import cost
 from sweeps.pruners import build_pruner
-from sweeps.rerank import fresh
 from sweeps.storage import open_storage
 from sweeps.study import load_study
+from sweeps.sweep import fresh
 
 from .command import at_once
 from .fresh import TRIALS, Driven, drive
