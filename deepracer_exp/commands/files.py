@@ -1,15 +1,26 @@
-"""`deepracer-exp import` and `export`: files of other programs."""
+"""`deepracer-exp validate`, `import`, `export` and `tracks`: rewards, models and routes as files."""
 
 import argparse
+import os
+import re
+import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from .arguments import add_command, add_run, run_and_overrides
-from .output import print_notes, warnings_on_stderr
-from .startup import check_policy
+from deepracer_exp.errors import BadInput
+
+from .arguments import add_command, add_overrides, add_run, run_and_overrides
+from .output import print_notes, table_console, warnings_on_stderr
+from .startup import check_files, check_policy, start_workers_early
+
+if TYPE_CHECKING:
+    from deepracer_exp.deepracer.worlds import World
+    from deepracer_exp.tracks.track import Track
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the commands."""
+    _add_validate(commands)
     parser = add_command(
         commands,
         "import",
@@ -43,6 +54,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
+    _add_tracks(commands)
 
 
 def _import(args: argparse.Namespace) -> int:
@@ -94,3 +106,207 @@ def _export(args: argparse.Namespace) -> int:
     with warnings_on_stderr():
         export(config, args.output, Console(highlight=False, markup=False))
     return 0
+
+
+_VALIDATE_EPILOG = """\
+  deepracer-exp validate reward=racing_line                 from the reward zoo, on the default track
+  deepracer-exp validate reward.file=my_reward.py track=Oval_track
+  deepracer-exp validate reward.file=my_reward.py trial=60s also train for that long: do reward and progress rise?
+
+exit code: 0 it can be trained, even if there are warnings; 2 it cannot, or with --strict the console would refuse it
+"""
+
+
+def _add_validate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "validate",
+        _validate,
+        help="find out what a reward function pays for",
+        description=(
+            "Check a reward function as the AWS console does, call it in many situations on the track, draw what it "
+            "pays for, and warn of common mistakes."
+        ),
+        epilog=_VALIDATE_EPILOG,
+        runs_rewards=True,
+    )
+    add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
+    parser.add_argument("-o", "--output", help="picture to write (default: runs/validate/REWARD-TRACK.png)")
+    parser.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
+
+
+def _validate(args: argparse.Namespace) -> int:
+    # Before NumPy is imported: a reward function has one thread in a training, too, and on a busy machine the threads
+    # of a small linear-algebra problem wait for one another.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+    from deepracer_exp.config.compose import compose_experiment
+
+    trials = [override.removeprefix("trial=") for override in args.overrides if override.startswith("trial=")]
+    overrides = [override for override in args.overrides if not override.startswith("trial=")]
+    seconds = _trial_seconds(trials[-1]) if trials else None
+    experiment, composition = compose_experiment(overrides)
+    args.debug = experiment.debug
+    print_notes(composition.notes)
+    trial = None if seconds is None else compose_experiment([*overrides, *_trial_overrides(seconds)])
+    check_files(experiment)
+    if trial is not None:
+        start_workers_early(experiment.collector.forks)
+
+    from rich.console import Console
+
+    from deepracer_exp.validation.validate import validate_reward
+
+    return validate_reward(experiment, trial, args.output, args.strict, Console(), Console(stderr=True))
+
+
+def _trial_seconds(text: str) -> float:
+    """Return the seconds of `60s`, `2min` or `90`.
+
+    Raises:
+        BadInput: it is none of them.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min)?", text)
+    seconds = float(match[1]) * (60 if match[2] == "min" else 1) if match else 0.0
+    if not seconds:
+        raise BadInput(
+            f"trial={text}: not a time; accepted: seconds or minutes above 0, e.g. trial=60s, trial=2min"
+        )
+    return seconds
+
+
+def _trial_overrides(seconds: float) -> list[str]:
+    """Return the overrides for a short training; its run goes to `runs/validate/`."""
+    return [
+        *("name=validate", "tracking=off", "stopping=none", "checkpoints.every=null"),
+        *("budget=default", "budget.env_steps=null", "budget.alerts=[]", f"budget.minutes={seconds / 60!r}"),
+    ]
+
+
+COLUMNS, ROWS = 100, 32
+"""Largest size of a drawing, in characters and lines."""
+
+
+def _add_tracks(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "tracks",
+        _tracks,
+        help="list the tracks, or draw one",
+        description="List the tracks with length, width and variants; with a name, draw that track.",
+    )
+    name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
+    name.completer = _names  # type: ignore[attr-defined]
+    parser.add_argument("-o", "--output", metavar="FILE", help="also write a picture of it")
+
+
+def _names(**_: object) -> list[str]:
+    from deepracer_exp.config.options import options
+
+    return options("track")
+
+
+def _tracks(args: argparse.Namespace) -> int:
+    if args.name is None:
+        _list_tracks()
+    else:
+        _show_track(args.name, args.output)
+    return 0
+
+
+def _list_tracks() -> None:
+    """Print a line for each family of worlds, then the user's own tracks."""
+    from rich.table import Table
+
+    from deepracer_exp.config.options import options
+    from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.deepracer.worlds import leaders, worlds
+
+    out = table_console(160)
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    table.add_column("track", no_wrap=True)
+    table.add_column("course", overflow="fold")
+    for name in ("length (m)", "width (m)", "waypoints"):
+        table.add_column(name, justify="right")
+    table.add_column("variants", overflow="fold")
+    for name in leaders():
+        world = worlds()[name]
+        others = [one for one in worlds().values() if one.family == world.family and one.name != name]
+        length_m, width_m = _measures(name)
+        table.add_row(
+            name,
+            world.title,
+            f"{length_m:.2f}",
+            f"{width_m:.2f}",
+            str(world.rows),
+            " ".join(map(_variant, others)),
+        )
+    for name in options("track"):
+        if name not in worlds():
+            track = _track(override_line("track", name))
+            measures = f"{track.length_m:.2f}", f"{track.width_m:.2f}", str(len(track.waypoints))
+            table.add_row(name, track.title, *measures, "")
+    out.print(table)
+    out.print(
+        f"\ntrack=NAME accepts each of {len(options('track'))} tracks, also variants and official names "
+        "(track='Ace Speedway').\n`deepracer-exp tracks NAME` draws one.",
+        soft_wrap=True,
+    )
+
+
+def _show_track(name: str, output: str | None) -> None:
+    """Draw a track in the terminal, and as a picture where one is asked for.
+
+    Args:
+        name: of a track, or a route file (.npy, .yaml).
+        output: the picture to write; its ending chooses the format.
+
+    Raises:
+        BadInput: there is no such track, or the picture cannot be written.
+    """
+    from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
+
+    is_file = Path(name).suffix in (".npy", ".yaml", ".yml")
+    track = _track(override_line("track.file" if is_file else "track", name))
+    if output is not None:
+        try:
+            draw_picture(track, output)
+        except (OSError, ValueError) as error:
+            raise BadInput(f"--output {output}: cannot be written: {error}") from error
+    wide, high = shutil.get_terminal_size((COLUMNS, ROWS))
+    print(
+        f"{track.title} ({track.name}): {track.length_m:.2f} m, {track.width_m:.2f} m wide, "
+        f"{len(track.waypoints)} waypoints\n"
+    )
+    print(draw_terminal(track, columns=min(wide, COLUMNS), rows=max(12, min(high - 6, ROWS))))
+    if output is not None:
+        print(f"\npicture: {output}")
+
+
+def _track(override: str) -> "Track":
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.tracks.track import Track
+
+    tracks = compose_experiment([override])[0].tracks
+    if len(tracks) > 1:
+        raise BadInput(f"{override}: {len(tracks)} tracks; accepted: one to draw")
+    (config,) = tracks.values()
+    return Track.from_config(config)
+
+
+def _measures(name: str) -> tuple[float, float]:
+    """Return a world's length and median width in metres."""
+    import numpy as np
+
+    from deepracer_exp.deepracer.routes import world_rows
+
+    center, inner, outer = np.split(world_rows(name), 3, axis=1)
+    length_m = np.linalg.norm(np.diff(center, axis=0), axis=1).sum()
+    return float(length_m), float(np.median(np.linalg.norm(outer - inner, axis=1)))
+
+
+def _variant(world: "World") -> str:
+    return world.name.replace(world.family, "…", 1)
