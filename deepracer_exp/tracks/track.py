@@ -18,9 +18,8 @@ from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.errors import BadInput
 
 from . import segments
-from .road import Bands, build_bands, join_bands, on_road, road_area
+from .road import Bands, build_bands, join_bands, on_road, road_area, rows_from_knots
 from .segments import Segments, build_segments
-from .spline import rows_from_knots
 
 PLAIN_FLOOR = FloorConfig(friction=1.0, road_color="#3d4148", ground_color="#54795a", line_color="#f2f2ee")
 """The default floor."""
