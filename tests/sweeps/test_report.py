@@ -31,6 +31,16 @@ def test_the_page_is_complete_and_loads_nothing(study, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
+def test_the_next_steps_name_the_classes_of_the_winner_again(tmp_path):
+    study = new_study(tmp_path)
+    add(study, [9.5], metrics=3)
+    config = tmp_path / study.study_name / "run-0" / "config.yaml"
+    config.write_text("network: {target: 'my_network:Net', kwargs: {}}\nstopping: {target: 'my_rule:Rule'}\n")
+    page = Html(study_page(study)).text
+    assert f"evaluate best:{study.study_name} network.target=my_network:Net --video" in page
+    assert f"clone best:{study.study_name} network.target=my_network:Net stopping.target=my_rule:Rule" in page
+
+
 @needs_chromium
 def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, tmp_path):
     path = write_study_page(study, tmp_path / "report.html")
