@@ -46,7 +46,6 @@ import torch
 from optuna.pruners import NopPruner
 from optuna.trial import TrialState
 
-from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import Pruner, compose_sweep
 from sweeps.best import best_trial
 from sweeps.labels import outcome_of
@@ -164,7 +163,6 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     refuse_others(request)
     config = request.entry.sweep
     (objective,) = config.objectives
-    protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
     noted = started(overrides, folder)
     study = load_study(request.study, open_storage(config.storage, folder / "runs"))
     # Without those whose worker was killed while it created them.
@@ -179,7 +177,9 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         [partial(whole_run, own_runs[number], folder / "whole" / f"{number:03d}") for number in cut_short],
     )
     whole_runs = own_runs | dict(zip(cut_short, resumed, strict=True))
-    courses = [course_of(trial.number, whole_runs[trial.number], objective, protocol) for trial in trials]
+    courses = [
+        course_of(trial.number, whole_runs[trial.number], objective, request.protocol) for trial in trials
+    ]
     for trial, course in zip(trials, courses, strict=True):
         hold_against(trial, course)
 
@@ -207,7 +207,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     # Start, re-ranking and page, and what the model of the workers leaves out.
     besides_s = max(noted["seconds"] - makespan_s(ended[OWN]), 0.0)
 
-    test = fresh(protocol, config.rerank_laps)
+    test = fresh(request.protocol, config.rerank_laps)
     driven: dict[Path, Driven] = {}
     found: dict[str, dict[str, Any]] = {}
     for name, each in ended.items():

@@ -8,7 +8,6 @@ import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.study import Study, StudyDirection
 
-from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
@@ -63,7 +62,7 @@ def load_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Stu
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
     request = compose_sweep(overrides)
-    known = _known(request, _names_only(overrides), runs_dir_of(request))
+    known = _known(request, _names_only(overrides))
     if known is None:
         return list(overrides), request, None
     whole = list(overrides)
@@ -78,12 +77,6 @@ def load_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Stu
             "name; for anything else give the whole search again"
         )
     return whole, request, known
-
-
-def runs_dir_of(request: SweepRequest) -> Path:
-    """Return where the runs of a sweep are."""
-    given = [line.partition("=")[2] for line in request.base if line.partition("=")[0] == "runs_dir"]
-    return Path(compose_experiment([f"runs_dir={given[-1]}"] if given else [])[0].runs_dir)
 
 
 def open_study(
@@ -153,11 +146,11 @@ def _differences(stored: dict[str, object], wanted: dict[str, object]) -> list[s
     return found
 
 
-def _known(request: SweepRequest, must_exist: bool, runs_dir: Path) -> Study | None:
+def _known(request: SweepRequest, must_exist: bool) -> Study | None:
     """Return the study that the request names, if it exists; no file is created by looking."""
     if request.entry.study is None:
         return None
-    if request.entry.sweep.storage is None and not (runs_dir / DEFAULT_FILE).exists():
+    if request.entry.sweep.storage is None and not (request.runs_dir / DEFAULT_FILE).exists():
         return None
     find = load_study if must_exist else find_study
-    return find(request.study, open_storage(request.entry.sweep.storage, runs_dir))
+    return find(request.study, open_storage(request.entry.sweep.storage, request.runs_dir))

@@ -15,7 +15,7 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
-from deepracer_exp.config.compose import Composition, compose_evaluation, compose_experiment
+from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
@@ -43,7 +43,7 @@ from .ray_launcher import RayLauncher
 from .samplers import build_sampler
 from .space import SearchSpace
 from .storage import Storage, open_storage, patiently, resolve_database
-from .study import load_request, open_study, runs_dir_of
+from .study import load_request, open_study
 from .view import SweepView
 from .worker import Interrupted
 from .worker_config import WorkerConfig
@@ -69,9 +69,8 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     overrides, request, known = load_request(overrides)
-    runs_dir = runs_dir_of(request)
+    runs_dir, protocol = request.runs_dir, request.protocol
     config = request.entry.sweep
-    protocol = compose_evaluation(["run=any", f"evaluation={config.protocol}"])[0].evaluation
     request = _without_rules(request, overrides)
     parent = _parent(request, runs_dir, known)
     compose = partial(_composed, request.study, parent, runs_dir)

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -9,8 +11,16 @@ from pydantic import Field
 from deepracer_exp.errors import BadInput
 
 from .bounds import Count, Natural, Seconds, UpTo100, UpTo1000
-from .compose import Composition, check_choice, check_option, compose_entry
+from .compose import (
+    Composition,
+    check_choice,
+    check_option,
+    compose_entry,
+    compose_evaluation,
+    compose_experiment,
+)
 from .dimension import Choices, as_override, dimension, override_value, plain_expression
+from .evaluation import EvaluationConfig
 from .experiment import SafeName
 from .options import groups
 from .overrides import PLAIN_TEXT, key_of, parse_sweep
@@ -135,6 +145,25 @@ class SweepRequest:
         """Return the study's name: the given one, or that of the ready-made sweep."""
         option = self.composition.choices[_ENTRY]
         return self.entry.study or (_ENTRY if option == "own" else option)
+
+    @cached_property
+    def protocol(self) -> EvaluationConfig:
+        """The protocol by which trials are judged.
+
+        Raises:
+            BadInput: as `compose_evaluation`.
+        """
+        return compose_evaluation(["run=any", f"evaluation={self.entry.sweep.protocol}"])[0].evaluation
+
+    @cached_property
+    def runs_dir(self) -> Path:
+        """Where the runs of the trials are.
+
+        Raises:
+            BadInput: it is not a path.
+        """
+        given = [line for line in self.base if key_of(line) == "runs_dir"]
+        return Path(compose_experiment(given[-1:])[0].runs_dir)
 
 
 def compose_sweep(overrides: Sequence[str]) -> SweepRequest:
