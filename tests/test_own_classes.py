@@ -13,7 +13,7 @@ import torch
 import yaml
 
 from deepracer_exp import load_policy
-from deepracer_exp.analysis.next_steps import next_steps
+from deepracer_exp.analysis.next_steps import command_line, next_steps
 from deepracer_exp.config import own_class
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
@@ -126,6 +126,12 @@ def test_the_lines_to_paste_name_the_classes_again(run, tmp_path):
             extra = short if command == "evaluate" else ("budget.env_steps=1024",) * (command == "clone")
             ended = call_in(home, command, *words, *extra)
             assert ended.code == 0, (line, ended.stderr)
+
+
+def test_a_line_to_paste_runs_nothing_that_the_run_has_written_into_it():
+    config = {"network": {"target": "a:B; reboot"}, "observation": {"parts": ["$(reboot)", {"target": 1}]}}
+    line = command_line("evaluate", "my run", {**config, "stopping": [{"target": "c:D"}], "algorithm": None})
+    assert shlex.split(line) == ["deepracer-exp", "evaluate", "my run", "network.target=a:B; reboot"]
 
 
 def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path):

@@ -74,7 +74,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def command_line(command: str, word: str, config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> str:
-    """Return a command for the run that `word` names, with the user's own classes that it needs.
+    """Return a command for the run that `word` names, with the user's own classes that it needs, quoted for a shell.
 
     Args:
         command: its name.
@@ -82,7 +82,7 @@ def command_line(command: str, word: str, config: Mapping[str, Any], groups: Seq
         config: of the run.
         groups: whose classes the command needs.
     """
-    return " ".join([COMMAND, command, shlex.quote(word), *named_again(config, groups)])
+    return shlex.join([COMMAND, command, word, *named_again(config, groups)])
 
 
 def run_word(run: Path) -> str:

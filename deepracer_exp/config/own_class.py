@@ -87,8 +87,9 @@ def own_classes(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> It
     """Return the classes of the user's own among the values of an experiment, each with its group."""
     for group in groups:
         values = config.get(group)
-        for own in [values, *(values.get("parts") or ())] if isinstance(values, dict) else []:
-            if own.get("target") is not None:
+        parts = values.get("parts") if isinstance(values, dict) else None
+        for own in (values, *(parts if isinstance(parts, list | tuple) else ())):
+            if isinstance(own, dict) and isinstance(own.get("target"), str):
                 yield group, own["target"]
 
 
