@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from deepracer_exp.analysis.next_steps import command_line, run_word
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lifeline import running
-from deepracer_exp.runs.files import METRICS, SUMMARY, read_object
+from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_object
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, INTERRUPTED
 
 _log = logging.getLogger(__name__)
@@ -166,9 +167,10 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
     if not reason.startswith(BUDGET_REACHED):
         if "stopping" in map(group_of, overrides):
             return
+        clone = command_line("clone", run_word(run_dir), read_config(run_dir))
         raise RunEnded(
-            f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it anyway, `deepracer-exp clone "
-            f"{run_dir.name}` starts a new run from its best checkpoint"
+            f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it anyway, `{clone}` starts a new run "
+            "from its best checkpoint"
         )
     used = Budget(config).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
     if used[1] >= 1:
