@@ -180,7 +180,7 @@ def test_a_repeated_iteration_that_differs_is_not_doubled(store, client, identit
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (None, "cannot be read"),
+        (None, "is missing"),
         ("{", "Invalid JSON"),
         ("[]", "accepted: what a tracker writes there"),
         ("{}", "run_id: Field required"),
