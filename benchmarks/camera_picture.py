@@ -1,0 +1,65 @@
+"""The picture of docs/camera.md: tracks as the camera sees them, and episodes that differ by randomization.
+
+python -m benchmarks.camera_picture
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.setup import build_setup
+
+OUTPUT = Path(__file__).parents[1] / "docs" / "images" / "camera.png"
+TRACKS = (
+    "reinvent_base",
+    "Oval_track",
+    "Spain_track",
+    "2022_summit_speedway",
+    "reinvent_wood",
+    "reinvent_carpet",
+    "Bowtie_track",
+    "Monaco",
+)
+STRAIGHT, STEPS = 7, 6
+"""Action of the default space, and steps until the picture is taken."""
+GAP = 4
+
+
+def main() -> None:
+    """Write the picture."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--output", type=Path, default=OUTPUT)
+    output = parser.parse_args().output
+    tracks = look(f"track=[{','.join(TRACKS)}]")
+    episodes = look("randomization=sim2real")
+    rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], episodes[:4], episodes[4:])]
+    width = rows[0].shape[1]
+    Image.fromarray(np.vstack(rows)[GAP:, GAP:]).quantize(128).save(output, optimize=True)
+    print(f"{output}: {width} pixels wide, {output.stat().st_size / 1e3:.0f} kB")
+
+
+def look(override: str) -> NDArray[np.uint8]:
+    """Return what eight cars see after a few steps, (8, height, width, 3)."""
+    setup = build_setup(
+        compose_experiment(["observation=camera", "observation.camera.color=rgb", override])[0]
+    )
+    race = Race(setup, len(TRACKS))
+    race.reset()
+    for _ in range(STEPS):
+        race.step(np.full(len(TRACKS), STRAIGHT))
+    return np.moveaxis(race.pixels, 1, -1)
+
+
+def beside(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return pictures in a row, with white gaps above and to the left."""
+    framed = np.pad(pictures, ((0, 0), (GAP, 0), (GAP, 0), (0, 0)), constant_values=255)
+    return np.hstack(list(framed))
+
+
+if __name__ == "__main__":
+    main()
