@@ -18,6 +18,7 @@ from benchmarks.report import mean_and_interval
 from benchmarks.same import different_points, different_rows, different_tensors, different_traces
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.training.metrics import NOT_EVALUATED
 
 SHORT = ("budget.iterations=1", "checkpoints.every=null")
 
@@ -118,7 +119,8 @@ def test_a_finished_run_of_the_same_overrides_is_used_again(tmp_path: Path, monk
 
 def test_a_really_stopped_run_must_be_the_beginning_of_the_full_one(tmp_path: Path) -> None:
     rows = [
-        {"iteration": number, "completion": number / 3, "wall_clock_s": number} for number in range(1, 10)
+        NOT_EVALUATED | {"iteration": number, "completion": number / 3, "wall_clock_s": number}
+        for number in range(1, 10)
     ]
 
     def run(name: str, of: list[dict[str, Any]], best: int) -> Path:
@@ -131,10 +133,14 @@ def test_a_really_stopped_run_must_be_the_beginning_of_the_full_one(tmp_path: Pa
     full = run("full", rows, 8)
     slower = [row | {"wall_clock_s": 99.0} for row in rows[:5]]
     assert stopping.prove(full, run("same", slower, 4), 5, "000004")["same_metrics"]
+    # A run that ends has its last policy evaluated, which may be the best.
+    raced = [*slower[:4], slower[4] | {"eval_completion": 100.0}]
+    assert stopping.prove(full, run("raced", raced, 5), 5, "000004")["same_metrics"]
     for name, of, best in (
         ("other_end", slower[:4], 4),
         ("other_best", slower, 3),
         ("other_row", [*slower[:4], slower[4] | {"completion": 1.7}], 4),
+        ("raced_before", [*slower[:3], slower[3] | {"eval_completion": 100.0}, slower[4]], 4),
     ):
         with pytest.raises(SystemExit, match="ended after"):
             stopping.prove(full, run(name, of, best), 5, "000004")

@@ -91,7 +91,7 @@ def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(here):
     overrides = ["track.direction=reversed", "track.floor.friction=0.5"]
     track = compose_experiment(["track=mine", *overrides])[0].track
     assert (track.name, track.title, track.width_m, track.closed) == ("mine", "mine", 0.76, True)
-    assert (track.direction, track.floor.friction, track.floor.road_color) == ("reversed", 0.5, "#4a4d52")
+    assert (track.direction, track.floor.friction, track.floor.road_color) == ("reversed", 0.5, "#263344")
     several = compose_experiment(["track=[mine,Oval_track]", "track.mine.weight=2"])[0].tracks
     assert [(track.name, track.weight) for track in several.values()] == [("mine", 2), ("Oval_track", 1)]
     assert "mine" in compose_experiment(["track=all"])[0].tracks

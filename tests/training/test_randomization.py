@@ -41,16 +41,27 @@ def test_the_pages_question_to_a_trace_is_answered(trained, monkeypatch):
         assert any(line.startswith(name) for line in lines)
 
 
+def table(number: int) -> tuple[list[str], list[list[str]]]:
+    """Return head and rows of a table of the page."""
+    tables = [text for text in re.split(r"\n(?!\|)", PAGE) if "\n|---" in text]
+    lines = [line for line in tables[number].splitlines() if line.startswith("|")]
+    header, _, *rows = [[cell.strip().strip("`") for cell in line.strip("|").split("|")] for line in lines]
+    return header, rows
+
+
 @pytest.mark.parametrize("option", ["none", "aws", "sim2real"])
 def test_the_pages_table_says_what_the_options_do(option):
-    header, _, *rows = [
-        [cell.strip().strip("`") for cell in line.strip("|").split("|")]
-        for line in PAGE.splitlines()
-        if line.startswith("|")
-    ]
+    header, rows = table(0)
     written = {row[0]: row[header.index(option)] for row in rows}
     assert list(written) == list(QUANTITIES)
     content = yaml.safe_load((ROOT / "conf" / "randomization" / f"{option}.yaml").read_text(encoding="utf-8"))
     for name in QUANTITIES:
         low, high = content.get(name, [OFF[name], OFF[name]])
         assert written[name] == (f"{low:g}" if low == high else f"{low:g} to {high:g}")
+
+
+def test_the_pages_table_says_what_pictures_differ_in():
+    header, rows = table(1)
+    content = yaml.safe_load((ROOT / "conf" / "randomization" / "sim2real.yaml").read_text(encoding="utf-8"))
+    expected = {name: f"{low:g} to {high:g}" for name, (low, high) in content["pictures"].items()}
+    assert {row[0]: row[header.index("sim2real")] for row in rows} == expected
