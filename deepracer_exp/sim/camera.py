@@ -66,7 +66,7 @@ def take_pictures(
         mounts: of each car's camera, (N, 5), see `Lens.mount`; None: the lens's own for all.
     """
     if mounts is None:
-        mounts = np.broadcast_to(lens.mount, (len(out), 5))
+        mounts = np.tile(lens.mount, (len(out), 1))
     _take(
         np.ascontiguousarray(poses, np.float64),
         track_index,
@@ -173,7 +173,7 @@ def _take(  # type: ignore[no-untyped-def]
 def _add_edge(changes, height, width, ax, ay, bx, by, change):  # type: ignore[no-untyped-def]
     """Add an edge from a to b, in pixels: `change` below it where it runs to the right, else its opposite.
 
-    `changes` is (channels, (height + 3) * width): what lies below the picture goes to rows that nobody sees.
+    `changes` is (channels, (height + 3) * width): what lies below the picture goes to rows that are not drawn.
     """
     sign = 1.0
     if ax > bx:

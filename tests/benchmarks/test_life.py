@@ -4,6 +4,7 @@ import json
 import math
 import random
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -252,13 +253,14 @@ def test_the_first_failure_of_many_calls_is_reported_and_ends_the_rest() -> None
         made.append(number)
         if number == 1:
             raise SystemExit("no")
+        time.sleep(0.05)
         return number * 2
 
     assert at_once(2, [partial(call, number) for number in (3, 2)]) == [6, 4]
     made.clear()
     with pytest.raises(SystemExit, match="no"):
-        at_once(1, [partial(call, number) for number in (1, *range(2, 2000))])
-    assert len(made) < 1999
+        at_once(1, [partial(call, number) for number in range(1, 400)])
+    assert len(made) < 399
 
 
 COUNTER = """\
