@@ -6,8 +6,9 @@ from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.distributions import Distribution
+from torch.distributions import Distribution, kl_divergence
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -19,6 +20,8 @@ from .actor_critic import ActorCritic
 from .schedules import Schedule, build_schedule
 
 _PICTURES_AT_ONCE = 1024
+_TEMPERATURE = 0.1
+"""Of a teacher's distribution of actions."""
 _VALUE_LOSSES = {"huber": "smooth_l1", "mean squared error": "l2"}
 _LOSS_NAMES = {"loss_objective": "policy loss", "loss_critic": "value loss", "loss_entropy": "entropy"}
 
@@ -115,6 +118,7 @@ class PPO(Algorithm):
         # Adam's epsilon as in DeepRacer's trainer; one fused kernel instead of a dozen over all tensors.
         self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
         self._max_grad_norm = config.max_grad_norm or math.inf
+        self._epochs, self._batch_size = config.epochs, config.batch_size
         self._advantages = GAE(
             gamma=config.discount,
             lmbda=config.gae_lambda,
@@ -155,11 +159,11 @@ class PPO(Algorithm):
             group["lr"] = lr
         steps, explained_variance = self._prepare(batch)
         count = steps.shape[0]
-        size = min(self.config.batch_size, count)
+        size = min(self._batch_size, count)
         minibatches = count // size
         results = [
             self._gradient_step(minibatch)
-            for _ in range(self.config.epochs)
+            for _ in range(self._epochs)
             for minibatch in steps[self._shuffled(count)[: minibatches * size]].split(size)
         ]
         # One transfer for all metrics; only the test for finite numbers waits for each gradient step.
@@ -264,6 +268,78 @@ class PPO(Algorithm):
         raise RunFailed("norm of the gradient is not finite; the gradient step was not made")
 
 
+class Distillation(PPO):
+    """PPO that first learns to act like a teacher.
+
+    For `teacher_iterations` the policy's loss is the KL divergence of its distribution of actions from the teacher's,
+    in the states that the policy's own driving leads to (DAgger, Ross et al. 2011). Before that the teacher's
+    distribution is sharpened, as in policy distillation (Rusu et al. 2015): policies here take actions at random
+    until the end, and what they would like best is clearer than what they do. Every step is learned from once, in
+    small minibatches: with labels there is less to gain from a second look than from another step. The value network
+    learns as in PPO, which follows.
+    """
+
+    def __init__(
+        self,
+        actor_critic: ActorCritic,
+        config: AlgorithmConfig,
+        schedule: Schedule,
+        seed: int,
+        teacher: TensorDictModuleBase,
+    ) -> None:
+        """Set up both; the teacher stays as it is."""
+        super().__init__(actor_critic, config, schedule, seed)
+        self._teacher = teacher
+        self._imitates = False
+
+    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
+        """See `Algorithm.update`; `policy_loss` is the divergence from the teacher, in nats, while it is imitated."""
+        config = self.config
+        self._imitates = iteration < config.teacher_iterations
+        self._epochs, self._batch_size = (
+            (1, config.teacher_batch_size) if self._imitates else (config.epochs, config.batch_size)
+        )
+        return super().update(batch, iteration, fraction)
+
+    def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses as PPO does."""
+        if not self._imitates:
+            return super().loss(minibatch)
+        policy = self.networks.policy_head.get_dist(minibatch)
+        teacher = self.networks.policy_head.build_dist_from_params(minibatch["teacher"])
+        value_loss, *_ = self._loss.loss_critic(minibatch)
+        with torch.no_grad():
+            log_ratio = policy.log_prob(minibatch["action"]) - minibatch["action_log_prob"]
+            nothing = torch.zeros(())
+        return TensorDict(
+            {
+                "loss_objective": kl_divergence(teacher, policy).mean(),
+                "loss_critic": value_loss.mean(),
+                "loss_entropy": nothing,
+                "entropy": policy.entropy().detach().mean(),
+                "clip_fraction": nothing,
+                "mean_ratio": log_ratio.exp().mean(),
+                "kl_approx": -log_ratio.mean(),
+            }
+        )
+
+    @torch.no_grad()
+    def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:
+        steps, explained_variance = super()._prepare(batch)
+        if self._imitates:
+            seen = batch.select(*self._teacher.in_keys).reshape(-1)
+            teacher = TensorDict.cat(
+                [self._teacher.get_dist_params(part) for part in seen.split(_PICTURES_AT_ONCE)]
+            )
+            # As if probabilities were raised to the power of 1 / _TEMPERATURE; a Gaussian's become narrower.
+            if "logits" in teacher:
+                sharpened = {"logits": teacher["logits"] / _TEMPERATURE}
+            else:
+                sharpened = {"loc": teacher["loc"], "scale": teacher["scale"] * math.sqrt(_TEMPERATURE)}
+            steps["teacher"] = TensorDict(sharpened, steps.batch_size)
+        return steps, explained_variance
+
+
 def _require_finite(batch: TensorDictBase) -> None:
     keys = ("observation", "action", "action_log_prob", ("next", "observation"), ("next", "reward"))
     for key in keys:
@@ -275,14 +351,27 @@ def _require_finite(batch: TensorDictBase) -> None:
 
 
 def build_agent(
-    actor_critic: ActorCritic, config: AlgorithmConfig, lr_schedule: LRScheduleConfig, seed: int
+    actor_critic: ActorCritic,
+    config: AlgorithmConfig,
+    lr_schedule: LRScheduleConfig,
+    seed: int,
+    teacher: TensorDictModuleBase | None = None,
 ) -> Algorithm:
     """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
+
+    Args:
+        actor_critic: Updated by it in place.
+        config: The group `algorithm`.
+        lr_schedule: The group `lr_schedule`.
+        seed: Of the algorithm's own random streams.
+        teacher: A policy with the same actions that is imitated for the first `config.teacher_iterations`.
 
     Raises:
         BadInput: a class of the user's own cannot be used.
     """
     schedule = build_schedule(lr_schedule)
+    if teacher is not None:
+        return Distillation(actor_critic, config, schedule, seed, teacher)
     if config.target is None:
         return PPO(actor_critic, config, schedule, seed)
     own = OwnClass(target=config.target, kwargs=config.kwargs)

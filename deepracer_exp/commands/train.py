@@ -20,7 +20,15 @@ from .arguments import (
     split_stores,
 )
 from .output import print_notes, print_result, print_results, print_start, warnings_on_stderr
-from .startup import check_changes, check_files, check_run, check_sweep, has_workers, start_workers_early
+from .startup import (
+    check_changes,
+    check_files,
+    check_policy,
+    check_run,
+    check_sweep,
+    has_workers,
+    start_workers_early,
+)
 
 _TRAIN_EPILOG = """\
 An experiment is one option of each group, and any value in it can be set:
@@ -107,6 +115,10 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     for experiment, _ in composed:
         check_files(experiment)
+        if experiment.teacher is not None:
+            check_policy(
+                experiment.teacher, experiment.runs_dir, getattr(experiment.tracking, "uri", None), None
+            )
     print_start()
     start_workers_early(any(experiment.collector.forks for experiment, _ in composed))
 

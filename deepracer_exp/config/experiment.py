@@ -61,9 +61,15 @@ class Experiment:
     stopping: StoppingConfig
     budget: BudgetConfig
     tracking: TrackingConfig
+    teacher: Annotated[str, Field(min_length=1)] | None = None
+    """A run whose policy this one's first learns to act like."""
 
     def __post_init__(self) -> None:
         """Refuse a network that cannot read what is observed."""
+        if self.teacher is None and self.algorithm.teacher_iterations:
+            raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")
+        if self.teacher is not None and not self.algorithm.teacher_iterations:
+            raise ValueError("teacher: only algorithm=distill learns from one; accepted: algorithm=distill")
         camera = self.observation.camera
         if camera is None and isinstance(self.network, CNNConfig):
             raise ValueError(

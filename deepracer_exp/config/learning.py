@@ -98,6 +98,10 @@ class AlgorithmConfig:
     """Control steps, over all cars, between two updates; null when episodes_per_iteration is used."""
     episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
     """Finished episodes between two updates (`num_episodes_between_training`); null when frames are used."""
+    teacher_iterations: Annotated[int, Field(ge=0, le=10**6)] = 0
+    """Iterations at the start in which the policy learns to act like the teacher (0: there is none)."""
+    teacher_batch_size: Annotated[int, Field(ge=1, le=10**6)] = 128
+    """Steps per gradient step in these."""
     target: Reference | None = None
     """A class of your own in place of PPO, `package.module:Class`."""
     kwargs: dict[str, Any] = field(default_factory=dict)
@@ -107,6 +111,8 @@ class AlgorithmConfig:
         """Refuse arguments for a class that is not named."""
         if self.kwargs and self.target is None:
             raise ValueError("kwargs are arguments of a class of your own; give target=package.module:Class")
+        if self.teacher_iterations and self.target is not None:
+            raise ValueError("teacher_iterations: only PPO learns from a teacher; give target or a teacher")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -111,6 +111,15 @@ def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
     return _discrete(np.repeat(angles, len(speeds)), np.tile(speeds, len(angles)))
 
 
+def describe_actions(actions: ActionSpace) -> str:
+    """Return the actions in words: equal for equal spaces."""
+    if isinstance(actions, DiscreteActions):
+        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
+        return f"{actions.n} actions " + " ".join(f"{steering:g}°/{speed:g}" for steering, speed in pairs)
+    low, high = actions.low.tolist(), actions.high.tolist()
+    return f"continuous {low[0]:g} to {high[0]:g}°, {low[1]:g} to {high[1]:g} m/s"
+
+
 def _discrete(steering_deg: ArrayLike, speed_mps: ArrayLike) -> DiscreteActions:
     return DiscreteActions(np.array(steering_deg, dtype=np.float64), np.array(speed_mps, dtype=np.float64))
 

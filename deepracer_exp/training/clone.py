@@ -11,7 +11,7 @@ from deepracer_exp.config.evaluation import checked_checkpoint_name
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import config_differences, describe_differences, with_overrides
-from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
+from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.env.observation import feature_names
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
@@ -91,6 +91,10 @@ def _changed(parent: StoredRun, changes: Sequence[str]) -> Composition:
         composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER
     if "runs_dir" not in keys:
         composition.mapping["runs_dir"] = str(parent.path.parent.parent)
+    if parent.experiment.teacher is not None and "teacher" not in keys:
+        # What it had to teach, the parent has learned.
+        composition.mapping["teacher"] = None
+        composition.mapping["algorithm"]["teacher_iterations"] = 0
     return composition
 
 
@@ -120,17 +124,9 @@ def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
         raise BadInput(
             f"observation: cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}"
         )
-    before, after = (_words(build_action_space(one.action_space)) for one in (parent, clone))
+    before, after = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
     if before != after:
         raise BadInput(f"action_space: cannot be changed in a clone: {before} -> {after}; {why}")
-
-
-def _words(actions: ActionSpace) -> str:
-    if isinstance(actions, DiscreteActions):
-        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
-        return f"{actions.n} actions " + " ".join(f"{steering:g}°/{speed:g}" for steering, speed in pairs)
-    low, high = actions.low.tolist(), actions.high.tolist()
-    return f"continuous {low[0]:g} to {high[0]:g}°, {low[1]:g} to {high[1]:g} m/s"
 
 
 def _notes(parent: StoredRun, clone: Experiment, checkpoint: str) -> list[str]:

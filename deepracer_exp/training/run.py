@@ -48,6 +48,7 @@ from .budget import refuse_ended, refuse_spent
 from .callbacks import standard_callbacks
 from .metrics import track_names
 from .signals import Interruption
+from .teacher import find_teacher, keep_teacher
 from .trainer import Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
@@ -161,6 +162,7 @@ def _begin(
     """Create the folder of a new run and record it."""
     setup = read_files(experiment)
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
+    teacher = find_teacher(experiment)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
@@ -169,6 +171,8 @@ def _begin(
         label += f"-clone{start[1].generation}"
     folder = RunFolder.create(experiment.runs_dir, experiment.name, label)
     try:
+        if teacher is not None:
+            keep_teacher(teacher, folder.path)
         trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
             trainer.networks.load_state_dict(start[0].state_dict())
@@ -188,6 +192,8 @@ def _begin(
         raise
     for note in composition.notes:
         logger.info(note)
+    if teacher is not None:
+        logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
     _track(tracker, trainer, composition, names, commit, run_name, tags)
     return trainer
 

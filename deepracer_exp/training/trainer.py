@@ -33,6 +33,7 @@ from deepracer_exp.runs.trace import TraceWriter
 from .budget import Budget
 from .metrics import NOT_EVALUATED, EvalResult, Finished, RunMetrics, track_names
 from .signals import Interruption
+from .teacher import read_teacher
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -181,7 +182,13 @@ class Trainer:
             self.networks = build_actor_critic(
                 experiment.network, observation_shape(experiment.observation), setup.actions.n, generator
             )
-        self.agent = build_agent(self.networks, experiment.algorithm, experiment.lr_schedule, experiment.seed)
+        self.agent = build_agent(
+            self.networks,
+            experiment.algorithm,
+            experiment.lr_schedule,
+            experiment.seed,
+            None if experiment.teacher is None else read_teacher(folder.path),
+        )
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}
         self.evaluation: EvalResult | None = None

@@ -1,0 +1,71 @@
+"""The policy that a new one first learns to act like (`algorithm=distill teacher=RUN`)."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from tensordict.nn import TensorDictModuleBase
+
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import build_action_space, describe_actions
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.checkpoints import check, read_checkpoint, read_policy
+from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, TEACHER
+from deepracer_exp.runs.resolve import StoredRun, resolve
+
+
+def find_teacher(experiment: Experiment) -> StoredRun | None:
+    """Return the run that an experiment's policy learns from, with the name of its checkpoint; None: there is none.
+
+    Raises:
+        BadInput: there is no such run or checkpoint, its policy has other actions, or it sees what the cars of this
+            experiment do not.
+    """
+    if experiment.teacher is None:
+        return None
+    run = resolve(experiment.teacher, Path(experiment.runs_dir), getattr(experiment.tracking, "uri", None))
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(None))
+    what = f"teacher={experiment.teacher}"
+    theirs, ours = (
+        describe_actions(build_action_space(one.action_space)) for one in (run.experiment, experiment)
+    )
+    if theirs != ours:
+        raise BadInput(f"{what}: has other actions: {theirs}; accepted: a run with {ours}")
+    before, now = run.experiment.observation, experiment.observation
+    sees = stored.networks.policy.in_keys
+    if "pixels" in sees and before.camera != now.camera:
+        raise BadInput(
+            f"{what}: sees other pictures; accepted: a run with the same camera, or observation=features"
+        )
+    if "observation" in sees and replace(before, camera=None) != replace(now, camera=None):
+        raise BadInput(
+            f"{what}: sees other features; accepted: a run whose features are those of this observation"
+        )
+    return StoredRun(run.path, stored.path.name)
+
+
+def keep_teacher(run: StoredRun, folder: Path) -> None:
+    """Copy configuration and checkpoint of a teacher into the folder of a new run, which then needs no other.
+
+    Raises:
+        OSError: they cannot be copied.
+    """
+    assert run.checkpoint is not None
+    shutil.copytree(run.checkpoints / run.checkpoint, folder / TEACHER / CHECKPOINTS / run.checkpoint)
+    shutil.copy(run.path / CONFIG, folder / TEACHER / CONFIG)
+
+
+def read_teacher(folder: Path) -> TensorDictModuleBase:
+    """Return the teacher's policy that is kept in a run's folder.
+
+    Raises:
+        BadInput: it is missing or corrupt.
+    """
+    kept = StoredRun(folder / TEACHER)
+    try:
+        (checkpoint,) = kept.checkpoints.iterdir()
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            f"{kept.checkpoints}: is not one checkpoint, which a run with a teacher has there"
+        ) from error
+    return read_policy(kept.experiment, check(checkpoint)).networks.policy
