@@ -3,6 +3,7 @@
 import ast
 import json
 import logging
+import math
 import os
 import shutil
 import time
@@ -11,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 
+import psutil
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import ActorCritic
@@ -52,6 +54,10 @@ from .teacher import find_teacher, keep_teacher
 from .trainer import Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
+
+_COPIES_OF_PICTURES = 8
+"""Of each step's picture at the peak of an iteration: before and after the step, in workers, batch and shuffled steps.
+Measured: 7.1 with collector=in_process, 7.8 with sync."""
 
 
 def train(
@@ -150,6 +156,31 @@ def read_files(experiment: Experiment) -> RaceSetup:
     return setup
 
 
+def memory_of_pictures(experiment: Experiment) -> str | None:
+    """Return a line that says how much memory the pictures of an iteration take; None: there are none.
+
+    Raises:
+        BadInput: more than is free.
+    """
+    camera, algorithm = experiment.observation.camera, experiment.algorithm
+    if camera is None:
+        return None
+    bytes_per_step, free = _COPIES_OF_PICTURES * math.prod(camera.shape), psutil.virtual_memory().available
+    steps = algorithm.frames_per_iteration or 1000  # how long episodes will be is not known
+    needed = steps * bytes_per_step
+    if algorithm.frames_per_iteration is not None and needed > free:
+        raise BadInput(
+            f"algorithm.frames_per_iteration={steps}: the pictures of so many steps take {needed / 1e9:.1f} GB of "
+            f"memory, and {free / 1e9:.1f} GB are free; accepted: up to {free // bytes_per_step}, or smaller or fewer "
+            "pictures (observation.camera)"
+        )
+    each = "the" if algorithm.frames_per_iteration is not None else "each"
+    return (
+        f"pictures: {needed / 1e9:.1f} GB of memory for {each} {steps:,} steps of an iteration, "
+        f"{free / 1e9:.1f} GB are free"
+    )
+
+
 def _begin(
     experiment: Experiment,
     composition: Composition,
@@ -161,6 +192,7 @@ def _begin(
 ) -> Trainer:
     """Create the folder of a new run and record it."""
     setup = read_files(experiment)
+    memory = memory_of_pictures(experiment)
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
     teacher = find_teacher(experiment)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
@@ -192,6 +224,9 @@ def _begin(
         raise
     for note in composition.notes:
         logger.info(note)
+    if memory is not None:
+        logger.info(memory)
+        _printing(console)(memory)
     if teacher is not None:
         logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
     _track(tracker, trainer, composition, names, commit, run_name, tags)

@@ -64,6 +64,19 @@ def policy_input(pixels: np.ndarray):
     return TensorDict({"pixels": torch.from_numpy(pixels)}, [len(pixels)])
 
 
+def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(call):
+    (line,) = (
+        line
+        for line in call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512").stderr.splitlines()
+        if line.startswith("pictures: ")
+    )
+    assert "0.0 GB of memory for the 512 steps" in line
+    big = "algorithm.frames_per_iteration=10000000"
+    refused = call("train", *IN_PROCESS, "observation=camera", "name=big", big)
+    assert refused.code == 2
+    assert int(refused.complaint.split("up to ")[1].split(",")[0]) < 10_000_000
+
+
 def test_a_clone_keeps_what_the_networks_were_made_for(call):
     parent = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512").folder
     cloned = call("clone", str(parent), "budget.env_steps=512", "tracking=off")
