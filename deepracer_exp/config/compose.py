@@ -38,7 +38,7 @@ from .options import conf_dirs, find, groups, listed, options
 from .overrides import PLAIN_TEXT, line_for_hydra, override_line, parse_single, parse_sweep
 from .own_class import allow, allow_given, own_option
 from .parse import import_own_classes, parse_config, parse_experiment
-from .track_options import ALL, by_world_name, complete, register_worlds, several_tracks, without_placeholders
+from .track_options import ALL, by_world_name, complete, several_tracks, without_placeholders, world_values
 from .track_options import GROUP as TRACK
 
 Config = TypeVar("Config")
@@ -180,7 +180,11 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
 
 
 class OptionFiles(FileConfigSource):
-    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file."""
+    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
+
+    It has the worlds, too. Hydra copies what is in its `ConfigStore` each time it composes, which took it longer than
+    all else with 120 worlds there.
+    """
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Read an option.
@@ -188,6 +192,10 @@ class OptionFiles(FileConfigSource):
         Raises:
             BadInput: the file cannot be read, or is not YAML with keys and values.
         """
+        if (world := self._world(config_path)) is not None:
+            return ConfigResult(
+                self.provider, f"{self.scheme()}://{self.path}", OmegaConf.create(world), {"package": None}
+            )
 
         def load(text: str) -> ConfigResult:
             config = OmegaConf.load(StringIO(text))
@@ -201,11 +209,17 @@ class OptionFiles(FileConfigSource):
     def is_config(self, config_path: str) -> bool:
         """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
         path = self._file(config_path)
-        return self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
+        is_file = self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
+        return is_file or self._world(config_path) is not None
 
     def is_group(self, config_path: str) -> bool:
         """Return whether there is such a folder."""
         return self._is_below(config_path) and super().is_group(config_path)
+
+    @staticmethod
+    def _world(config_path: str) -> dict[str, Any] | None:
+        group, _, option = config_path.rpartition("/")
+        return world_values(option.removesuffix(".yaml")) if group == TRACK else None
 
     def _file(self, config_path: str) -> Path:
         return Path(self.path, self._normalize_file_name(config_path))
@@ -226,7 +240,6 @@ def _composed(name: str | None, lines: list[str]) -> DictConfig:
     """Let Hydra compose a file of `conf/`, or the overrides alone; the result includes Hydra's own settings."""
     project, *more = conf_dirs()
     register_option_files()
-    register_worlds()
     if more:
         lines = [*lines, override_line("hydra.searchpath", [f"file://{folder}" for folder in more])]
     with initialize_config_dir(str(project), version_base="1.3"):

@@ -1,6 +1,6 @@
 """The options of the group `track`: the service's worlds and your own tracks, one or several at once.
 
-Worlds need no files: they are registered with Hydra by name. Keys that an option omits have the values of
+Worlds need no files: Hydra finds them by name. Keys that an option omits have the values of
 `conf/track/reinvent_base.yaml`, so that a track of your own needs `knots` and `width_m` only.
 
 Several tracks (`track=[A,B]`, `track=all`) are composed by Hydra under the placeholder keys `several_tracks.place_0`,
@@ -15,7 +15,6 @@ from functools import cache
 from typing import Any
 
 import yaml
-from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override
 
 from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
@@ -63,18 +62,17 @@ class SeveralTracks:
         mapping[GROUP] = {name: complete(name, places[_place(at)]) for at, name in enumerate(self.names)}
 
 
-@cache
-def register_worlds() -> None:
-    """Register every world without a file in `conf/track` with Hydra."""
-    store = ConfigStore.instance()
-    files = {path.stem for path in (conf_dir() / GROUP).glob("*.yaml")}
-    for world in (world for name, world in worlds().items() if name not in files):
-        node: dict[str, Any] = {"name": world.name, "title": world.title}
-        if not _OF_2018.match(world.name):
-            node["floor"] = dict(_LATER_FLOOR)
-            if not _OF_2019.match(world.name):
-                node["floor"]["walls_beyond_m"] = None
-        store.store(group=GROUP, name=world.name, node=node)
+def world_values(option: str) -> dict[str, Any] | None:
+    """Return the values of a world that has no file in `conf/track`; None for any other option."""
+    world = worlds().get(option)
+    if world is None or (conf_dir() / GROUP / f"{option}.yaml").is_file():
+        return None
+    values: dict[str, Any] = {"name": world.name, "title": world.title}
+    if not _OF_2018.match(world.name):
+        values["floor"] = dict(_LATER_FLOOR)
+        if not _OF_2019.match(world.name):
+            values["floor"]["walls_beyond_m"] = None
+    return values
 
 
 def complete(option: str, values: Mapping[Any, Any]) -> dict[Any, Any]:
