@@ -23,11 +23,11 @@ from sqlalchemy.exc import (
 )
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay
-from tenacity.wait import wait_exponential_jitter
 
 from deepracer_exp.addresses import redact, with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
 from deepracer_exp.tracking.store import check_database_file, one_line
+from deepracer_exp.tracking.store_thread import PAUSES
 
 from . import DEFAULT_FILE
 
@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInternalError)
 """Errors of a database that is down or locked, among others; see `_may_pass`."""
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
-_FIRST_WAIT_S, _LONGEST_WAIT_S, _SAY_AFTER_S = 0.1, 10.0, 5.0
+_SAY_AFTER_S = 5.0
 
 _KINDS = ("sqlite", "postgresql", "mysql")
 _ACCEPTED = (
@@ -194,9 +194,6 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> St
 def patiently(call: Callable[[], Result], patience_s: float) -> Result:
     """Call until the database answers; a call that was under way when it went down may take effect twice.
 
-    Waits longer and longer between calls, up to ten seconds, with jitter, so that processes that began to wait
-    together do not return together.
-
     Raises:
         RunFailed: it has not answered for `patience_s`, or its error is one that waiting does not change.
     """
@@ -219,7 +216,7 @@ def _waiting(call: Callable[[], Result], patience_s: float) -> Result:
 
     return Retrying(
         retry=retry_if_exception(_may_pass),
-        wait=wait_exponential_jitter(multiplier=_FIRST_WAIT_S, max=_LONGEST_WAIT_S, jitter=_FIRST_WAIT_S),
+        wait=PAUSES,
         stop=stop_after_delay(patience_s),
         before_sleep=say,
         reraise=True,

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tenacity import RetryCallState, Retrying, retry_if_exception_type, wait_exponential
+from tenacity import RetryCallState, Retrying, retry_if_exception_type
+from tenacity.wait import wait_exponential_jitter
 
 from .store import Store, StoreRefusedError, StoreUnavailableError, one_line
 
@@ -18,7 +19,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
+PAUSES = wait_exponential_jitter(multiplier=0.1, max=10.0, jitter=0.1)
+"""Between calls of a store or a database that does not answer: longer and longer, with jitter, so that processes that
+began to wait together do not return together."""
+_LAST_PAUSE_S = 0.5
+"""The same once there is a deadline."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +115,7 @@ class StoreThread:
 
         retrying = Retrying(
             retry=retry_if_exception_type(StoreUnavailableError),
-            wait=wait_exponential(multiplier=_FIRST_PAUSE_S, max=_LONGEST_PAUSE_S),
+            wait=PAUSES,
             stop=lambda _: time.monotonic() >= self._end_by,
             sleep=self._pause,
             before_sleep=self._log_outage,
@@ -136,7 +141,7 @@ class StoreThread:
 
     def _pause(self, seconds: float) -> None:
         if self._has_deadline.is_set():
-            time.sleep(_FIRST_PAUSE_S)
+            time.sleep(_LAST_PAUSE_S)
         else:
             self._has_deadline.wait(seconds)
 
