@@ -377,6 +377,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration."""
     # Half a second of import that no training waits for.
     import pandas as pd
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from deepracer_exp.analysis.charts.run_pictures import LINE_COLUMNS, driven_lines, learning_curves
 
@@ -384,9 +385,12 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     if not metrics_file.is_file() or not metrics_file.stat().st_size:
         return
     trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
-    figure = driven_lines(trace, {course.name: course.tracks[0] for course in courses})
-    figure.savefig(run_dir / BEST_LAP, dpi=120)
-    learning_curves(pd.read_json(metrics_file, lines=True)).savefig(run_dir / LEARNING, dpi=120)
+    tracks = {course.name: course.tracks[0] for course in courses}
+    curves = learning_curves(pd.read_json(metrics_file, lines=True))
+    for name, figure in ((BEST_LAP, driven_lines(trace, tracks)), (LEARNING, curves)):
+        figure.set_dpi(120)
+        # `savefig` draws a figure twice, the first time for its layout alone.
+        FigureCanvasAgg(figure).print_png(run_dir / name)
 
 
 def _write_page(run_dir: Path, car: CarConfig) -> str | None:
