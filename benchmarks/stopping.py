@@ -44,7 +44,7 @@ import yaml
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
-from deepracer_exp.runs.files import read_run
+from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.training.metrics import NOT_EVALUATED
 from deepracer_exp.training.stopping_replay import replay
@@ -123,7 +123,7 @@ def prove(full: Path, stopped: Path, iteration: int, kept: str) -> dict[str, Any
 
 def measure(run: Path, rule: StoppingConfig, trials: int = TRIALS) -> dict[str, Any]:
     """Apply the rule to a full run and let both checkpoints drive."""
-    record = read_run(run)
+    record = read_record(run)
     end = replay(record, rule, RULE)
     # A run that ends is raced once more: the best of the full run may be its last policy.
     best = (run / "checkpoints" / "best").resolve().name

@@ -16,13 +16,13 @@ from deepracer_exp.config.overrides import override_line
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.evaluation.evaluate import evaluate as evaluate_run
+from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.resolve import resolve
-from deepracer_exp.training.run import train as train_run
+from deepracer_exp.training.run import run_training
 from deepracer_exp.training.trainer import Callback, Trainer, TrainResult
 
 __all__ = [
@@ -97,7 +97,7 @@ def train(
     Raises:
         BadInput: before anything was started; no folder is left.
     """
-    return train_run(experiment.config, experiment.composition, console, callbacks=callbacks)
+    return run_training(experiment.config, experiment.composition, console, callbacks=callbacks)
 
 
 def evaluate(run: str | Path, *overrides: str) -> Evaluation:

@@ -40,7 +40,7 @@ from deepracer_exp.tracking.study_run import STUDY, TRIAL, end_trial_run, open_t
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import Budget, RunEnded
 from deepracer_exp.training.clone import prepare_clone
-from deepracer_exp.training.run import copy_run, resume, train
+from deepracer_exp.training.run import copy_run, resume, run_training
 from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
@@ -334,7 +334,7 @@ class TrialRun(Callback):
         if index:
             experiment, composition, start = self._composed([*own, f"seed={experiment.seed + index}"])
         title, tags = self._title_and_tags()
-        return train(experiment, composition, None, start, [self], run_name=title, tags=tags)
+        return run_training(experiment, composition, None, start, [self], run_name=title, tags=tags)
 
     def _resumed(self, run_dir: Path) -> TrainResult | None:
         """Resume a run that was begun; None if there is nothing to resume."""

@@ -74,7 +74,7 @@ class LogPage:
     replay: RewardComparison | None = None
     """The same driving, paid by another reward function."""
     terms: pd.DataFrame | None = None
-    """What each term of the reward function contributed, as `reward_terms` takes it."""
+    """What each term of the reward function contributed, as `contributed_terms` returns it."""
 
 
 def write_report(recording: Recording, path: Path) -> Path:

@@ -114,12 +114,12 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from deepracer_exp.evaluation.evaluate import evaluate
+    from deepracer_exp.evaluation.evaluate import evaluate_run
 
     video = None if args.video is None else (Path(args.video), args.view)
     out = Console(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
-        evaluate(config, video, out, Console(stderr=True))
+        evaluate_run(config, video, out, Console(stderr=True))
     return 0
 
 
@@ -188,7 +188,7 @@ _STOPPING_EPILOG = """\
 
 def _replay(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_experiment, expand_grid
-    from deepracer_exp.runs.files import read_run
+    from deepracer_exp.runs.files import read_record
     from deepracer_exp.runs.resolve import resolve
 
     runs, given = runs_and_overrides(args)
@@ -200,7 +200,7 @@ def _replay(args: argparse.Namespace) -> int:
         raise BadInput("RUN: missing; accepted: a run's folder, or its name in runs/EXPERIMENT/")
     if not any(override.startswith("stopping=") for override in overrides):
         overrides.insert(0, "stopping=entropy")
-    records = [read_run(resolve(run, stores.runs_dir, stores.uri).path) for run in runs]
+    records = [read_record(resolve(run, stores.runs_dir, stores.uri).path) for run in runs]
 
     from deepracer_exp.training.stopping_replay import replay, table
 

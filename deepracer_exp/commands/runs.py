@@ -216,7 +216,7 @@ def _age(seconds: float) -> str:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    from deepracer_exp.runs.files import read_run
+    from deepracer_exp.runs.files import read_record
     from deepracer_exp.runs.resolve import resolve
 
     if args.output is not None and Path(args.output).suffix != ".html":
@@ -226,7 +226,7 @@ def _compare(args: argparse.Namespace) -> int:
     folders = dict.fromkeys(resolve(run, stores.runs_dir, stores.uri).path for run in runs)
     if not 2 <= len(folders) <= len(ascii_uppercase):
         raise BadInput(f"{len(folders)} runs given; accepted: 2 to {len(ascii_uppercase)} different ones")
-    records = [read_run(folder) for folder in folders]
+    records = [read_record(folder) for folder in folders]
     for record in records:
         if not record.rows:
             raise BadInput(f"{record.path / METRICS}: has no iteration; there is nothing to compare")
@@ -279,7 +279,7 @@ def _lineage(args: argparse.Namespace) -> int:
     from rich.table import Table
     from rich.tree import Tree
 
-    from deepracer_exp.runs.lineage import best_members, family, generations
+    from deepracer_exp.runs.lineage import best_by_generation, best_members, family
     from deepracer_exp.runs.resolve import resolve
 
     name, overrides = run_and_overrides(args)
@@ -295,7 +295,7 @@ def _lineage(args: argparse.Namespace) -> int:
 
     console = table_console()
     table = Table(box=None, show_header=False, pad_edge=False)
-    fastest = generations(root)
+    fastest = best_by_generation(root)
     courses = len({member.course for _, member, _ in fastest}) > 1
     for generation, member, result in fastest:
         course = [member.course] if courses else []

@@ -124,14 +124,14 @@ def _train(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from deepracer_exp.training.run import read_files, train
+    from deepracer_exp.training.run import read_files, run_training
 
     if len(composed) > 1:
         for experiment, _ in composed:
             read_files(experiment)
     outcomes = []
     for experiment, composition in composed:
-        outcome = train(experiment, composition, Console(stderr=True))
+        outcome = run_training(experiment, composition, Console(stderr=True))
         outcomes.append(outcome)
         if experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
@@ -232,14 +232,14 @@ def _clone(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from deepracer_exp.training.clone import prepare_clone
-    from deepracer_exp.training.run import train
+    from deepracer_exp.training.run import run_training
 
     with warnings_on_stderr():
         clone = prepare_clone([f"run={run}", *given], stores.runs_dir, stores.uri)
     args.debug = clone.experiment.debug
     for line in clone.notes:
         print(line, file=sys.stderr)
-    outcome = train(clone.experiment, clone.composition, Console(stderr=True), clone.start)
+    outcome = run_training(clone.experiment, clone.composition, Console(stderr=True), clone.start)
     print_result(outcome, clone.experiment.runs_dir if clone.experiment.tracking.kind == "mlflow" else None)
     return outcome.exit_code
 

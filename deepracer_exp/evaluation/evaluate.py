@@ -125,7 +125,7 @@ def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:
     return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 
-def evaluate(
+def evaluate_run(
     config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, err: Console
 ) -> Evaluation:
     """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.

@@ -38,7 +38,7 @@ def run_terms(
         just_trained: the training in this process has run the function already.
 
     Returns:
-        The view, with another problem if the terms could not be computed; the terms as from `reward_terms`.
+        The view, with another problem if the terms could not be computed; the terms as from `contributed_terms`.
     """
     text = view.recording.reward_source
     if text is None or not (just_trained or is_of_zoo(text)):
@@ -46,12 +46,12 @@ def run_terms(
     sha256 = hashlib.sha256(text.encode()).hexdigest()
     source = RewardSource(view.name, f"{view.name}: reward function", text, sha256, {}, {})
     try:
-        return view, reward_terms(view, source, car)
+        return view, contributed_terms(view, source, car)
     except BadInput as error:
         return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), None
 
 
-def reward_terms(
+def contributed_terms(
     view: LogView,
     source: RewardSource,
     car: CarConfig,

@@ -69,7 +69,7 @@ class RunRecord:
         return self.path.name
 
 
-def read_run(path: Path) -> RunRecord:
+def read_record(path: Path) -> RunRecord:
     """Read a run's folder.
 
     Raises:
@@ -83,7 +83,7 @@ def read_head(path: Path) -> RunRecord:
     """Read a run's folder without the rows of metrics.jsonl, which is long.
 
     Raises:
-        BadInput: as for `read_run`.
+        BadInput: as for `read_record`.
     """
     return RunRecord(
         path,

@@ -134,7 +134,7 @@ def best_members(root: Member) -> dict[int, str]:
     return words
 
 
-def generations(root: Member) -> list[tuple[int, Member, RunResult]]:
+def best_by_generation(root: Member) -> list[tuple[int, Member, RunResult]]:
     """Return the best member of each generation on each track and measure; evaluated ones before others."""
     found: dict[tuple[int, str, str], tuple[Member, RunResult]] = {}
     evaluated = {(one.generation, one.course) for one in root.walk() if one.result and one.result.evaluated}

@@ -135,9 +135,9 @@ def _train_shortly(out: Console, err: Console, experiment: Experiment, compositi
         RunFailed: the training failed.
         KeyboardInterrupt: it was interrupted.
     """
-    from deepracer_exp.training.run import train
+    from deepracer_exp.training.run import run_training
 
-    outcome = train(experiment, composition, err)
+    outcome = run_training(experiment, composition, err)
     if outcome.status == "failed":
         raise RunFailed(f"trial: run failed: {outcome.reason}; see {outcome.folder}")
     if outcome.status == "interrupted":

@@ -10,7 +10,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.reward_replay import replay_reward
-from deepracer_exp.evaluation.reward_terms import reward_terms, run_terms
+from deepracer_exp.evaluation.reward_terms import contributed_terms, run_terms
 from deepracer_exp.rewards.source import RewardSource, load_reward_source, zoo_names
 
 from ..analysis.made_up import Drive, made_up_recording  # noqa: TID252
@@ -38,19 +38,19 @@ def module(text: str) -> RewardSource:
 
 @pytest.mark.parametrize("name", zoo_names())
 def test_the_functions_of_the_zoo_that_are_sums_name_their_terms(name: str, view: LogView) -> None:
-    assert (reward_terms(view, source(name), CAR, most=50) is not None) == (name in WITH_TERMS)
+    assert (contributed_terms(view, source(name), CAR, most=50) is not None) == (name in WITH_TERMS)
 
 
 @pytest.mark.parametrize("name", WITH_TERMS)
 def test_terms_add_up_to_the_reward(name: str, view: LogView) -> None:
-    terms = reward_terms(view, source(name), CAR)
+    terms = contributed_terms(view, source(name), CAR)
     assert terms is not None
     paid = replay_reward(view, source(name), CAR).steps["new_reward"]
     np.testing.assert_allclose(terms.sum(axis=1), paid.loc[terms.index], rtol=1e-9, atol=1e-12)
 
 
 def test_every_driven_row_has_its_terms(view: LogView) -> None:
-    terms = reward_terms(view, source("center_speed_blend"), CAR)
+    terms = contributed_terms(view, source("center_speed_blend"), CAR)
     assert terms is not None
     driven = view.steps[view.steps["episode_status"] != "prepare"]
     assert terms.index.equals(driven.index)
@@ -58,7 +58,7 @@ def test_every_driven_row_has_its_terms(view: LogView) -> None:
 
 def test_of_a_long_training_whole_episodes_are_asked_about(view: LogView) -> None:
     most = len(view.steps) // 3
-    terms = reward_terms(view, source("center_speed_blend"), CAR, most=most)
+    terms = contributed_terms(view, source("center_speed_blend"), CAR, most=most)
     assert terms is not None
     asked = view.steps.loc[terms.index, "episode"]
     assert 0 < len(terms) < 1.5 * most
@@ -77,7 +77,7 @@ def test_a_recordings_own_function_is_run_if_it_was_just_trained(view: LogView) 
 
 
 def test_without_a_course_there_are_no_terms(view: LogView) -> None:
-    assert reward_terms(replace(view, course=None), source("progress_gain"), CAR) is None
+    assert contributed_terms(replace(view, course=None), source("progress_gain"), CAR) is None
 
 
 @pytest.mark.parametrize(
@@ -94,6 +94,6 @@ def test_without_a_course_there_are_no_terms(view: LogView) -> None:
 def test_terms_that_fail_are_reported_in_one_line(body: str, words: str, view: LogView) -> None:
     text = f"def terms(params):\n    {body}\n\n\ndef reward_function(params):\n    return 1.0\n"
     with pytest.raises(BadInput, match=r"mine\.py: terms ") as caught:
-        reward_terms(view, module(text), CAR, time_limit_s=0.2)
+        contributed_terms(view, module(text), CAR, time_limit_s=0.2)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)

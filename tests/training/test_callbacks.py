@@ -9,7 +9,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
 from deepracer_exp.runs.result import STOPPED_EARLY
-from deepracer_exp.training.run import copy_run, resume, train
+from deepracer_exp.training.run import copy_run, resume, run_training
 from deepracer_exp.training.trainer import Callback, TakenOver
 
 TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "checkpoints.every=2")
@@ -35,7 +35,7 @@ def take_away(trainer):
 
 def run(folder, callback, *overrides, **options):
     experiment, composition = compose_experiment([*TINY, f"runs_dir={folder}", *overrides])
-    return train(experiment, composition, callbacks=[callback] if callback else (), **options)
+    return run_training(experiment, composition, callbacks=[callback] if callback else (), **options)
 
 
 def test_a_run_that_a_callback_stops_early_keeps_a_best_policy(tmp_path):

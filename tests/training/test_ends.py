@@ -12,7 +12,7 @@ import pytest
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.runs.files import read_run
+from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.training.stopping_replay import replay
 
@@ -38,7 +38,7 @@ def test_a_run_that_does_not_learn_is_stopped_early(trained):
 
 def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained):
     ended = trained(*NOT_LEARNING)
-    found = replay(read_run(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
+    found = replay(read_record(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
     assert found.iteration == ended.summary["iteration"]
     assert found.decision.as_dict() == ended.summary["stopping"]
     assert found.saved_steps == 0
@@ -71,7 +71,7 @@ def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
     assert (first.summary["reason"], first.summary["env_steps"]) == ("budget reached: env_steps", 4096)
     assert first.summary["cost"] == pytest.approx(first.summary["wall_clock_s"], abs=0.1)  # 1 a second
     both = train_here(*shared)
-    second = read_run(both.folders[1]).summary
+    second = read_record(both.folders[1]).summary
     assert (second["reason"], second["env_steps"]) == ("budget reached: experiment_env_steps", 2048)
     third = train_here(*shared)
     assert third.code == 2

@@ -16,7 +16,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.observation import Features, observation_shape
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.training.metrics import TIMES
-from deepracer_exp.training.run import train
+from deepracer_exp.training.run import run_training
 
 # Reached sooner than a lap: episodes end often.
 OVERRIDES = ("reward=speed_on_track", "episode.max_steps=60")
@@ -278,7 +278,7 @@ def test_a_bug_of_ours_shows_its_traceback_and_the_run_counts_as_failed(tmp_path
 
     monkeypatch.setattr(PPO, "update", broken)
     with pytest.raises(ZeroDivisionError, match="of ours"):
-        train(
+        run_training(
             *compose_experiment(
                 ["experiment=tiny", "tracking=off", "collector=in_process", f"runs_dir='{tmp_path}'"]
             ),

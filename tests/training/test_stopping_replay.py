@@ -6,7 +6,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import RunRecord, read_run
+from deepracer_exp.runs.files import RunRecord, read_record
 from deepracer_exp.training.stopping_replay import Replay, replay
 
 LENGTH = 200
@@ -46,7 +46,7 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
 
 
 def replayed(folder: Path, *overrides: str) -> Replay:
-    return replay(read_run(folder), compose_experiment(overrides)[0].stopping, " ".join(overrides))
+    return replay(read_record(folder), compose_experiment(overrides)[0].stopping, " ".join(overrides))
 
 
 def test_it_reports_where_the_run_would_have_ended_and_what_that_saves_and_loses(make_run):
@@ -156,7 +156,7 @@ def test_a_last_line_cut_off_by_a_kill_is_left_out(make_run):
     folder = make_run()
     with (folder / "metrics.jsonl").open("a") as file:
         file.write('{"iteration": 201, "env_st')
-    record: RunRecord = read_run(folder)
+    record: RunRecord = read_record(folder)
     assert record.rows[-1]["iteration"] == LENGTH
     assert record.summary == {}
 
@@ -175,4 +175,4 @@ def test_files_that_no_training_wrote_are_refused_by_name(make_run, name, text, 
     folder = make_run()
     (folder / name).write_text(text)
     with pytest.raises(BadInput, match=f"{name}.*{words}"):
-        read_run(folder)
+        read_record(folder)
