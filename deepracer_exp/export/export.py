@@ -1,16 +1,24 @@
 """The command `export`: write a policy as ONNX, or a run's files or logs in the layouts of AWS."""
 
+import json
+import logging
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
+from torch import Tensor, nn
 
+from deepracer_exp.agents.actor_critic import ActorCritic, PictureNet
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.evaluation import ExportConfig
-from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
@@ -19,7 +27,12 @@ from deepracer_exp.validation.console import console_findings
 
 from .aws_files import aws_files, write_texts
 from .aws_logs import write_aws_logs
-from .onnx_file import CHECKED, CHECKED_PICTURES, DeployedPolicy, write_onnx
+
+POLICY, COMMAND = "policy", "command"
+CHECKED, CHECKED_PICTURES = 1000, 100
+"""Number of observations on which the file is compared with the network."""
+TOLERANCE = 1e-4
+"""Largest accepted difference, with a margin over single-precision rounding."""
 
 
 def export(config: ExportConfig, output: str | None, out: Console) -> Path:
@@ -100,3 +113,131 @@ def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
     for finding in console_findings(reward):
         out.print(f"  reward_function.py: the AWS console would reject it: {finding}", soft_wrap=True)
     return folder
+
+
+class DeployedPolicy(nn.Module):
+    """The deterministic policy of an actor-critic, without value network and sampling.
+
+    `observation` (N, features), or `pixels` (N, channels, height, width), bytes -> `policy`, the probabilities of the
+    actions (N, n), of a continuous policy the mean of [steering, speed] clipped to -1..1 (N, 2); and `command` (N, 2),
+    degrees (positive to the left) and metres per second: of the likeliest action, or of that mean.
+    """
+
+    def __init__(self, networks: ActorCritic, actions: ActionSpace):
+        """Share the layers of `networks`, which must not be trained further."""
+        super().__init__()
+        trunk = networks.trunk
+        self.trunk = nn.Identity() if trunk is None else trunk.module
+        self.head = networks.policy_head[0].module
+        (self.in_key,) = networks.policy.in_keys
+        for module in self.modules():
+            if isinstance(module, PictureNet):
+                module.matrix_units = False  # a file for any processor
+        self.discrete = isinstance(actions, DiscreteActions)
+        if isinstance(actions, DiscreteActions):
+            rows = [actions.steering_deg, actions.speed_mps]
+        else:
+            rows = [actions.low, actions.high]
+        table = np.stack(rows, axis=1 if self.discrete else 0)
+        self.table: Tensor
+        self.register_buffer("table", torch.as_tensor(table, dtype=torch.float32))
+
+    def forward(self, observed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return policy and command."""
+        outputs = self.head(self.trunk(observed))
+        if self.discrete:
+            policy = torch.softmax(outputs, dim=-1)
+            return policy, self.table[policy.argmax(dim=-1)]
+        policy = outputs[0].clamp(-1.0, 1.0)
+        share = (policy + 1.0) * 0.5
+        return policy, self.table[0] * (1.0 - share) + self.table[1] * share
+
+
+def write_onnx(
+    model: DeployedPolicy, observed: ObservationShape, facts: Mapping[str, Any], path: Path
+) -> float:
+    """Write the file and return its largest difference from the network, on `CHECKED` observations.
+
+    Args:
+        model: the policy.
+        observed: the shape of what it reads.
+        facts: metadata of the file, JSON types.
+        path: the file, written atomically.
+
+    Raises:
+        BadInput: the required packages are not installed, or the file cannot be written.
+        RunFailed: the file differs from the network.
+    """
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401 - checked before the work
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise BadInput(
+            f"format=onnx: needs the package {error.name}; install the project with its extra: "
+            "pip install 'deepracer-exp[export]'"
+        ) from error
+    observations = _observations(observed)
+    program = _program(model.eval(), observations[:2])
+    onnx.helper.set_model_props(program, {key: json.dumps(value) for key, value in facts.items()})
+    content = program.SerializeToString()
+    difference = largest_difference(model, content, observations)
+    if not difference <= TOLERANCE:
+        raise RunFailed(
+            f"the ONNX file differs from the network by {difference:.3g} on {len(observations)} observations; "
+            f"at most {TOLERANCE:g} is rounding"
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, content)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from error
+    return difference
+
+
+def _observations(observed: ObservationShape) -> Tensor:
+    """Return standard normal features, or pictures of noise."""
+    generator = torch.Generator().manual_seed(0)
+    if observed.picture is None:
+        return torch.randn(CHECKED, observed.features, generator=generator)
+    return torch.randint(
+        0, 256, (CHECKED_PICTURES, *observed.picture), generator=generator, dtype=torch.uint8
+    )
+
+
+def largest_difference(model: DeployedPolicy, content: bytes, observations: Tensor) -> float:
+    """Return how far any `policy` of a file is from the network's."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    (theirs,) = session.run([POLICY], {model.in_key: observations.numpy()})
+    with torch.no_grad():
+        ours = model(observations)[0].numpy()
+    return float(np.abs(theirs - ours).max())
+
+
+def _program(model: DeployedPolicy, observations: Tensor) -> Any:
+    """Return the ONNX model, with the exporter's own messages silenced."""
+    quiet = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    before = [logger.level for logger in quiet]
+    for logger in quiet:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # between the libraries
+            program = torch.onnx.export(
+                model,
+                (observations,),
+                input_names=[model.in_key],
+                output_names=[POLICY, COMMAND],
+                dynamic_shapes={"observed": {0: torch.export.Dim("batch")}},
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        for logger, level in zip(quiet, before, strict=True):
+            logger.setLevel(level)
+    assert program is not None
+    return program.model_proto

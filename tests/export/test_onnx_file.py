@@ -17,8 +17,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, build_action_space
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.export import onnx_file
-from deepracer_exp.export.onnx_file import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
+from deepracer_exp.export import export as exporting
+from deepracer_exp.export.export import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
 
 FEATURES = tuple(f"feature_{number}" for number in range(19))
 OBSERVATIONS = torch.randn(50, len(FEATURES), generator=torch.Generator().manual_seed(2))
@@ -66,7 +66,7 @@ def programmed(default: Written, monkeypatch: pytest.MonkeyPatch) -> None:
     """Use the default's program again: making it takes seconds."""
     program = onnx.load(default.path)
     del program.metadata_props[:]
-    monkeypatch.setattr(onnx_file, "_program", lambda *_: program)
+    monkeypatch.setattr(exporting, "_program", lambda *_: program)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_file_of_another_network_is_detected(default):
 
 
 def test_a_file_that_computes_something_else_is_not_written(programmed, tmp_path, monkeypatch):
-    monkeypatch.setattr(onnx_file, "TOLERANCE", -1.0)
+    monkeypatch.setattr(exporting, "TOLERANCE", -1.0)
     with pytest.raises(RunFailed, match="differs from the network by"):
         written(tmp_path / "policy.onnx")
     assert list(tmp_path.iterdir()) == []
