@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO on the same cars: what `benchmarks.throughput` holds the training against.
 
-    python -m benchmarks.sb3_peer --iterations 20 [--physics-threads 0] [--torch-threads 1] [OVERRIDE...]
+    python -m benchmarks.sb3_peer --iterations 20 [--physics-threads 0] [--torch-threads 1] [--car-racing] [OVERRIDE...]
 
 As many cars as the experiment has over all its processes are driven through `DeepRacerVectorEnv`, by default with one
 physics thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights
@@ -8,7 +8,8 @@ are the experiment's. The peer keeps no trace, no metrics and no checkpoints. On
 starts; then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
 
 With a camera it is the peer's `CnnPolicy` with the experiment's convolutions, which policy and value share, as is usual
-there; a value network of features beside pictures is not.
+there; a value network of features beside pictures is not. `--car-racing` trains it on Gymnasium's CarRacing-v3 instead
+(96x96 in colour, its discrete actions), with one process per core.
 """
 
 import argparse
@@ -23,10 +24,11 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from deepracer_exp.collectors.base import worker_count
+from deepracer_exp.collectors.base import cores, worker_count
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, MLPConfig
@@ -99,7 +101,7 @@ class SB3Cars(VecEnv):
         return [False] * self.num_envs
 
 
-def build(experiment: Experiment, physics_threads: int) -> PPO:
+def build(experiment: Experiment, physics_threads: int, car_racing: bool = False) -> PPO:
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
     assert algorithm.frames_per_iteration is not None
@@ -123,9 +125,16 @@ def build(experiment: Experiment, physics_threads: int) -> PPO:
                 "features_extractor_kwargs": {"network": network},
             },
         )
+    cars: VecEnv
+    if car_racing:
+        n_cars = cores()
+        options = {"continuous": False}
+        cars = make_vec_env("CarRacing-v3", n_cars, env_kwargs=options, vec_env_cls=SubprocVecEnv)
+    else:
+        cars = SB3Cars(DeepRacerVectorEnv(n_cars, threads=physics_threads, setup=build_setup(experiment)))
     return PPO(
         policy,
-        SB3Cars(DeepRacerVectorEnv(n_cars, threads=physics_threads, setup=build_setup(experiment))),
+        cars,
         learning_rate=algorithm.lr,
         n_steps=-(-algorithm.frames_per_iteration // n_cars),
         batch_size=algorithm.batch_size,
@@ -143,16 +152,21 @@ def build(experiment: Experiment, physics_threads: int) -> PPO:
 
 
 def measure(
-    experiment: Experiment, iterations: int, physics_threads: int, torch_threads: int
+    experiment: Experiment,
+    iterations: int,
+    physics_threads: int,
+    torch_threads: int,
+    car_racing: bool = False,
 ) -> dict[str, float]:
     """Train for one iteration, then for `iterations` with the clock running."""
     torch.set_num_threads(torch_threads)
-    peer = build(experiment, physics_threads)
+    peer = build(experiment, physics_threads, car_racing)
     frames = peer.n_steps * peer.n_envs
     peer.learn(frames, log_interval=None)
     began = time.perf_counter()
     peer.learn(iterations * frames, log_interval=None, reset_num_timesteps=False)
     seconds = time.perf_counter() - began
+    peer.env.close()
     return {
         "env_steps": iterations * frames,
         "seconds": seconds,
@@ -168,10 +182,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--iterations", type=int, required=True)
     parser.add_argument("--physics-threads", type=int, default=0, help="0: one per core")
     parser.add_argument("--torch-threads", type=int, default=1)
+    parser.add_argument(
+        "--car-racing", action="store_true", help="on Gymnasium's CarRacing-v3, not on our cars"
+    )
     parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     args = parser.parse_args(arguments)
     experiment, _ = compose_experiment(args.overrides)
-    print(json.dumps(measure(experiment, args.iterations, args.physics_threads, args.torch_threads)))
+    threads = args.physics_threads, args.torch_threads
+    print(json.dumps(measure(experiment, args.iterations, *threads, args.car_racing)))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
 - `peer_sb3_train_steps_per_s`: see `benchmarks.sb3_peer`; the same number of iterations from the same start, with one
   physics thread per core, and with one torch thread and one per core, the faster of which counts.
 - `peer_sb3_default_train_steps_per_s`: the same with the vector environment's own default of one physics thread.
+- `car_racing_train_steps_per_s`, with a camera: the peer on Gymnasium's CarRacing-v3, one iteration of
+  CAR_RACING_FRAMES a round.
 
 What is compared is measured in turns, `--rounds` times, each for at least `--seconds` (a training for as many
 iterations as collection alone would do in that time). Figures are medians over the rounds; a ratio is the median of
@@ -52,6 +54,9 @@ from .command import read_metrics, train
 from .driving import SameDriving
 from .report import benchmark_parser, machine, number, table, write_json
 
+CAR_RACING_FRAMES = 1024
+"""Of an iteration on CarRacing-v3, which takes as long as some ten thousand steps here."""
+
 Rates = dict[str, list[float]]
 """Steps per second of each round, by figure."""
 
@@ -61,6 +66,7 @@ RATIOS = (
     ("collect_2_to_1", "collect 2", "collect 1", 1.6),
     ("train_to_peer", "train", "peer", 1.5),
     ("train_to_default_peer", "train", "peer, 1 physics and 1 torch threads", None),
+    ("train_to_car_racing", "train", "CarRacing-v3", 10.0),
 )
 """Name, numerator, denominator and the least wanted."""
 
@@ -139,8 +145,17 @@ def training(overrides: Sequence[str], iterations: int, rounds: int, folder: Pat
         first, last = rows[0], rows[-1]
         return last["env_steps"] - first["env_steps"], last["wall_clock_s"] - first["wall_clock_s"]
 
-    def peer(physics_threads: int, torch_threads: int) -> tuple[float, float]:
-        command = [sys.executable, "-m", "benchmarks.sb3_peer", *overrides, "--iterations", str(iterations)]
+    def peer(physics_threads: int, torch_threads: int, car_racing: bool = False) -> tuple[float, float]:
+        command = [sys.executable, "-m", "benchmarks.sb3_peer", *overrides]
+        if car_racing:
+            command += [
+                "--car-racing",
+                "--iterations",
+                "1",
+                f"algorithm.frames_per_iteration={CAR_RACING_FRAMES}",
+            ]
+        else:
+            command += ["--iterations", str(iterations)]
         command += ["--physics-threads", str(physics_threads), "--torch-threads", str(torch_threads)]
         root = Path(__file__).parents[1]
         done = subprocess.run(command, cwd=root, check=True, stdout=subprocess.PIPE, text=True)
@@ -150,6 +165,8 @@ def training(overrides: Sequence[str], iterations: int, rounds: int, folder: Pat
     passes: dict[str, Callable[[], tuple[float, float]]] = {"train": ours}
     for threads in sorted({(1, 1), (cores(), 1), (cores(), cores())}):
         passes[peer_name(*threads)] = functools.partial(peer, *threads)
+    if compose_experiment(overrides)[0].observation.camera is not None:
+        passes["CarRacing-v3"] = functools.partial(peer, cores(), cores(), True)
     return in_turns(rounds, 0.0, passes)
 
 
@@ -161,6 +178,8 @@ def summarize(rates: Rates) -> dict[str, Any]:
     middle = {name: round(statistics.median(values), 1) for name, values in rates.items()}
     ratios = {}
     for name, above, below, wanted in RATIOS:
+        if below not in rates:  # CarRacing-v3 is held only against learning from pictures
+            continue
         by_round = [a / b for a, b in zip(rates[above], rates[below], strict=True)]
         ratios[name] = {
             "median": round(statistics.median(by_round), 3),
@@ -175,6 +194,7 @@ def summarize(rates: Rates) -> dict[str, Any]:
         "train_steps_per_s": middle["train"],
         "peer_sb3_train_steps_per_s": middle["peer"],
         "peer_sb3_default_train_steps_per_s": middle[peer_name(1, 1)],
+        "car_racing_train_steps_per_s": middle.get("CarRacing-v3"),
         "peer_torch_threads": fastest[1],
         "ratios": ratios,
         "rounds": {name: [round(rate, 1) for rate in values] for name, values in rates.items()},
@@ -195,6 +215,7 @@ def show(summary: dict[str, Any]) -> str:
             "" if wanted is None else number(wanted, 2),
         )
         for name, above, below, wanted in RATIOS
+        if name in summary["ratios"]
     ]
     return "\n\n".join(
         (
