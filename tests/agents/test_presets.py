@@ -20,7 +20,12 @@ def options(group):
 
 
 def load(group, name, type_):
-    return TypeAdapter(type_).validate_python(yaml.safe_load((CONF / group / f"{name}.yaml").read_text()))
+    values = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
+    for base in values.pop("defaults", []):
+        values = (
+            yaml.safe_load((CONF / group / f"{base}.yaml").read_text()) if base != "_self_" else {}
+        ) | values
+    return TypeAdapter(type_).validate_python(values)
 
 
 @pytest.mark.parametrize("action_count", [7, None])
@@ -59,4 +64,4 @@ def test_every_algorithm_builds_and_names_one_length_of_an_iteration(name):
 def test_every_key_is_explained_on_the_line_above_it(group, name):
     lines = (CONF / group / f"{name}.yaml").read_text().splitlines()
     for above, line in zip(["", *lines], lines, strict=False):
-        assert not line or line.startswith("#") or above.startswith("# ")
+        assert not line or line.startswith(("#", "  - ")) or above.startswith("# ")
