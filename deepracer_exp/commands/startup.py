@@ -35,6 +35,16 @@ def check_files(experiment: "Experiment") -> None:
             Track.from_config(track)
 
 
+def check_teacher(experiment: "Experiment") -> None:
+    """Find the run that an experiment's policy learns from, if there is one.
+
+    Raises:
+        BadInput: as for `check_policy`.
+    """
+    if experiment.teacher is not None:
+        check_policy(experiment.teacher, experiment.runs_dir, getattr(experiment.tracking, "uri", None), None)
+
+
 def check_policy(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> None:
     """Find a run as `check_run` does, and import the classes of the user's own that its policy needs.
 
@@ -88,9 +98,12 @@ def check_sweep(request: "SweepRequest") -> None:
     named = [
         line
         for line in request.base
-        if (key := key_of(line)) in (*groups(), custom_files.KEY) or key.endswith(".file")
+        if (key := key_of(line)) in (*groups(), custom_files.KEY, "teacher", "runs_dir")
+        or key.endswith(".file")
     ]
-    check_files(compose_experiment(named)[0])
+    experiment, _ = compose_experiment(named)
+    check_files(experiment)
+    check_teacher(experiment)
 
 
 def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.worker") -> None:

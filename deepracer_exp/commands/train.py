@@ -23,9 +23,9 @@ from .output import print_notes, print_result, print_results, print_start, warni
 from .startup import (
     check_changes,
     check_files,
-    check_policy,
     check_run,
     check_sweep,
+    check_teacher,
     has_workers,
     start_workers_early,
 )
@@ -115,10 +115,7 @@ def _train(args: argparse.Namespace) -> int:
         return 0
     for experiment, _ in composed:
         check_files(experiment)
-        if experiment.teacher is not None:
-            check_policy(
-                experiment.teacher, experiment.runs_dir, getattr(experiment.tracking, "uri", None), None
-            )
+        check_teacher(experiment)
     print_start()
     start_workers_early(any(experiment.collector.forks for experiment, _ in composed))
 

@@ -63,3 +63,9 @@ def test_it_is_resumed_bit_for_bit_without_the_teachers_folder_and_cloned_withou
 )
 def test_what_cannot_be_taught_is_refused_in_one_line(teacher, call, overrides, words):
     call("train", *IN_PROCESS, *overrides).assert_bad_input(*words)
+
+
+def test_a_sweep_finds_the_teacher_before_its_trials_begin(teacher, call):
+    line = ("sweep", "algorithm=distill", "algorithm.lr=interval(1e-4,1e-3)", "--cfg")
+    assert call(*line, "teacher=school/teacher").code == 0
+    call(*line, "teacher=nowhere").assert_bad_input("nowhere", "no such run")
