@@ -64,10 +64,8 @@ def test_a_folder_that_is_read_only_is_bad_input(train_here, mounted):
     ended.assert_bad_input("runs_dir=runs", "Read-only file system")
 
 
-@pytest.mark.parametrize(
-    "name", ["with spaces", "Zürich Straße", "a'b\"c", "=", "50%", "{braces}", "[0]", "$HOME"]
-)
-def test_paths_of_any_name_work(train_here, tmp_path, name):
+def test_paths_of_any_name_work(train_here, tmp_path):
+    name = "= Zürich Straße a'b\"c 50% {braces} [0] $HOME"
     folder = tmp_path / name
     folder.mkdir()
     (folder / f"{name}.py").write_text("def reward_function(params):\n    return 1.0\n")

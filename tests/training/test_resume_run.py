@@ -71,7 +71,10 @@ def whole(trained, *overrides):
             "lr_schedule=adaptive_kl",
         ),
         ("checkpoints.every=null", "reward=speed_on_track"),
-        ("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
+        (
+            *("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
+            "algorithm.frames_per_iteration=256",
+        ),
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )
