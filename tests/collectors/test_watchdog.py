@@ -49,11 +49,14 @@ def _wait_until(condition) -> None:
         time.sleep(0.02)
 
 
-def _keep_beating(counters, workers, seconds):
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
+def _keep_beating(counters, workers, dog) -> None:
+    """Let workers make steps until another one is ended."""
+
+    def is_over() -> bool:
         counters[workers] += 1
-        time.sleep(0.02)
+        return bool(dog.verdict)
+
+    _wait_until(is_over)
 
 
 def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, processes):
@@ -62,8 +65,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     counters = beats()
     counters[:] = 1
     dog.expect()
-    _keep_beating(counters, [1], 4.0)
-    _wait_until(lambda: dog.verdict)
+    _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
     processes[0].join(60)
@@ -90,8 +92,7 @@ def test_what_arrived_is_no_excuse_for_the_next_batch(watch, beats, processes):
     dog.expect()
     dog.delivered(0)
     dog.expect()
-    _keep_beating(counters, [1], 4.0)
-    _wait_until(lambda: dog.verdict)
+    _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
 
 
@@ -100,7 +101,7 @@ def test_no_worker_is_ended_while_none_is_waited_for(watch, beats, processes):
     dog.workers_started(processes)
     beats()[:] = 1
     dog.rest()
-    time.sleep(2.5)
+    time.sleep(1.5)
     assert not dog.verdict
     assert all(process.is_alive() for process in processes)
 

@@ -35,6 +35,7 @@ def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_
     printed = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]
     assert len(printed) >= 3
     assert all(" ".join(line.split()) in text for line in printed)
+    assert 'id="figure-reward_terms"' in (run_dir / "report.html").read_text()
 
 
 @pytest.mark.parametrize("what", ["{name}", "tiny/{name}", "{begin}", "best:tiny"])
@@ -79,10 +80,7 @@ def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, 
     assert opened == [(tmp_path / "page.html").resolve().as_uri()]
 
 
-def test_the_terms_of_a_reward_are_shown_of_a_run_and_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
-    ended = call("analyze", str(run_dir))
-    assert ended.code == 0, ended.stderr
-    assert 'id="figure-reward_terms"' in (run_dir / "report.html").read_text()
+def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
     call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "theirs"))
     trap = f"open({str(tmp_path / 'trapped')!r}, 'w')\ndef terms(params): return {{}}\n"
     for file in (tmp_path / "theirs").rglob("reward_function.py"):
@@ -125,14 +123,7 @@ def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
     assert not list(tmp_path.glob("*.html"))
 
 
-def test_a_training_ends_with_its_page(trained):
-    ended = trained(*LAPS, "report=true")
-    assert ended.code == 0, ended.stderr
-    assert "report.html" in ended.stdout
-    assert "16,384 control steps" in findings_told(ended.folder / "report.html")
-
-
-def test_the_page_of_a_training_stands_in_its_mlflow_run(call):
+def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
     from mlflow import MlflowClient
 
     from deepracer_exp.runs.files import read_run_id
@@ -140,6 +131,8 @@ def test_the_page_of_a_training_stands_in_its_mlflow_run(call):
     tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.iterations=1")
     ended = call("train", *tiny, "report=true")
     assert ended.code == 0, ended.stderr
+    assert "report.html" in ended.stdout
+    assert "1,024 control steps" in findings_told(ended.folder / "report.html")
     client = MlflowClient(tracking_uri=f"sqlite:///{ended.cwd / 'runs' / 'mlflow.db'}")
     found = {file.path for file in client.list_artifacts(read_run_id(ended.folder) or "")}
     assert {"report.html", "learning.png"} <= found
@@ -150,7 +143,7 @@ def test_a_fault_of_the_page_is_reported_and_leaves_the_training_finished(train_
         raise ZeroDivisionError("a bug\nof two lines")
 
     monkeypatch.setattr(log_report, "write_page", fault)
-    ended = train_here("report=true")
+    ended = train_here("report=true", "budget.iterations=1")
     assert ended.code == 0
     assert ended.summary["status"] == "finished"
     (line,) = [line for line in ended.stderr.splitlines() if line.startswith("warning: ")]
@@ -167,7 +160,7 @@ def test_a_second_signal_during_the_page_leaves_it_off_and_the_training_finished
         raise KeyboardInterrupt
 
     monkeypatch.setattr(log_report, "write_page", interrupted)
-    ended = train_here("report=true")
+    ended = train_here("report=true", "budget.iterations=1")
     assert (ended.code, ended.summary["status"]) == (0, "finished")
     assert "report.html was left off; `deepracer-exp analyze " in ended.stderr
 

@@ -91,7 +91,7 @@ def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_eval
     "overrides", [(), ("track=Bowtie_track", "track.direction=alternate"), ("reward=progress_delta",)]
 )
 def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
-    run = trained(*overrides).folder
+    run = trained(*overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car
     replayed = reward_replay.replay_reward(prepare(read_own_recording(run)), source, car)

@@ -14,7 +14,7 @@ def test_onnx_goes_into_the_runs_folder_and_is_checked(trained, call):
 
 
 def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
-    run = trained("reward.constants.SPEED_WEIGHT=2.5", "algorithm.batch_size=1000")
+    run = trained("reward.constants.SPEED_WEIGHT=2.5", "algorithm.batch_size=1000", "budget.iterations=1")
     ended = call("export", str(run.folder), "format=aws", "-o", "custom_files")
     assert ended.code == 0, ended.stderr
     assert sorted(path.name for path in (ended.cwd / "custom_files").iterdir()) == [
@@ -27,7 +27,13 @@ def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
 def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tmp_path):
     reward = tmp_path / "mine.py"
     reward.write_text("import os\n\n\ndef reward_function(params):\n    return 1.0\n")
-    ended = call("export", str(trained(f"reward.file={reward}").folder), "format=aws", "-o", "files")
+    ended = call(
+        "export",
+        str(trained(f"reward.file={reward}", "budget.iterations=1").folder),
+        "format=aws",
+        "-o",
+        "files",
+    )
     assert ended.code == 0, ended.stderr
     assert "reward_function.py: the AWS console would reject it: line 1: import of os" in ended.stdout
 

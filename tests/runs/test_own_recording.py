@@ -89,7 +89,7 @@ def test_the_action_space_is_that_of_the_environment(trained, space):
 
     overrides = (f"action_space={space}",)
     experiment, _ = compose_experiment(overrides)
-    recording = read_own_recording(trained(*overrides).folder)
+    recording = read_own_recording(trained(*overrides, "budget.iterations=1").folder)
     assert recording.metadata == metadata_of(build_action_space(experiment.action_space))
     assert recording.steps["action"].isna().all() == (space == "continuous")
 

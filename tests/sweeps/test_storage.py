@@ -29,7 +29,7 @@ def _make_study(url: str) -> optuna.Study:
     return optuna.create_study(study_name="study", storage=open_storage(url, Path()).optuna)
 
 
-@pytest.mark.parametrize("name", ["runs", "two words", "{0}", "50%41", "who?x=1", "#1", "läufe", "[a]*"])
+@pytest.mark.parametrize("name", ["runs", "two words {0} 50%41 who?x=1 #1 läufe [a]*"])
 def test_the_default_is_a_file_in_the_folder_of_the_runs_whatever_its_name(tmp_path, name):
     storage = open_storage(None, tmp_path / name)
     optuna.create_study(study_name="study", storage=storage.optuna)

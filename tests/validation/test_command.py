@@ -139,7 +139,7 @@ def race_of_zoo(race):
 
 def test_a_short_training_reports_whether_anything_improves(call, tmp_path):
     ended = call(
-        *("validate", write(tmp_path, "params['speed'] - 9 * params['is_offtrack']"), "trial=3s"),
+        *("validate", write(tmp_path, "params['speed'] - 9 * params['is_offtrack']"), "trial=1s"),
         *("experiment=tiny", "collector=in_process", "collector.threads=1"),
     )
     assert ended.code == 0, ended.stderr
