@@ -182,8 +182,8 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
 class OptionFiles(FileConfigSource):
     """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
 
-    It has the worlds, too. Hydra copies what is in its `ConfigStore` each time it composes, which took it longer than
-    all else with 120 worlds there.
+    It has the worlds, too: all that is in Hydra's `ConfigStore` is copied at each composition, and 120 worlds there
+    were a fifth of the work.
     """
 
     def load_config(self, config_path: str) -> ConfigResult:
