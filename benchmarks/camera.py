@@ -3,11 +3,12 @@
     python -m benchmarks.camera [--frames DIR] [--poses 200] [--json FILE]
 
 1. The same scene, 160x120: random poses on three tracks, with pitch and roll. `images_per_s` is ours, one core, in grey
-   as policies see it (in colour: `rgb_images_per_s`); `mujoco_images_per_s` is MuJoCo's with one sample a pixel and
-   without shadows, reflections and fog; `times` their ratio, measured in turns. `mujoco_640x480_images_per_s` is that
-   of pictures as AWS's simulator takes them, before it shrinks them.
+   as policies see it (in colour: `rgb_images_per_s`; with boxes all around: `boxes_images_per_s`);
+   `mujoco_images_per_s` is MuJoCo's with one sample a pixel and without shadows, reflections and fog; `times` their
+   ratio, measured in turns. `mujoco_640x480_images_per_s` is that of pictures as AWS's simulator takes them, before it
+   shrinks them.
 2. `difference_of_255`: mean over pixels and channels of the absolute difference from MuJoCo's picture of four times the
-   width and height with four samples a pixel, shrunk by taking means.
+   width and height with four samples a pixel, shrunk by taking means; with boxes beside the road.
 3. `real_frames` (with `--frames`): pictures of AWS's simulator on re:Invent 2018 whose poses are unknown. Colours are
    fitted on every other frame, once for all; each of the rest is explained by the pose whose picture differs least.
    `difference_of_255`: mean over frames of the mean absolute difference in grey; `edge_error_px`: median distance of
@@ -27,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.picture_randomization import PictureRandomization
 from deepracer_exp.env.pictures import GREY, floor_colors
 from deepracer_exp.sim.camera import Lens, take_pictures
 from deepracer_exp.sim.scenery import Scenery, build_scenery
@@ -34,8 +36,9 @@ from deepracer_exp.tracks.track import Track
 
 from .report import benchmark_parser, number, table, write_json
 
-TRACKS = ("reinvent_base", "Oval_track", "Spain_track")
-WALLS_BEYOND_M = 0.91
+TRACKS = ("reinvent_base", "2022_summit_speedway_cw", "Spain_track")
+"""With high walls, with a start line, and with kerbs and a low barrier."""
+BOXES = 40
 WIDTH, HEIGHT = 160, 120
 ROUNDS = 5
 WANTED = {"times": 100.0, "difference_of_255": 4.0}
@@ -55,9 +58,16 @@ def service_lens(width: int, height: int) -> Lens:
     )
 
 
-def scenery_of(track: Track) -> Scenery:
-    """Return the track's outlines, with walls."""
-    return build_scenery(track.waypoints, (track.inner, track.outer), track.road, WALLS_BEYOND_M)
+def boxes_beside(track: Track) -> NDArray[np.float32]:
+    """Return boxes as randomized pictures have them, in colour, (boxes, 9)."""
+    objects = f"randomization.pictures.objects=[{BOXES},{BOXES}]"
+    config = compose_experiment(["randomization=sim2real", objects])[0].randomization.pictures
+    randomization = PictureRandomization([config], [0], [track])
+    randomization.seed(0)
+    randomization.begin(np.zeros(1, np.intp), np.zeros(1, np.int64), np.zeros(1, np.intp))
+    boxes = randomization.boxes(np.zeros(1, np.intp))
+    assert boxes is not None
+    return boxes[0]
 
 
 def random_poses(track: Track, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
@@ -76,12 +86,17 @@ def random_poses(track: Track, count: int, generator: np.random.Generator) -> ND
 
 
 def pictures(
-    lens: Lens, scenery: Scenery, poses: NDArray[np.float64], colors: NDArray[np.float32]
+    lens: Lens,
+    scenery: Scenery,
+    poses: NDArray[np.float64],
+    colors: NDArray[np.float32],
+    boxes: NDArray[np.float32] | None = None,
 ) -> NDArray[np.uint8]:
-    """Return our pictures, (N, channels, height, width)."""
+    """Return our pictures, (N, channels, height, width), of the same boxes (B, 6 + channels) for all."""
     out = np.empty((len(poses), colors.shape[-1], lens.height, lens.width), np.uint8)
     everyone = np.broadcast_to(colors, (len(poses), *colors.shape))
-    return take_pictures(lens, scenery, poses, np.zeros(len(poses), np.intp), everyone, out)
+    same = None if boxes is None else np.broadcast_to(boxes, (len(poses), *boxes.shape))
+    return take_pictures(lens, scenery, poses, np.zeros(len(poses), np.intp), everyone, out, boxes=same)
 
 
 def per_second(count: int, work: Callable[..., object], *arguments: object) -> float:
@@ -97,26 +112,31 @@ def compare_with_mujoco(count: int) -> dict[str, Any]:
 
     generator = np.random.default_rng(0)
     lens, large = service_lens(WIDTH, HEIGHT), service_lens(4 * WIDTH, 4 * HEIGHT)
-    rates: dict[str, list[float]] = {"ours": [], "rgb": [], "mujoco": [], "mujoco 640x480": []}
+    rates: dict[str, list[float]] = {"ours": [], "rgb": [], "boxes": [], "mujoco": [], "mujoco 640x480": []}
     times, differences = [], {}
     for name in TRACKS:
         track = Track.from_config(compose_experiment([f"track={name}"])[0].tracks[name])
         colors = floor_colors(track.floor)
         grey = (colors @ GREY)[:, None]
-        scenery, poses = scenery_of(track), random_poses(track, -(-count // len(TRACKS)), generator)
-        fast = SceneRenderer(build_scene(track, lens, colors, 0, WALLS_BEYOND_M), WIDTH, HEIGHT)
-        plain = SceneRenderer(build_scene(track, large, colors, 0, WALLS_BEYOND_M), 4 * WIDTH, 4 * HEIGHT)
-        exact = SceneRenderer(build_scene(track, large, colors, 4, WALLS_BEYOND_M), 4 * WIDTH, 4 * HEIGHT)
-        pictures(lens, scenery, poses, grey), pictures(lens, scenery, poses, colors), fast.take(poses[0])
+        scenery, poses = build_scenery(track), random_poses(track, -(-count // len(TRACKS)), generator)
+        boxes = boxes_beside(track)
+        grey_boxes = np.column_stack([boxes[:, :6], boxes[:, 6:] @ GREY])
+        fast = SceneRenderer(build_scene(track, lens, colors, 0), WIDTH, HEIGHT)
+        plain = SceneRenderer(build_scene(track, large, colors, 0), 4 * WIDTH, 4 * HEIGHT)
+        exact = SceneRenderer(build_scene(track, large, colors, 4, boxes), 4 * WIDTH, 4 * HEIGHT)
+        for some in (grey, colors):
+            pictures(lens, scenery, poses, some)
+        pictures(lens, scenery, poses, grey, grey_boxes), fast.take(poses[0])
         many = np.tile(poses, (20, 1))
         for _ in range(ROUNDS):
             rates["ours"].append(per_second(len(many), pictures, lens, scenery, many, grey))
             rates["rgb"].append(per_second(len(many), pictures, lens, scenery, many, colors))
+            rates["boxes"].append(per_second(len(many), pictures, lens, scenery, many, grey, grey_boxes))
             rates["mujoco"].append(per_second(len(poses), fast.take_all, poses))
             times.append(rates["ours"][-1] / rates["mujoco"][-1])
         rates["mujoco 640x480"].append(per_second(len(poses), plain.take_all, poses))
         theirs = exact.take_all(poses).reshape(-1, HEIGHT, 4, WIDTH, 4, 3).mean(axis=(2, 4))
-        ours = np.moveaxis(pictures(lens, scenery, poses, colors), 1, -1)
+        ours = np.moveaxis(pictures(lens, scenery, poses, colors, boxes), 1, -1)
         differences[name] = float(np.abs(theirs - ours).mean())
         for renderer in (fast, plain, exact):
             renderer.close()
@@ -124,6 +144,7 @@ def compare_with_mujoco(count: int) -> dict[str, Any]:
     return {
         "images_per_s": middle["ours"],
         "rgb_images_per_s": middle["rgb"],
+        "boxes_images_per_s": middle["boxes"],
         "mujoco_images_per_s": middle["mujoco"],
         "mujoco_640x480_images_per_s": middle["mujoco 640x480"],
         "times": float(np.median(times)),

@@ -16,10 +16,10 @@ from scipy.ndimage import distance_transform_edt
 from deepracer_exp.env.pictures import GREY, floor_colors
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.camera import Lens
-from deepracer_exp.sim.scenery import MATERIALS, Scenery
+from deepracer_exp.sim.scenery import MATERIALS, Scenery, build_scenery
 from deepracer_exp.tracks.track import Track, world_track
 
-from .camera import pictures, scenery_of
+from .camera import pictures
 
 TRACK = "reinvent_base"
 SHARES = np.eye(len(MATERIALS), dtype=np.float32) * 255
@@ -45,7 +45,7 @@ def explain_frames(folder: Path, lens: Lens) -> dict[str, Any]:
         raise BadInput(f"--frames {folder}: no *.png there; accepted: a folder of pictures, 160x120")
     frames = np.stack([np.asarray(Image.open(file).convert("RGB"), np.float32) @ GREY for file in files])
     track = world_track(TRACK)
-    scenery = scenery_of(track)
+    scenery = build_scenery(track)
     colors = floor_colors(track.floor) @ GREY
     fitted, held_out = frames[::2], frames[1::2]
     for _ in range(TURNS):

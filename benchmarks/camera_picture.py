@@ -16,10 +16,10 @@ from deepracer_exp.env.setup import build_setup
 
 OUTPUT = Path(__file__).parents[1] / "docs" / "images" / "camera.png"
 TRACKS = (
-    "reinvent_base",
-    "Oval_track",
-    "Spain_track",
     "2022_summit_speedway",
+    "reinvent_base",
+    "Spain_track",
+    "Oval_track",
     "reinvent_wood",
     "reinvent_carpet",
     "Bowtie_track",
@@ -35,7 +35,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     output = parser.parse_args().output
-    tracks = look(f"track=[{','.join(TRACKS)}]")
+    # The first car is a little before the start line.
+    tracks = look(f"track=[{','.join(TRACKS)}]", "episode.start_offset=0.965")
     episodes = look("randomization=sim2real")
     rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], episodes[:4], episodes[4:])]
     width = rows[0].shape[1]
@@ -43,10 +44,10 @@ def main() -> None:
     print(f"{output}: {width} pixels wide, {output.stat().st_size / 1e3:.0f} kB")
 
 
-def look(override: str) -> NDArray[np.uint8]:
+def look(*overrides: str) -> NDArray[np.uint8]:
     """Return what eight cars see after a few steps, (8, height, width, 3)."""
     setup = build_setup(
-        compose_experiment(["observation=camera", "observation.camera.color=rgb", override])[0]
+        compose_experiment(["observation=camera", "observation.camera.color=rgb", *overrides])[0]
     )
     race = Race(setup, len(TRACKS))
     race.reset()

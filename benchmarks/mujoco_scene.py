@@ -1,40 +1,54 @@
 """The scenery of a track for MuJoCo's renderer, built from the track's polygons: what our camera is compared with."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import mujoco
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from shapely.affinity import affine_transform
 from shapely.geometry.base import BaseGeometry
 
-from deepracer_exp.sim.camera import Lens
+from deepracer_exp.sim.camera import FACE_LIGHT, Lens
 from deepracer_exp.sim.scenery import (
-    DASH_LENGTH_M,
-    DASH_PITCH_M,
     DASH_WIDTH_M,
+    KERB_GAP_M,
+    KERB_LENGTH_M,
+    KERB_WIDTH_M,
     LINE_WIDTH_M,
     MATERIALS,
-    WALL_HEIGHT_M,
+    START_AHEAD_M,
+    START_CHECKS,
+    START_LENGTH_M,
+    START_WIDTH_M,
+    paved_area,
+    wall_ring,
 )
 from deepracer_exp.tracks.track import Track
 
 _UNSEEN_M = 1e-3
 """Thickness of what is flat; dashes lie half of it above the road."""
+_HIDDEN_M = 1e-4
+"""By which a box stands out of those of its other faces' colours."""
 
 
 def build_scene(
-    track: Track, lens: Lens, colors: NDArray[np.float32], samples: int, walls_beyond_m: float
+    track: Track,
+    lens: Lens,
+    colors: NDArray[np.float32],
+    samples: int,
+    boxes: NDArray[np.float32] | None = None,
 ) -> mujoco.MjModel:
     """Return a model with a body `car` to be moved and its camera `eye`; nothing is lit, all surfaces glow.
 
     Args:
-        track: its road, borders and centre line.
+        track: with walls.
         lens: of the camera.
         colors: of `scenery.MATERIALS`, 0 to 255, (materials, 3).
         samples: of a pixel, for anti-aliasing; 0: one.
-        walls_beyond_m: as in `scenery.build_scenery`.
+        boxes: as in `camera.take_pictures`, in red, green and blue, (boxes, 9).
     """
     spec = mujoco.MjSpec()
     spec.visual.quality.offsamples, spec.visual.quality.shadowsize = samples, 0
@@ -51,24 +65,45 @@ def build_scene(
     spec.add_texture(
         name="sky", type=kind, builtin=flat, rgb1=color["sky"], rgb2=color["sky"], width=8, height=48
     )
-    lines = shapely.union_all(
-        [shapely.LineString(line).buffer(LINE_WIDTH_M) for line in (track.inner, track.outer)]
-    )
-    _add_area(spec, "road", track.road.difference(lines), 0.0)
-    _add_area(spec, "line", track.road.intersection(lines), 0.0)
-    center = shapely.LineString(track.waypoints)
-    starts = np.arange(0, center.length - DASH_LENGTH_M, DASH_PITCH_M)
-    a, b = (shapely.line_interpolate_point(center, starts + more) for more in (0.0, DASH_LENGTH_M))
-    ends = np.stack([shapely.get_coordinates(a), shapely.get_coordinates(b)], axis=1)
-    dashes = shapely.buffer(shapely.linestrings(ends), 0.5 * DASH_WIDTH_M, cap_style="flat")
+    plain = track.road
+    if track.floor.lines_inside:
+        lines = [shapely.LineString(line).buffer(LINE_WIDTH_M) for line in (track.inner, track.outer)]
+        plain = track.road.difference(shapely.union_all(lines))
+    _add_area(spec, "road", plain, 0.0)
+    _add_area(spec, "line", paved_area(track).difference(plain), 0.0)
+    dashes = _dashes(track.waypoints, DASH_WIDTH_M, track.floor.dash_length_m, track.floor.dash_gap_m)
+    if track.floor.start_line_color is not None:
+        light, dark = _start_line(track)
+        dashes = dashes[~shapely.intersects(dashes, light.union(dark))]
+        _add_area(spec, "line", light.intersection(plain), 0.5 * _UNSEEN_M, "start_light")
+        _add_area(spec, "start", dark.intersection(plain), 0.5 * _UNSEEN_M)
     _add_area(spec, "dash", shapely.multipolygons(dashes), 0.5 * _UNSEEN_M)
-    low, high = np.array(track.road.bounds).reshape(2, 2) + np.array([[-walls_beyond_m], [walls_beyond_m]])
-    (x, y), (half_x, half_y) = 0.5 * (low + high), 0.5 * (high - low)
-    thick, tall = 0.01, 0.5 * WALL_HEIGHT_M
+    if track.floor.kerb_color is not None:
+        rings = shapely.get_rings(shapely.orient_polygons(paved_area(track, KERB_WIDTH_M / 2)))
+        kerbs = [
+            _dashes(shapely.get_coordinates(ring), KERB_WIDTH_M, KERB_LENGTH_M, KERB_GAP_M) for ring in rings
+        ]
+        _add_area(spec, "kerb", shapely.multipolygons(np.concatenate(kerbs)), 0.5 * _UNSEEN_M)
+    ring = wall_ring(track)
+    assert ring is not None
+    (x, y), (half_x, half_y) = 0.5 * (ring.min(0) + ring.max(0)), 0.5 * np.ptp(ring, axis=0)
+    thick, tall = 0.01, 0.5 * track.floor.walls_height_m
     _add_box(spec, "field", (x, y, -_UNSEEN_M - thick), (half_x, half_y, thick))
-    for side in (-1, 1):
-        _add_box(spec, "wall_x", (x + side * (half_x + thick), y, tall), (thick, half_y, tall))
-        _add_box(spec, "wall_y", (x, y + side * (half_y + thick), tall), (half_x, thick, tall))
+    for a, b in pairwise(ring):
+        (x, y), length = b - a, float(np.linalg.norm(b - a))
+        outwards = np.array([y, -x]) / length
+        wall = "wall_y" if y == 0 and not track.floor.walls_follow_road else "wall_x"
+        middle = 0.5 * (a + b) + thick * outwards
+        _add_box(spec, wall, (*middle, tall), (0.5 * length, thick, tall), np.arctan2(y, x))
+    standing = [] if boxes is None else [box for box in boxes.astype(float) if box[5] > 0]
+    for index, box in enumerate(standing):
+        # For the top, for front and back, and for the sides.
+        for out, share in zip((2, 0, 1), FACE_LIGHT, strict=True):
+            half = 0.5 * box[3:6] - _HIDDEN_M * (np.arange(3) != out)
+            name = f"box_{index}_{out}"
+            rgba = [*(share * box[6:] / 255), 1]
+            spec.add_material(name=name, rgba=rgba, emission=1.0, specular=0.0, reflectance=0.0)
+            _add_box(spec, name, (box[0], box[1], 0.5 * box[5]), half, box[2])
     cos, sin = np.cos(lens.pitch_rad), np.sin(lens.pitch_rad)
     spec.worldbody.add_body(name="car", mocap=True).add_camera(
         name="eye",
@@ -110,7 +145,35 @@ class SceneRenderer:
         self._renderer.close()
 
 
-def _add_area(spec: mujoco.MjSpec, material: str, area: BaseGeometry, z_m: float) -> None:
+def _dashes(
+    center: NDArray[np.float64], width_m: float, length_m: float, gap_m: float
+) -> NDArray[np.object_]:
+    line = shapely.LineString(center)
+    starts = np.arange(0, line.length - length_m, length_m + gap_m)
+    a, b = (shapely.line_interpolate_point(line, starts + more) for more in (0.0, length_m))
+    ends = np.stack([shapely.get_coordinates(a), shapely.get_coordinates(b)], axis=1)
+    dashes: NDArray[np.object_] = shapely.buffer(shapely.linestrings(ends), 0.5 * width_m, cap_style="flat")
+    return dashes
+
+
+def _start_line(track: Track) -> tuple[BaseGeometry, BaseGeometry]:
+    """Return the light and the dark fields of the start line."""
+    (ax, ay), (bx, by) = track.waypoints[:2]
+    cos, sin = np.array([bx - ax, by - ay]) / np.hypot(bx - ax, by - ay)
+    along, across = START_CHECKS
+    wide, long = START_WIDTH_M / across, START_LENGTH_M / along
+    fields: tuple[list[BaseGeometry], list[BaseGeometry]] = ([], [])
+    for i in range(along):
+        for j in range(across):
+            x, y = START_AHEAD_M + (i - 0.5 * along) * long, (j - 0.5 * across) * wide
+            turned = [cos, -sin, sin, cos, ax, ay]
+            fields[(i + j + 1) % 2].append(affine_transform(shapely.box(x, y, x + long, y + wide), turned))
+    return shapely.multipolygons(fields[0]), shapely.multipolygons(fields[1])
+
+
+def _add_area(
+    spec: mujoco.MjSpec, material: str, area: BaseGeometry, z_m: float, name: str | None = None
+) -> None:
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
     corners = np.stack([shapely.get_coordinates(shapely.orient_polygons(one))[:3] for one in triangles])
     points = np.column_stack([corners.reshape(-1, 2), np.full(3 * len(corners), z_m)])
@@ -118,11 +181,16 @@ def _add_area(spec: mujoco.MjSpec, material: str, area: BaseGeometry, z_m: float
     points = np.concatenate([points, points - [0, 0, _UNSEEN_M]])
     faces = np.arange(3 * len(corners), dtype=np.int32)
     shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    spec.add_mesh(name=material, uservert=points.ravel(), userface=faces, inertia=shell)
+    spec.add_mesh(name=name or material, uservert=points.ravel(), userface=faces, inertia=shell)
     mesh = mujoco.mjtGeom.mjGEOM_MESH
-    spec.worldbody.add_geom(type=mesh, meshname=material, material=material, contype=0, conaffinity=0)
+    spec.worldbody.add_geom(type=mesh, meshname=name or material, material=material, contype=0, conaffinity=0)
 
 
-def _add_box(spec: mujoco.MjSpec, material: str, pos: tuple[float, ...], size: tuple[float, ...]) -> None:
+def _add_box(
+    spec: mujoco.MjSpec, material: str, pos: Sequence[float], size: ArrayLike, yaw: float = 0.0
+) -> None:
     box = mujoco.mjtGeom.mjGEOM_BOX
-    spec.worldbody.add_geom(type=box, pos=pos, size=size, material=material, contype=0, conaffinity=0)
+    quat = [np.cos(0.5 * yaw), 0, 0, np.sin(0.5 * yaw)]
+    spec.worldbody.add_geom(
+        type=box, pos=pos, size=size, quat=quat, material=material, contype=0, conaffinity=0
+    )

@@ -184,6 +184,8 @@ OffsetRange = Annotated[tuple[Offset, ...], _TWO, _ORDERED]
 DeviationRange = Annotated[tuple[Deviation, ...], _TWO, _ORDERED]
 
 
+Objects = Annotated[int, Field(ge=0, le=50)]
+ObjectRange = Annotated[tuple[Objects, ...], _TWO, _ORDERED]
 Height = Annotated[float, Field(ge=-0.1, le=0.5, allow_inf_nan=False)]
 HeightRange = Annotated[tuple[Height, ...], _TWO, _ORDERED]
 
@@ -212,6 +214,10 @@ class PictureRandomizationConfig:
     """Added to the pitch of the camera, downwards."""
     field_of_view_scale: ScaleRange
     """Factor on the tangent of half the field of view."""
+    dirt: ShareRange = (0.0, 0.0)
+    """How much darker spots of dirt on the lens are at their middle."""
+    objects: ObjectRange = (0, 0)
+    """How many boxes stand beside the road; whole numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)

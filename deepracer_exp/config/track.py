@@ -9,6 +9,8 @@ from .bounds import Finite, Positive
 
 Point = tuple[Finite, Finite]
 Color = Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")]
+# Each dash is drawn.
+DashLength = Annotated[float, Field(ge=0.01, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,12 +22,23 @@ class FloorConfig:
     road_color: Color
     ground_color: Color
     line_color: Color
+    lines_inside: bool = True
+    """Whether the edge lines lie inside the road's border, as in most worlds, or beyond it."""
     dash_color: Color = "#e38b05"
     """Of the centre line."""
+    dash_length_m: DashLength = 0.0508
+    dash_gap_m: DashLength = 0.0508
+    start_line_color: Color | None = None
+    """Of the dark fields of the start line, whose light ones have that of the edge lines; None: there is none."""
+    kerb_color: Color | None = None
+    """Of kerbs beyond the edge lines, which are striped with the lines' colour; None: there are none."""
     wall_color: Color = "#244651"
     sky_color: Color = "#272727"
     walls_beyond_m: Positive | None = 0.91
     """Distance of the walls around the field from the road's extreme coordinates; None: there are no walls."""
+    walls_height_m: Positive = 1.0
+    walls_follow_road: bool = False
+    """Whether the walls stand at that distance around the road's convex hull, as barriers do, or in a rectangle."""
 
 
 @dataclass(frozen=True, kw_only=True)

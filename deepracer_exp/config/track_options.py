@@ -30,19 +30,40 @@ PLACE = "several_tracks"
 BASE = "reinvent_base"
 """The option with the default values of all others."""
 
-# Textures of the service's worlds (deepracer-simapp, `bundle/meshes`): those of 2018 have colours of their own, and
-# only those of 2018 and 2019 have walls.
+# Meshes and textures of the service's worlds (deepracer-simapp, `bundle/meshes`), the first pattern that matches; those
+# of 2018 have colours of their own. Walls of 9.14 m (30 ft) and 0.76 m beyond the road are of the generated worlds; of
+# worlds whose meshes are in many files we know less.
 _OF_2018 = re.compile(r"reinvent_")
-_OF_2019 = re.compile(
-    r"reInvent2019|AWS_track|Bowtie|Canada|China|H_track|London|Mexico|New_York|Oval|Straight|Tokyo|Vegas|Virtual_May19"
-)
-_LATER_FLOOR = {
+_LATER_FLOOR: dict[str, Any] = {
     "road_color": "#403f3d",
     "ground_color": "#7e8541",
     "line_color": "#dfdfdf",
     "dash_color": "#e18f00",
     "sky_color": "#b2b2b2",
-    "walls_beyond_m": 0.76,
+    "walls_beyond_m": None,
+}
+_START_LINE: dict[str, Any] = {"start_line_color": "#3f3e3d"}
+_FLOORS: dict[str, dict[str, Any]] = {
+    # The barrier is open towards the pits, where ours is closed.
+    "Spain_track": {
+        "lines_inside": False,
+        "dash_length_m": 0.076,
+        "dash_gap_m": 0.055,
+        "kerb_color": "#880c0c",
+        "wall_color": "#312529",
+        "walls_beyond_m": 0.82,
+        "walls_height_m": 0.19,
+        "walls_follow_road": True,
+    },
+    r"AWS_track|Bowtie|Oval|Straight|Virtual_May19": {"walls_beyond_m": 0.76, "lines_inside": False},
+    r"reInvent2019_(track|wide|wide_mirrored)$|Canada|China|H_track|London|Mexico|New_York|Tokyo|Vegas": {
+        "walls_beyond_m": 0.76
+    },
+    r"2022_reinvent_champ|2022_(april|may|june|july|august|september|october)_(open|pro)$": _START_LINE,
+    r"20.*(cw|mini)$|.*_c?cw$": _START_LINE | {"walls_beyond_m": 0.76},
+    r"LGSWide": {"walls_beyond_m": 9.14},
+    r"20|A[lmr]|Belille|FS_|arctic|dubai|hamption|jyllands|morgan|penbay|red_star|thunder": _START_LINE
+    | {"walls_beyond_m": 9.14},
 }
 
 
@@ -69,9 +90,8 @@ def world_values(option: str) -> dict[str, Any] | None:
         return None
     values: dict[str, Any] = {"name": world.name, "title": world.title}
     if not _OF_2018.match(world.name):
-        values["floor"] = dict(_LATER_FLOOR)
-        if not _OF_2019.match(world.name):
-            values["floor"]["walls_beyond_m"] = None
+        known = (floor for pattern, floor in _FLOORS.items() if re.match(pattern, world.name))
+        values["floor"] = _LATER_FLOOR | next(known, {})
     return values
 
 

@@ -1,23 +1,33 @@
-"""Pictures that differ from episode to episode: light, colours, sharpness, noise, and where the camera sits."""
+"""Pictures that differ from episode to episode: light, colours, sharpness, noise, the camera and what stands around."""
 
 from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
+import shapely
 from numba import njit
 from numpy.typing import NDArray
 
 from deepracer_exp.config.driving import PictureRandomizationConfig
-from deepracer_exp.sim.scenery import MATERIALS
+from deepracer_exp.sim.scenery import MATERIALS, paved_area, wall_ring
+from deepracer_exp.tracks.track import Track
 
 from .randomization import CarStreams, Ids, Purpose
 
 QUANTITIES = tuple(field.name for field in fields(PictureRandomizationConfig))
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
 _OFF = np.array([1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES])
+_FIRST_QUANTITIES, _FIRST_MATERIALS = 10, 8
+"""What came later is drawn after all else, so that it changes no draw of runs that do without."""
 _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""
+_DIRT_SPOTS, _DIRT_SIZE = 4, (0.015, 0.06)
+"""Of dirt: their number, and standard deviation as a share of the picture's width."""
+_OBJECT_LOW_M, _OBJECT_HIGH_M = np.array([0.1, 0.1, 0.1]), np.array([0.6, 0.6, 0.9])
+"""Length, width and height of objects: not higher than walls."""
+_PLACES, _CLEARANCE_M, _BESIDE_M = 256, 0.05, 1.6
+"""Of objects: places per track, distance from road and walls at least, from the border at most."""
 _NOISE_NUMBERS = 2**18
 """Standard normal numbers that all pictures take their noise from: drawing each would take longer than the picture."""
 _NEXT_PICTURE = 7919
@@ -32,7 +42,12 @@ class PictureRandomization:
     What an episode draws depends only on the seed, the car's number and the episode's number.
     """
 
-    def __init__(self, configs: Sequence[PictureRandomizationConfig | None], cars: Sequence[int]) -> None:
+    def __init__(
+        self,
+        configs: Sequence[PictureRandomizationConfig | None],
+        cars: Sequence[int],
+        tracks: Sequence[Track],
+    ) -> None:
         """Take each car's ranges and its number over all processes; call `seed` and then `begin` next."""
         none = np.stack([_OFF, _OFF], axis=1)
         ranges = np.array(
@@ -48,26 +63,56 @@ class PictureRandomization:
         # Depth (negative: a shadow), and middle and size as shares of the width.
         self._spot = np.zeros((n_cars, 4))
         self._noise_at = np.zeros(n_cars, np.int64)
+        # Middle and size as shares of the width (or height).
+        self._dirt = np.zeros((n_cars, _DIRT_SPOTS, 3))
+        most = int(ranges[:, _COLUMN["objects"], 1].max())
+        self._span[:, _COLUMN["objects"]] += 1  # 0, 1 and 2 objects are equally probable
+        self._places = [_places(track) for track in tracks] if most else []
+        self._boxes = np.zeros((n_cars, most, 9), np.float32)
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS).astype(np.float32)
 
     def seed(self, seed: int) -> None:
         """Start all streams from `seed`."""
         self._streams = CarStreams(seed, self._cars, Purpose.PICTURE)
 
-    def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
-        """Draw for new episodes of the cars `ids`; episodes are numbered per car from 0."""
-        for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True):
+    def begin(self, ids: Ids, episodes: NDArray[np.int64], course: NDArray[np.intp]) -> None:
+        """Draw for new episodes of the cars `ids` on tracks `course`; episodes are numbered per car from 0."""
+        draws = np.empty(len(QUANTITIES))
+        normal = np.empty(self._color_factor.shape[1:])
+        for car, episode, track in zip(ids.tolist(), episodes.tolist(), course.tolist(), strict=True):
             stream = self._streams.at(car, episode)
-            values = self._low[car] + self._span[car] * stream.random(len(QUANTITIES))
-            self._values[car] = values
-            factor = 1.0 + values[_COLUMN["color_noise"]] * stream.standard_normal(
-                self._color_factor.shape[1:]
-            )
-            self._color_factor[car] = factor
+            stream.random(out=draws[:_FIRST_QUANTITIES])
+            stream.standard_normal(out=normal[:_FIRST_MATERIALS])
             sign, x, y, size = stream.random(4)
+            self._noise_at[car] = stream.integers(_NOISE_NUMBERS)
+            stream.random(out=draws[_FIRST_QUANTITIES:])
+            stream.standard_normal(out=normal[_FIRST_MATERIALS:])
+            values = self._low[car] + self._span[car] * draws
+            self._values[car] = values
+            self._color_factor[car] = 1.0 + values[_COLUMN["color_noise"]] * normal
             depth = values[_COLUMN["light"]] * (1.0 if sign < 0.5 else -1.0)
             self._spot[car] = depth, x, y, _SPOT_SIZE[0] + (_SPOT_SIZE[1] - _SPOT_SIZE[0]) * size
-            self._noise_at[car] = stream.integers(_NOISE_NUMBERS)
+            self._dirt[car] = stream.random((_DIRT_SPOTS, 3))
+            self._dirt[car, :, 2] = _DIRT_SIZE[0] + (_DIRT_SIZE[1] - _DIRT_SIZE[0]) * self._dirt[car, :, 2]
+            if len(self._boxes[car]):
+                objects = stream.random((int(values[_COLUMN["objects"]]), 8))
+                self._place_objects(car, objects, self._places[track])
+
+    def _place_objects(self, car: int, objects: Floats, places: Floats) -> None:
+        """Set the car's boxes from uniform draws (n, 8); those that would stand in others are left out."""
+        boxes = self._boxes[car]
+        boxes[:] = 0
+        taken = np.empty((0, 3))
+        for row, draw in zip(boxes, objects if len(places) else (), strict=False):
+            x, y, free_m = places[int(draw[0] * len(places))]
+            length, width, height = _OBJECT_LOW_M + (_OBJECT_HIGH_M - _OBJECT_LOW_M) * draw[1:4]
+            radius = 0.5 * np.hypot(length, width)
+            fit = min(1.0, free_m / radius)
+            radius *= fit
+            if (np.hypot(taken[:, 0] - x, taken[:, 1] - y) > taken[:, 2] + radius).all():
+                taken = np.concatenate([taken, [[x, y, radius]]])
+                row[:6] = x, y, 2 * np.pi * draw[4], fit * length, fit * width, height
+        boxes[: len(objects), 6:] = self._exposed(np.array([car]), 255 * objects[None, :, 5:])[0]
 
     def mounts(self, ids: Ids, mount: Floats) -> Floats:
         """Return the mounts (n, 5) of cameras that `camera.Lens.mount` describes, (5,)."""
@@ -79,20 +124,68 @@ class PictureRandomization:
 
     def colors(self, ids: Ids, colors: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the colours that cars see, given those of their tracks, (n, materials, 3), 0 to 255."""
-        seen = np.clip(colors * self._color_factor[ids], 0, 255)
-        seen = 255 * (seen / 255) ** self._of("gamma_scale", ids)[:, None, None]
+        return self._exposed(ids, np.clip(colors * self._color_factor[ids], 0, 255))
+
+    def _exposed(self, ids: Ids, colors: Floats) -> NDArray[np.float32]:
+        seen = 255 * (colors / 255) ** self._of("gamma_scale", ids)[:, None, None]
         seen = (seen - _MIDDLE) * self._of("contrast_scale", ids)[:, None, None] + _MIDDLE
         seen = np.clip(seen * self._of("brightness_scale", ids)[:, None, None], 0, 255)
         return seen.astype(np.float32)
 
+    def boxes(self, ids: Ids) -> NDArray[np.float32] | None:
+        """Return the boxes beside the road, in red, green and blue, (n, most, 9); see `camera.take_pictures`."""
+        return self._boxes[ids] if self._boxes.size else None
+
     def disturb(self, ids: Ids, pictures: NDArray[np.uint8], steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Add light, blur and noise to pictures (n, channels, height, width), taken `steps` after the start, (n,)."""
+        """Add dirt, light, blur and noise to pictures (n, channels, height, width).
+
+        Those of `steps` control steps after the start of the episode, (n,). Dirt is written into them.
+        """
+        dirt = self._of("dirt", ids)
+        if dirt.any():
+            _soil(pictures, self._dirt[ids], dirt)
         noise_at = (self._noise_at[ids] + _NEXT_PICTURE * steps) % _NOISE_NUMBERS
         blur, noise = self._of("blur", ids), 255 * self._of("pixel_noise", ids)
         return _disturb(pictures, self._spot[ids], blur, noise, self._noise, noise_at)
 
     def _of(self, name: str, ids: Ids) -> Floats:
         return self._values[ids, _COLUMN[name]]
+
+
+def _places(track: Track) -> Floats:
+    """Return places beside the road and how far each is from the road and the walls, (n, 3), metres."""
+    generator = np.random.default_rng(0)
+    pose = track.start_pose((np.arange(_PLACES) + generator.random(_PLACES)) / _PLACES)
+    side = generator.choice([-1.0, 1.0], _PLACES)
+    side *= 0.5 * track.width_max_m + generator.uniform(0, _BESIDE_M, _PLACES)
+    x, y = pose.x - side * np.sin(pose.yaw_rad), pose.y + side * np.cos(pose.yaw_rad)
+    points = shapely.points(x, y)
+    free_m = shapely.distance(paved_area(track), points)
+    ring = wall_ring(track)
+    if ring is not None:
+        beyond = ~shapely.contains(shapely.Polygon(ring), points)
+        free_m = np.minimum(free_m, np.where(beyond, 0.0, shapely.distance(shapely.LineString(ring), points)))
+    places = np.column_stack([x, y, free_m - _CLEARANCE_M])
+    return places[places[:, 2] > 0.5 * np.hypot(*_OBJECT_LOW_M[:2])]
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _soil(pictures, spots, depths):  # type: ignore[no-untyped-def]
+    """Darken spots of the pictures."""
+    count, channels, height, width = pictures.shape
+    for at in range(count):
+        for x, y, size in spots[at] if depths[at] > 0 else spots[at, :0]:
+            middle_x, middle_y, size_px = x * width, y * height, size * width
+            for row in range(max(int(middle_y - 3 * size_px), 0), min(int(middle_y + 3 * size_px), height)):
+                down = (row + 0.5 - middle_y) / size_px
+                for column in range(
+                    max(int(middle_x - 3 * size_px), 0), min(int(middle_x + 3 * size_px), width)
+                ):
+                    across = (column + 0.5 - middle_x) / size_px
+                    left = 1.0 - depths[at] * np.exp(-0.5 * (down * down + across * across))
+                    for channel in range(channels):
+                        value = pictures[at, channel, row, column] * left + 0.5
+                        pictures[at, channel, row, column] = np.uint8(value)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)

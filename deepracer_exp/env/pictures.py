@@ -20,8 +20,6 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
 _WALL_Y_LIGHT = 0.3
 """Brightness of the walls along the x axis relative to the others, in recorded frames (`benchmarks.camera`)."""
-_FAR_DASHES = 0.5
-"""Share of dashes in the centre line."""
 
 Pixels = NDArray[np.uint8]
 
@@ -51,7 +49,7 @@ class Pictures:
             cars: their numbers over all processes.
         """
         self._varied = (
-            PictureRandomization(randomizations, cars)
+            PictureRandomization(randomizations, cars, tracks)
             if any(one is not None for one in randomizations)
             else None
         )
@@ -71,14 +69,7 @@ class Pictures:
             for side_m in sides_m
         ]
         self._tilt_rad_per_mps2 = np.radians(car.tilt_deg_per_mps2)
-        self._scenery = join_sceneries(
-            [
-                build_scenery(
-                    track.waypoints, (track.inner, track.outer), track.road, track.floor.walls_beyond_m
-                )
-                for track in tracks
-            ]
-        )
+        self._scenery = join_sceneries([build_scenery(track) for track in tracks])
         self._floor_colors = np.stack([floor_colors(track.floor) for track in tracks])
         self._grey = config.color == "grey"
 
@@ -87,10 +78,10 @@ class Pictures:
         if self._varied is not None:
             self._varied.seed(seed)
 
-    def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
-        """Draw what pictures differ in for new episodes of the cars `ids`."""
+    def begin(self, ids: Ids, episodes: NDArray[np.int64], course: NDArray[np.intp]) -> None:
+        """Draw what pictures differ in for new episodes of the cars `ids` on tracks `course`, (n,)."""
         if self._varied is not None:
-            self._varied.begin(ids, episodes)
+            self._varied.begin(ids, episodes, course)
 
     def first(self, ids: Ids, state: CarState, course: NDArray[np.intp]) -> Pixels:
         """Return the observations of the cars `ids`, which stand, (n, *shape): as if they had always stood there.
@@ -140,32 +131,43 @@ class Pictures:
         ahead, left = self._tilt_rad_per_mps2 * acceleration_mps2.T
         poses = np.stack([state.x_m, state.y_m, state.yaw_rad, -ahead, left], axis=1)
         varied = self._varied
-        colors = self._floor_colors[course]
+        colors, boxes = self._floor_colors[course], None
         if varied is not None:
-            colors = varied.colors(ids, colors)
+            colors, boxes = varied.colors(ids, colors), varied.boxes(ids)
         if self._grey:
             colors = (colors @ GREY)[..., None]
+            if boxes is not None:
+                boxes = np.concatenate([boxes[..., :6], (boxes[..., 6:] @ GREY)[..., None]], axis=-1)
         shots = []
         for lens in self._lenses:
             out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)
             mounts = None if varied is None else varied.mounts(ids, lens.mount)
-            shots.append(take_pictures(lens, self._scenery, poses, course, colors, out, mounts))
+            shots.append(take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes))
         now = shots[0] if len(shots) == 1 else np.concatenate(shots, axis=1)
         return now if varied is None else varied.disturb(ids, now, steps)
 
 
 def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:
     """Return red, green and blue of MATERIALS, 0 to 255, (materials, 3)."""
-    road, dash, wall = _rgb(floor.road_color), _rgb(floor.dash_color), _rgb(floor.wall_color)
+    road, line, wall = _rgb(floor.road_color), _rgb(floor.line_color), _rgb(floor.wall_color)
+    dash, kerb, start = (
+        _rgb(color or floor.line_color)
+        for color in (floor.dash_color, floor.kerb_color, floor.start_line_color)
+    )
+    dashes = floor.dash_length_m / (floor.dash_length_m + floor.dash_gap_m)
     colors = {
         "sky": _rgb(floor.sky_color),
         "field": _rgb(floor.ground_color),
         "road": road,
-        "line": _rgb(floor.line_color),
+        "line": line,
         "dash": dash,
-        "far_dash": road + _FAR_DASHES * (dash - road),
+        "far_dash": road + dashes * (dash - road),
         "wall_x": wall,
         "wall_y": _WALL_Y_LIGHT * wall,
+        "kerb": kerb,
+        "far_kerb": 0.5 * (kerb + line),
+        "start": start,
+        "far_start": 0.5 * (start + line),
     }
     return np.array([colors[material] for material in MATERIALS], np.float32)
 

@@ -160,7 +160,7 @@ class Race:
         """Draw what differs from episode to episode."""
         self.randomization.begin(ids, self.rules.episode[ids])
         if self._pictures is not None:
-            self._pictures.begin(ids, self.rules.episode[ids])
+            self._pictures.begin(ids, self.rules.episode[ids], self.rules.course[ids])
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
         """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn again.
@@ -241,7 +241,7 @@ class Race:
         self.randomization.load_state_dict(state["randomization"])
         if self._pictures is not None:
             self._pictures.seed(state["randomization"]["seed"])
-            self._pictures.begin(self._everyone, self.rules.episode)
+            self._pictures.begin(self._everyone, self.rules.episode, self.rules.course)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
         # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics

@@ -3,7 +3,8 @@
 Straight edges of the scenery are straight in the picture. Where an edge crosses a column, the colour below differs from
 the one above by a known amount: the sum of these changes from the top of the column down is the picture. A change
 within a pixel counts by the area below the edge, so that each pixel is the mean of what it sees (as glyph rasterisers
-do, R. Levien, "Inside the fastest font renderer in the world", 2016).
+do, R. Levien, "Inside the fastest font renderer in the world", 2016). Boxes are drawn over it, the farthest first: the
+visible faces of one are added up in the same way, with the share that they cover as one more channel.
 """
 
 from dataclasses import dataclass
@@ -12,10 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from .scenery import Scenery
+from .scenery import Scenery, box_corners
 
 NEAREST_M = 0.02
 """Nothing nearer to the picture's plane is seen (deepracer-simapp, `bundle/models/camera/model.sdf`)."""
+
+FACE_LIGHT = (1.0, 0.85, 0.7)
+"""Brightness of a box's top, of its front and back, and of its sides, relative to its colour."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +56,7 @@ def take_pictures(
     colors: NDArray[np.float32],
     out: NDArray[np.uint8],
     mounts: NDArray[np.float64] | None = None,
+    boxes: NDArray[np.float32] | None = None,
 ) -> NDArray[np.uint8]:
     """Take a picture of each of N cars.
 
@@ -64,6 +69,9 @@ def take_pictures(
         colors: of each car's `scenery.MATERIALS`, 0 to 255, (N, materials, channels).
         out: (N, channels, height, width), written and returned.
         mounts: of each car's camera, (N, 5), see `Lens.mount`; None: the lens's own for all.
+        boxes: that stand on the floor around each car, between the walls and apart from each other: x, y, yaw, length,
+            width and height in metres and radians, and the colour in each channel, (N, boxes, 6 + channels); one of
+            height 0 is none.
     """
     if mounts is None:
         mounts = np.tile(lens.mount, (len(out), 1))
@@ -78,6 +86,14 @@ def take_pictures(
         mounts,
         out,
     )
+    if boxes is not None:
+        _take_boxes(
+            np.ascontiguousarray(poses, np.float64),
+            boxes.astype(np.float64),
+            box_corners(boxes.astype(np.float64)),
+            mounts,
+            out,
+        )
     return out
 
 
@@ -94,27 +110,15 @@ def _take(  # type: ignore[no-untyped-def]
     rotation = np.empty((3, 3))
     middle_x, middle_y = 0.5 * width, 0.5 * height
     for car in range(cars):
-        mount_x, mount_y, mount_z, tilt, focal = mounts[car]
-        cos, sin = np.cos(tilt), np.sin(tilt)
+        focal = mounts[car, 4]
         # Of the planes through the picture's left and right edges: normal's share along the axis and across.
         side_axis = middle_x / np.hypot(middle_x, focal)
         side_across = focal / np.hypot(middle_x, focal)
-        _rotation(poses[car, 2], poses[car, 3], poses[car, 4], rotation)
-        eye_x = poses[car, 0] + rotation[0, 0] * mount_x + rotation[0, 1] * mount_y + rotation[0, 2] * mount_z
-        eye_y = poses[car, 1] + rotation[1, 0] * mount_x + rotation[1, 1] * mount_y + rotation[1, 2] * mount_z
-        eye_z = rotation[2, 0] * mount_x + rotation[2, 1] * mount_y + rotation[2, 2] * mount_z
-        # The picture's axis, its right and its bottom, in the world.
-        axis_x, axis_y, axis_z = (
-            rotation[0, 0] * cos - rotation[0, 2] * sin,
-            rotation[1, 0] * cos - rotation[1, 2] * sin,
-            rotation[2, 0] * cos - rotation[2, 2] * sin,
-        )
-        down_x, down_y, down_z = (
-            -rotation[0, 0] * sin - rotation[0, 2] * cos,
-            -rotation[1, 0] * sin - rotation[1, 2] * cos,
-            -rotation[2, 0] * sin - rotation[2, 2] * cos,
-        )
-        right_x, right_y, right_z = -rotation[0, 1], -rotation[1, 1], -rotation[2, 1]
+        eye, axis, sideways, downwards = _camera(poses[car], mounts[car], rotation)
+        eye_x, eye_y, eye_z = eye
+        axis_x, axis_y, axis_z = axis
+        right_x, right_y, right_z = sideways
+        down_x, down_y, down_z = downwards
         track = track_index[car]
         for index in range(first_piece[track], first_piece[track + 1]):
             piece = pieces[index]
@@ -167,6 +171,157 @@ def _take(  # type: ignore[no-untyped-def]
                         min(max(running[column], np.float32(0)), np.float32(255))
                     )
             changes[channel, height * width :] = 0
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _take_boxes(poses, boxes, corners, mounts, out):  # type: ignore[no-untyped-def]
+    """Draw each car's boxes over its picture."""
+    cars, channels, height, width = out.shape
+    count = boxes.shape[1]
+    changes = np.zeros((channels + 1, (height + 3) * width), np.float32)
+    running = np.empty((channels + 1, width), np.float32)
+    change = np.empty(channels + 1, np.float32)  # the last: share covered
+    rotation = np.empty((3, 3))
+    # Of the corners, those on the floor first: depth, right and down from the eye.
+    seen = np.empty((count, 8, 3))
+    columns, distance = np.empty((count, 2)), np.empty(count)
+    left = np.empty(count, np.int64)
+    face, polygon = np.empty(4, np.int64), np.empty((5, 2))
+    middle_x, middle_y = 0.5 * width, 0.5 * height
+    for car in range(cars):
+        focal = mounts[car, 4]
+        eye, axis, right, down = _camera(poses[car], mounts[car], rotation)
+        # What is in the picture, the farthest first.
+        n_left = 0
+        for box in range(count):
+            top = boxes[car, box, 5]
+            if top <= 0.0:
+                continue
+            beyond_left = beyond_right = behind = 0
+            columns[box] = np.inf, -np.inf
+            for corner in range(8):
+                x = corners[car, box, corner % 4, 0] - eye[0]
+                y = corners[car, box, corner % 4, 1] - eye[1]
+                z = (top if corner >= 4 else 0.0) - eye[2]
+                depth = x * axis[0] + y * axis[1] + z * axis[2]
+                across = x * right[0] + y * right[1] + z * right[2]
+                seen[box, corner] = depth, across, x * down[0] + y * down[1] + z * down[2]
+                beyond_left += focal * across < -middle_x * depth
+                beyond_right += focal * across > middle_x * depth
+                behind += depth <= NEAREST_M
+                at = middle_x + focal * across / max(depth, NEAREST_M)
+                columns[box, 0], columns[box, 1] = min(columns[box, 0], at), max(columns[box, 1], at)
+            if beyond_left == 8 or beyond_right == 8 or behind == 8:
+                continue
+            if behind:
+                columns[box] = 0.0, np.float64(width)
+            distance[box] = np.hypot(boxes[car, box, 0] - eye[0], boxes[car, box, 1] - eye[1])
+            place = n_left
+            while place > 0 and distance[left[place - 1]] < distance[box]:
+                left[place] = left[place - 1]
+                place -= 1
+            left[place] = box
+            n_left += 1
+        while n_left > 0:
+            # The first that hides none of the others; if each of them hides another, the farthest.
+            chosen = 0
+            for candidate in range(n_left):
+                box, hides = left[candidate], False
+                for place in range(n_left):
+                    other = left[place]
+                    if (
+                        other != box
+                        and columns[box, 0] < columns[other, 1]
+                        and columns[other, 0] < columns[box, 1]
+                    ):
+                        nearer = distance[box] < distance[other]
+                        hides |= _may_hide(corners[car, box], corners[car, other], eye, nearer)
+                if not hides:
+                    chosen = candidate
+                    break
+            box = left[chosen]
+            n_left -= 1
+            left[chosen:n_left] = left[chosen + 1 : n_left + 1].copy()
+            first_column, last_column, first_row, last_row = width, 0, height, 0
+            for side in range(5):
+                if side == 4:
+                    face[:] = 7, 6, 5, 4
+                    visible, light = eye[2] > boxes[car, box, 5], FACE_LIGHT[0]
+                else:
+                    after = (side + 1) % 4
+                    face[:] = 4 + side, 4 + after, after, side
+                    visible = _outside(corners[car, box], side, eye[0], eye[1]) > 0.0
+                    light = FACE_LIGHT[1 if side % 2 else 2]
+                if not visible:
+                    continue
+                points = 0
+                for corner in range(4):
+                    now, was = seen[box, face[corner]], seen[box, face[corner - 1]]
+                    depth, x, y = now[0], now[1], now[2]
+                    was_depth, was_x, was_y = was[0], was[1], was[2]
+                    if (depth > NEAREST_M) != (was_depth > NEAREST_M):
+                        share = (NEAREST_M - was_depth) / (depth - was_depth)
+                        polygon[points, 0] = middle_x + (was_x + share * (x - was_x)) * focal / NEAREST_M
+                        polygon[points, 1] = middle_y + (was_y + share * (y - was_y)) * focal / NEAREST_M
+                        points += 1
+                    if depth > NEAREST_M:
+                        polygon[points, 0] = middle_x + x * focal / depth
+                        polygon[points, 1] = middle_y + y * focal / depth
+                        points += 1
+                for channel in range(channels):
+                    change[channel] = light * boxes[car, box, 6 + channel]
+                change[channels] = 1.0
+                for point in range(points):
+                    begin, end = polygon[(point or points) - 1], polygon[point]
+                    _add_edge(changes, height, width, begin[0], begin[1], end[0], end[1], change)
+                    first_column = min(first_column, int(max(end[0], 0.0)))
+                    last_column = max(last_column, int(min(end[0] + 1.0, width)))
+                    first_row = min(first_row, int(max(end[1], 0.0)))
+                    last_row = max(last_row, int(min(end[1] + 1.0, height)))
+            running[:] = 0
+            for row in range(first_row, last_row):
+                for column in range(first_column, last_column):
+                    at = row * width + column
+                    for channel in range(channels + 1):
+                        running[channel, column] += changes[channel, at]
+                    behind_it = 1 - min(max(running[channels, column], np.float32(0)), np.float32(1))
+                    for channel in range(channels):
+                        value = behind_it * out[car, channel, row, column] + running[channel, column]
+                        out[car, channel, row, column] = np.uint8(
+                            min(max(value + np.float32(0.5), np.float32(0)), np.float32(255))
+                        )
+            # Edges at a row or column change the next two as well.
+            for row in range(first_row, min(last_row, height) + 3):
+                changes[:, row * width + first_column : row * width + min(last_column + 1, width)] = 0
+
+
+@njit(cache=True)
+def _may_hide(corners, others, eye, nearer):  # type: ignore[no-untyped-def]
+    """Return whether a box may hide a part of another, given their corners on the floor.
+
+    If the line of a side parts them, only the one on the side of the eye can hide the other. `nearer` is the answer for
+    boxes that stand in each other.
+    """
+    apart = False
+    for side in range(4):
+        least = min([_outside(corners, side, others[k, 0], others[k, 1]) for k in range(4)])
+        if least >= 0.0:
+            if _outside(corners, side, eye[0], eye[1]) > 0.0:
+                return False
+            apart = True
+        least = min([_outside(others, side, corners[k, 0], corners[k, 1]) for k in range(4)])
+        if least >= 0.0:
+            if _outside(others, side, eye[0], eye[1]) <= 0.0:
+                return False
+            apart = True
+    return apart or nearer
+
+
+@njit(cache=True, inline="always")
+def _outside(corners, side, x, y):  # type: ignore[no-untyped-def]
+    """Return how far a point is beyond the line of a side, times the side's length."""
+    begin, end = corners[side], corners[(side + 1) % 4]
+    return (end[1] - begin[1]) * (x - begin[0]) - (end[0] - begin[0]) * (y - begin[1])
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
@@ -258,6 +413,28 @@ def _add_steep(changes, width, ax, ay, bx, by, x_per_row, sign, change):  # type
                 step = np.float32(sign * wide) * change[channel]
                 changes[channel, at] += np.float32(below) * step
                 changes[channel, at + np.uint64(width)] += np.float32(1.0 - below) * step
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
+def _camera(pose, mount, rotation):  # type: ignore[no-untyped-def]
+    """Return the eye, and the picture's axis, right and bottom, in the world; `rotation` is overwritten."""
+    mount_x, mount_y, mount_z, tilt, _ = mount
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    _rotation(pose[2], pose[3], pose[4], rotation)
+    eye_x = pose[0] + rotation[0, 0] * mount_x + rotation[0, 1] * mount_y + rotation[0, 2] * mount_z
+    eye_y = pose[1] + rotation[1, 0] * mount_x + rotation[1, 1] * mount_y + rotation[1, 2] * mount_z
+    eye_z = rotation[2, 0] * mount_x + rotation[2, 1] * mount_y + rotation[2, 2] * mount_z
+    axis = (
+        rotation[0, 0] * cos - rotation[0, 2] * sin,
+        rotation[1, 0] * cos - rotation[1, 2] * sin,
+        rotation[2, 0] * cos - rotation[2, 2] * sin,
+    )
+    down = (
+        -rotation[0, 0] * sin - rotation[0, 2] * cos,
+        -rotation[1, 0] * sin - rotation[1, 2] * cos,
+        -rotation[2, 0] * sin - rotation[2, 2] * cos,
+    )
+    return (eye_x, eye_y, eye_z), axis, (-rotation[0, 1], -rotation[1, 1], -rotation[2, 1]), down
 
 
 @njit(cache=True)

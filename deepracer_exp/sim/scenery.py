@@ -1,11 +1,11 @@
-"""What there is to see around a track: outlines of its road, lines and walls.
+"""What there is to see around a track: outlines of its road, lines and walls, and boxes that stand on the floor.
 
 Sizes are those of the service's worlds (deepracer-simapp, `bundle/meshes`).
 """
 
 import math
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -13,18 +13,40 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from deepracer_exp.tracks.track import Track
+
 LINE_WIDTH_M = 0.0762
-"""Of the edge lines, which lie inside the road: its border is their outer edge."""
-DASH_WIDTH_M, DASH_LENGTH_M, DASH_PITCH_M = 0.0254, 0.0508, 0.1016
+"""Of the edge lines; where they lie inside the road, its border is their outer edge."""
+DASH_WIDTH_M = 0.0254
 """Of the centre line."""
-WALL_HEIGHT_M = 1.0
+KERB_WIDTH_M, KERB_LENGTH_M, KERB_GAP_M = 0.0762, 0.185, 0.185
+"""Of the coloured parts of kerbs, which lie beyond edge lines; the gaps are white as the lines."""
+START_AHEAD_M, START_LENGTH_M, START_WIDTH_M = 0.13, 0.0733, 0.914
+"""Of the start line: distance of its middle from the first waypoint, and size along and across the road."""
+START_CHECKS = (2, 8)
+"""Light and dark fields of the start line, along and across the road."""
 FIELD_M = 20.0
 """Of field around a track without walls."""
 
-MATERIALS = ("sky", "field", "road", "line", "dash", "far_dash", "wall_x", "wall_y")
-"""What has a colour of its own: `far_dash` is that of the centre line where dashes run together, `wall_x` that of the
-walls that face along the x axis."""
-SKY, FIELD, ROAD, LINE, DASH, FAR_DASH, WALL_X, WALL_Y = range(len(MATERIALS))
+MATERIALS = (
+    "sky",
+    "field",
+    "road",
+    "line",
+    "dash",
+    "far_dash",
+    "wall_x",
+    "wall_y",
+    "kerb",
+    "far_kerb",
+    "start",
+    "far_start",
+)
+"""What has a colour of its own: `far_dash` is that of the centre line where dashes run together, and so on; `wall_x` is
+that of the walls that face along the x axis, `start` that of the start line's dark fields."""
+SKY, FIELD, ROAD, LINE, DASH, FAR_DASH, WALL_X, WALL_Y, KERB, FAR_KERB, START, FAR_START = range(
+    len(MATERIALS)
+)
 
 DASHES_UNTIL_M = 2.0
 """Distance from which dashes run together: a row of the picture sees more than one of them."""
@@ -64,48 +86,87 @@ class Scenery(NamedTuple):
     first_piece: NDArray[np.int64]
 
 
-def build_scenery(
-    center: NDArray[np.float64],
-    borders: Sequence[NDArray[np.float64]],
-    road: BaseGeometry,
-    walls_beyond_m: float | None,
-) -> Scenery:
-    """Build the outlines of a track.
-
-    Args:
-        center: centre line in driving order, (n, 2), metres.
-        borders: the lines along which the edge lines run, (n, 2) each.
-        road: the road's area.
-        walls_beyond_m: distance of the walls from the road's extreme coordinates; None: there are no walls.
-    """
-    lines = shapely.union_all([shapely.LineString(line).buffer(LINE_WIDTH_M) for line in borders])
-    low_x, low_y, high_x, high_y = road.bounds
-    beyond = FIELD_M if walls_beyond_m is None else walls_beyond_m
-    field = shapely.box(low_x - beyond, low_y - beyond, high_x + beyond, high_y + beyond)
+def build_scenery(track: Track) -> Scenery:
+    """Build the outlines of a track."""
+    floor, road = track.floor, track.road
     drawing = _Drawing()
-    (ring,) = _rings(field)
-    if walls_beyond_m is None:
-        drawing.add([ring], FIELD, SKY)
+    ring = wall_ring(track)
+    if ring is None:
+        low_x, low_y, high_x, high_y = road.bounds
+        (field,) = _rings(shapely.box(low_x - FIELD_M, low_y - FIELD_M, high_x + FIELD_M, high_y + FIELD_M))
+        drawing.add([field], FIELD, SKY)
     else:
         for (ax, ay), (bx, by) in pairwise(ring):
-            wall = WALL_X if ax == bx else WALL_Y
-            z = WALL_HEIGHT_M
+            wall = WALL_Y if ay == by and not floor.walls_follow_road else WALL_X
+            z = floor.walls_height_m
             # Counter-clockwise in the picture of a camera between the walls.
             drawing.add([np.array([[ax, ay, 0], [ax, ay, z], [bx, by, z], [bx, by, 0]])], wall, SKY)
             drawing.add([np.array([[bx, by, 0], [ax, ay, 0]])], wall, FIELD)
-    for area, inside, outside in ((road, LINE, FIELD), (road.difference(lines), ROAD, LINE)):
+    plain = road
+    if floor.lines_inside:
+        borders = [shapely.LineString(line).buffer(LINE_WIDTH_M) for line in (track.inner, track.outer)]
+        plain = road.difference(shapely.union_all(borders))
+    for area, inside, outside in ((paved_area(track), LINE, FIELD), (plain, ROAD, LINE)):
         for ring in _rings(area):
             for first in range(0, len(ring) - 1, _PIECE_LINES):
                 some = ring[first : first + _PIECE_LINES + 1]
                 drawing.add([some], inside, outside, far_m=CURVES_UNTIL_M)
                 coarse = shapely.get_coordinates(shapely.LineString(some).simplify(COARSE_M))
                 drawing.add([coarse], inside, outside, near_m=CURVES_UNTIL_M)
-    dashes = list(_dashes(center))
-    for first in range(0, len(dashes), _PIECE_LINES):
-        few = dashes[first : first + _PIECE_LINES]
-        drawing.add(few, DASH, ROAD, far_m=DASHES_UNTIL_M)
-        drawing.add([_strip(few)], FAR_DASH, ROAD, near_m=DASHES_UNTIL_M)
+    dashes = list(_dashes(track.waypoints, DASH_WIDTH_M, floor.dash_length_m, floor.dash_gap_m))
+    runs = [dashes]
+    if floor.start_line_color is not None:
+        start, dark = _start_line(track, plain)
+        drawing.add(list(_rings(start)), LINE, ROAD, far_m=CURVES_UNTIL_M)
+        drawing.add(list(_rings(dark)), START, LINE, far_m=CURVES_UNTIL_M)
+        drawing.add(list(_rings(start)), FAR_START, ROAD, near_m=CURVES_UNTIL_M)
+        seen = groupby(dashes, lambda dash: not start.intersects(shapely.Polygon(dash)))
+        runs = [list(run) for visible, run in seen if visible]
+    for run in runs:
+        drawing.add_dashes(run, DASH, FAR_DASH, ROAD)
+    if floor.kerb_color is not None:
+        for ring in _rings(paved_area(track, KERB_WIDTH_M / 2)):
+            stripes = list(_dashes(ring, KERB_WIDTH_M, KERB_LENGTH_M, KERB_GAP_M))
+            drawing.add_dashes(stripes, KERB, FAR_KERB, LINE)
     return drawing.finish()
+
+
+def wall_ring(track: Track) -> NDArray[np.float64] | None:
+    """Return the foot of the walls around a track, counter-clockwise and closed, (n, 2); None: there are none."""
+    beyond = track.floor.walls_beyond_m
+    if beyond is None:
+        return None
+    low_x, low_y, high_x, high_y = track.road.bounds
+    # Convex either way: no wall hides anything but what lies beyond the walls.
+    around = (
+        track.road.convex_hull.buffer(beyond).simplify(0.02)
+        if track.floor.walls_follow_road
+        else shapely.box(low_x - beyond, low_y - beyond, high_x + beyond, high_y + beyond)
+    )
+    (ring,) = _rings(around)
+    return ring
+
+
+def paved_area(track: Track, kerb_m: float = KERB_WIDTH_M) -> BaseGeometry:
+    """Return the road with what lines and kerbs lie outside its border, these up to the width `kerb_m`."""
+    if track.floor.lines_inside and track.floor.kerb_color is None:
+        return track.road
+    beyond = 0.0 if track.floor.lines_inside else LINE_WIDTH_M
+    return track.road.buffer(beyond + (kerb_m if track.floor.kerb_color is not None else 0.0))
+
+
+def box_corners(boxes: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return where boxes stand, counter-clockwise corners (..., 4, 2).
+
+    Args:
+        boxes: x, y, yaw, length, width, ..., as `camera.take_pictures` has them, (..., 5 or more).
+    """
+    cos, sin = np.cos(boxes[..., 2, None]), np.sin(boxes[..., 2, None])
+    along = 0.5 * boxes[..., 3, None] * np.array([-1, 1, 1, -1])
+    across = 0.5 * boxes[..., 4, None] * np.array([-1, -1, 1, 1])
+    x = boxes[..., 0, None] + along * cos - across * sin
+    y = boxes[..., 1, None] + along * sin + across * cos
+    return np.stack([x, y], axis=-1)
 
 
 def join_sceneries(sceneries: Sequence[Scenery]) -> Scenery:
@@ -144,6 +205,8 @@ class _Drawing:
         far_m: float = math.inf,
     ) -> None:
         """Add a piece of connected points, (n, 2) on the floor or (n, 3) each."""
+        if not outlines:  # of a road that is narrower than its lines
+            return
         first = self._count
         for points in outlines:
             points = points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
@@ -154,6 +217,13 @@ class _Drawing:
         middle = 0.5 * (all_points.min(axis=0) + all_points.max(axis=0))
         radius = np.linalg.norm(all_points - middle, axis=1).max()
         self._pieces.append((first, self._count, inside, outside, middle, radius, near_m, far_m))
+
+    def add_dashes(self, dashes: Sequence[NDArray[np.float64]], dash: int, far: int, under: int) -> None:
+        """Add consecutive dashes, which run together from `DASHES_UNTIL_M` on."""
+        for first in range(0, len(dashes), _PIECE_LINES):
+            few = dashes[first : first + _PIECE_LINES]
+            self.add(few, dash, under, far_m=DASHES_UNTIL_M)
+            self.add([_strip(few)], far, under, near_m=DASHES_UNTIL_M)
 
     def finish(self) -> Scenery:
         return Scenery(
@@ -172,18 +242,40 @@ def _rings(area: BaseGeometry) -> Iterator[NDArray[np.float64]]:
                 yield shapely.get_coordinates(ring)
 
 
-def _dashes(center: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Yield the dashes' outlines, counter-clockwise, (5, 2)."""
+def _dashes(
+    center: NDArray[np.float64], width_m: float, length_m: float, gap_m: float
+) -> Iterator[NDArray[np.float64]]:
+    """Yield the outlines of a line's dashes, counter-clockwise, (5, 2)."""
     line = shapely.LineString(center)
-    for start in np.arange(0, line.length - DASH_LENGTH_M, DASH_PITCH_M):
+    for start in np.arange(0, line.length - length_m, length_m + gap_m):
         (ax, ay), (bx, by) = shapely.get_coordinates(
-            shapely.line_interpolate_point(line, [start, start + DASH_LENGTH_M])
+            shapely.line_interpolate_point(line, [start, start + length_m])
         )
         length = math.hypot(bx - ax, by - ay)
-        x, y = -0.5 * DASH_WIDTH_M * (by - ay) / length, 0.5 * DASH_WIDTH_M * (bx - ax) / length
+        x, y = -0.5 * width_m * (by - ay) / length, 0.5 * width_m * (bx - ax) / length
         yield np.array(
             [[ax - x, ay - y], [bx - x, by - y], [bx + x, by + y], [ax + x, ay + y], [ax - x, ay - y]]
         )
+
+
+def _start_line(track: Track, road: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
+    """Return the area of the start line and of its dark fields, as far as they lie on `road`."""
+    center = track.waypoints[::-1] if track.reversed else track.waypoints
+    ahead = (center[1] - center[0]) / np.linalg.norm(center[1] - center[0])
+    left = np.array([-ahead[1], ahead[0]])
+    along, across = START_CHECKS
+    size = np.array([START_LENGTH_M / along, START_WIDTH_M / across])
+    low = np.array([START_AHEAD_M - 0.5 * START_LENGTH_M, -0.5 * START_WIDTH_M])
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
+    def area(place: Sequence[float], size: NDArray[np.float64]) -> shapely.Polygon:
+        return shapely.Polygon(center[0] + (low + (place + corners) * size) @ [ahead, left])
+
+    dark = [area((i, j), size) for i in range(along) for j in range(i % 2, across, 2)]
+    return (
+        area((0, 0), size * START_CHECKS).intersection(road),
+        shapely.multipolygons(dark).intersection(road),
+    )
 
 
 def _strip(dashes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

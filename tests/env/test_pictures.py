@@ -1,6 +1,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import shapely
 from torchrl.envs.utils import check_env_specs
 
 import deepracer_exp.env.gym_env  # noqa: F401 - registers DeepRacer-v0
@@ -8,7 +9,7 @@ from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.env.pictures import GREY, floor_colors
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.sim.scenery import MATERIALS
+from deepracer_exp.sim.scenery import MATERIALS, box_corners, paved_area, wall_ring
 
 SMALL = "observation=camera_small"
 AHEAD = np.array([7])
@@ -165,6 +166,8 @@ def test_a_cars_pictures_depend_on_its_number_and_not_on_the_batch(race_of):
         ("blur", 0.0, 1.0, lambda a, b: np.abs(np.diff(b)).max() < 0.8 * np.abs(np.diff(a)).max()),
         ("pixel_noise", 0.0, 0.1, lambda a, b: 15 < (b - a)[20:].std() < 30),
         ("light", 0.0, 0.9, lambda a, b: np.abs(b - a).max() > 20),
+        ("dirt", 0.0, 1.0, lambda a, b: (b <= a).all() and (a - b).max() > 20),
+        ("objects", 0, 40, lambda a, b: np.abs(b - a).mean() > 1),
         ("color_noise", 0.0, 0.9, lambda a, b: np.abs(b - a).max() > 20),
         # A higher camera that looks down further, and a wider lens, see the wall's foot in another row.
         ("height_m", 0.0, 0.1, lambda a, b: np.abs(b - a).mean() > 3),
@@ -175,7 +178,8 @@ def test_a_cars_pictures_depend_on_its_number_and_not_on_the_batch(race_of):
 def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
     """Pictures at the start, with only this one at its lowest and highest value."""
     off = "{brightness_scale: [1,1], contrast_scale: [1,1], gamma_scale: [1,1], color_noise: [0,0], light: [0,0], "
-    off += "blur: [0,0], pixel_noise: [0,0], height_m: [0,0], pitch_deg: [0,0], field_of_view_scale: [1,1]}"
+    off += "blur: [0,0], pixel_noise: [0,0], height_m: [0,0], pitch_deg: [0,0], field_of_view_scale: [1,1], "
+    off += "dirt: [0,0], objects: [0,0]}"
     pictures = []
     for value in (low, high):
         on = f"randomization.pictures.{quantity}=[{value},{value}]"
@@ -183,6 +187,27 @@ def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
             race_of(SMALL, f"randomization.pictures={off}".replace(": ", ":"), on).pixels[0, 0].astype(float)
         )
     assert law(*pictures)
+
+
+@pytest.mark.parametrize("track", ["reinvent_base", "Spain_track", "2022_summit_speedway_cw"])
+def test_objects_stand_beside_the_road_between_the_walls_and_apart(race_of, track):
+    race = race_of(*VARIED, f"track={track}", "randomization.pictures.objects=[9,9]", n_cars=8)
+    boxes = race._pictures._varied.boxes(np.arange(8))
+    course = race.setup.track
+    walls = shapely.Polygon(wall_ring(course))
+    for car in boxes:
+        standing = car[car[:, 5] > 0]
+        areas = shapely.polygons(box_corners(standing.astype(float)))
+        assert len(areas) > 2
+        assert (shapely.distance(areas, paved_area(course)) > 0.04).all()
+        assert (shapely.distance(areas, walls.exterior) > 0.04).all()
+        assert shapely.contains(walls, areas).all()
+        assert len(shapely.STRtree(areas).query(areas, "intersects")[0]) == len(areas)
+    assert len(np.unique(boxes[:, :, 0])) > 20
+    race.reset(np.array([1]))
+    again = race._pictures._varied.boxes(np.arange(8))
+    assert not np.array_equal(again[1], boxes[1])
+    assert np.array_equal(again[[0, 2]], boxes[[0, 2]])
 
 
 def horizon(picture: np.ndarray) -> float:

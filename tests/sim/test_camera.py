@@ -1,6 +1,7 @@
 """The camera against rays followed one by one, which know of nothing but geometry."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,32 +9,41 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepracer_exp.sim.camera import Lens, take_pictures
+from deepracer_exp.sim.camera import FACE_LIGHT, Lens, take_pictures
 from deepracer_exp.sim.scenery import (
     CURVES_UNTIL_M,
-    DASH_LENGTH_M,
-    DASH_PITCH_M,
     DASH_WIDTH_M,
     DASHES_UNTIL_M,
     LINE_WIDTH_M,
     MATERIALS,
-    WALL_HEIGHT_M,
+    START_AHEAD_M,
+    START_CHECKS,
+    START_LENGTH_M,
+    START_WIDTH_M,
     build_scenery,
     join_sceneries,
+    paved_area,
+    wall_ring,
 )
-from deepracer_exp.tracks.track import Track, world_track
+from deepracer_exp.tracks.track import PLAIN_FLOOR, Track, world_track
 
-WALLS_M = 0.91
 SHARES = 255 * np.eye(len(MATERIALS), dtype=np.float32)
 LENS = Lens(
     width=40, height=30, field_of_view_rad=1.13, x_m=0.1453, y_m=0.0, z_m=0.1303, pitch_rad=math.radians(15)
 )
 TRACKS = ("reinvent_base", "Spain_track", "Straight_track")
-SCENERIES = {
-    name: build_scenery(track.waypoints, (track.inner, track.outer), track.road, WALLS_M)
-    for name in TRACKS
-    for track in [world_track(name)]
-}
+SCENERIES = {name: build_scenery(world_track(name)) for name in TRACKS}
+RACEWAY = replace(
+    PLAIN_FLOOR,
+    lines_inside=False,
+    dash_length_m=0.076,
+    dash_gap_m=0.055,
+    kerb_color="#880c0c",
+    start_line_color="#3f3e3d",
+    walls_beyond_m=0.82,
+    walls_height_m=0.19,
+    walls_follow_road=True,
+)
 
 
 def shares(name: str, poses: np.ndarray, lens: Lens = LENS) -> np.ndarray:
@@ -75,18 +85,22 @@ def rays(lens: Lens, pose: np.ndarray, per_pixel: int) -> tuple[np.ndarray, np.n
 def followed(track: Track, pose: np.ndarray, lens: Lens, per_pixel: int) -> np.ndarray:
     """Return the share of each material in each pixel by following rays, (materials, height, width)."""
     eye, ahead = rays(lens, pose, per_pixel)
-    low_x, low_y, high_x, high_y = track.road.bounds
+    ring = wall_ring(track)
+    sides = np.diff(ring, axis=0)
+    outwards = np.column_stack([sides[:, 1], -sides[:, 0]])
     with np.errstate(divide="ignore", invalid="ignore"):
         floor = np.where(ahead[..., 2] < 0, -eye[2] / ahead[..., 2], np.inf)
-        to_x = (np.where(ahead[..., 0] > 0, high_x + WALLS_M, low_x - WALLS_M) - eye[0]) / ahead[..., 0]
-        to_y = (np.where(ahead[..., 1] > 0, high_y + WALLS_M, low_y - WALLS_M) - eye[1]) / ahead[..., 1]
-    wall = np.minimum(to_x, to_y)
-    seen = np.where(to_x < to_y, MATERIALS.index("wall_x"), MATERIALS.index("wall_y"))
-    seen[eye[2] + wall * ahead[..., 2] > WALL_HEIGHT_M] = MATERIALS.index("sky")
+        speed = ahead[..., :2] @ outwards.T
+        reached = np.where(speed > 0, ((ring[:-1] - eye[:2]) * outwards).sum(axis=1) / speed, np.inf)
+    wall = reached.min(axis=-1)
+    along_x = (sides[:, 1] == 0) & (not track.floor.walls_follow_road)
+    seen = np.where(along_x, MATERIALS.index("wall_y"), MATERIALS.index("wall_x"))[reached.argmin(axis=-1)]
+    seen[eye[2] + wall * ahead[..., 2] > track.floor.walls_height_m] = MATERIALS.index("sky")
     on_floor = floor < wall
     at = eye[:2] + floor[on_floor][:, None] * ahead[on_floor][:, :2]
     points = shapely.points(at)
     material = np.full(len(at), MATERIALS.index("field"))
+    material[shapely.contains(paved_area(track), points)] = MATERIALS.index("line")
     shapely.prepare(track.road)
     road = shapely.contains(track.road, points)
     material[road] = MATERIALS.index("road")
@@ -94,13 +108,24 @@ def followed(track: Track, pose: np.ndarray, lens: Lens, per_pixel: int) -> np.n
         [shapely.LineString(line).buffer(LINE_WIDTH_M) for line in (track.inner, track.outer)]
     )
     shapely.prepare(lines)
-    material[road & shapely.contains(lines, points)] = MATERIALS.index("line")
+    if track.floor.lines_inside:
+        material[road & shapely.contains(lines, points)] = MATERIALS.index("line")
     center = shapely.LineString(track.waypoints)
     beside = road & (shapely.distance(center, points) < 0.5 * DASH_WIDTH_M)
     near = np.linalg.norm(at - eye[:2], axis=1) < DASHES_UNTIL_M
-    phase = shapely.line_locate_point(center, points) % DASH_PITCH_M
-    material[beside & (phase < DASH_LENGTH_M) & near] = MATERIALS.index("dash")
+    length_m = track.floor.dash_length_m
+    phase = shapely.line_locate_point(center, points) % (length_m + track.floor.dash_gap_m)
+    material[beside & (phase < length_m) & near] = MATERIALS.index("dash")
     material[beside & ~near] = MATERIALS.index("far_dash")
+    if track.floor.start_line_color is not None:
+        pose = track.start_pose(np.zeros(1))
+        x, y = (at - track.waypoints[0]).T
+        cos, sin = np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)
+        i = (x * cos + y * sin - START_AHEAD_M) / START_LENGTH_M + 0.5
+        j = (y * cos - x * sin) / START_WIDTH_M + 0.5
+        on_start = road & (i > 0) & (i < 1) & (j > 0) & (j < 1)
+        dark = (np.floor(i * START_CHECKS[0]) + np.floor(j * START_CHECKS[1])) % 2 == 0
+        material[on_start] = np.where(dark, MATERIALS.index("start"), MATERIALS.index("line"))[on_start]
     seen[on_floor] = material
     counted = np.stack([seen == index for index in range(len(MATERIALS))]).astype(float)
     shape = (len(MATERIALS), lens.height, per_pixel, lens.width, per_pixel)
@@ -169,7 +194,11 @@ def test_cars_are_drawn_as_if_each_were_alone():
 def test_the_horizon_is_where_the_pitch_puts_it():
     """Camera 15 degrees down, 160x120: the horizon of the service's camera is 26.1 rows from the top."""
     lens = Lens(**{**vars(LENS), "width": 160, "height": 120})
-    scenery = build_scenery(*_endless())
+    x = np.linspace(0, 30, 31)
+    rows = np.column_stack([x, 0 * x, x, 0 * x + 0.5, x, 0 * x - 0.5])
+    scenery = build_scenery(
+        Track.from_route(rows, "endless", floor=replace(PLAIN_FLOOR, walls_beyond_m=None))
+    )
     pose = np.array([[0.0, 0.0, 0.0, 0.0, 0.0]])
     colors = np.broadcast_to(SHARES, (1, *SHARES.shape))
     out = take_pictures(
@@ -180,11 +209,110 @@ def test_the_horizon_is_where_the_pitch_puts_it():
     assert np.abs(sky_rows - 26.1).max() < 1.2
 
 
-def _endless() -> tuple:
-    x = np.linspace(0, 30, 31)
-    center, left, right = (np.column_stack([x, np.full(31, y)]) for y in (0.0, 0.5, -0.5))
-    return center, (left, right), shapely.Polygon(np.concatenate([left, right[::-1]])), None
-
-
 def test_curves_lose_points_only_where_pixels_are_large():
     assert CURVES_UNTIL_M > DASHES_UNTIL_M
+
+
+@pytest.mark.parametrize(("ndist", "angle"), [(0.985, 0.0), (0.3, 0.4)])
+def test_a_raceway_has_lines_outside_its_border_kerbs_a_start_line_and_a_barrier(ndist, angle):
+    track = replace(world_track("Spain_track"), floor=RACEWAY)
+    pose = pose_on(track, ndist, 0.1, (angle, 0.0, 0.0))
+    out = np.empty((1, len(MATERIALS), LENS.height, LENS.width), np.uint8)
+    take_pictures(LENS, build_scenery(track), pose, np.zeros(1, np.intp), SHARES[None], out)
+    ours, theirs = out[0] / 255.0, followed(track, pose[0], LENS, 12)
+    place = {name: index for index, name in enumerate(MATERIALS)}
+    # Stripes and dashes take their place from what they lie on, wherever they begin.
+    groups = [
+        ["road", "dash", "far_dash"],
+        ["line", "kerb", "far_kerb"],
+        ["start"],
+        ["field"],
+        ["wall_x"],
+        ["sky"],
+    ]
+    for group in groups:
+        error = np.abs((ours - theirs)[[place[name] for name in group]].sum(axis=0))
+        assert error.mean() < 0.002
+        assert np.quantile(error, 0.99) < 0.15
+    red = ours[place["kerb"]].sum() + 0.5 * ours[place["far_kerb"]].sum()
+    assert 0.1 < red / ours[[place["line"], place["kerb"], place["far_kerb"]]].sum() < 0.4
+    assert (theirs[place["start"]].sum() > 5) == (ndist > 0.9)
+
+
+# Ahead of a car at the start of reinvent_base, which drives along the x axis.
+EYE = pose_on(world_track("reinvent_base"), 0.1, 0.0, (0.0, 0.02, -0.03))
+
+
+def box(
+    ahead_m: float, left_m: float, turned: float, length: float, width: float, height: float, color: float
+):
+    x, y, yaw = EYE[0, :3]
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    at = (x + ahead_m * cos - left_m * sin, y + ahead_m * sin + left_m * cos)
+    return [*at, yaw + turned, length, width, height, color]
+
+
+def boxed(*boxes: list[float]) -> np.ndarray:
+    """Return the grey picture with boxes, (height, width)."""
+    colors = np.linspace(30, 220, len(MATERIALS), dtype=np.float32)[None, :, None]
+    out = np.empty((1, 1, LENS.height, LENS.width), np.uint8)
+    some = np.array([boxes], np.float32) if boxes else None
+    scenery = SCENERIES["reinvent_base"]
+    return take_pictures(LENS, scenery, EYE, np.zeros(1, np.intp), colors, out, boxes=some)[0, 0].astype(
+        float
+    )
+
+
+def met_boxes(boxes: np.ndarray, per_pixel: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share of each pixel that boxes cover, and their colours' part of it, by following rays."""
+    eye, ahead = rays(LENS, EYE[0], per_pixel)
+    nearest, grey = np.full(ahead.shape[:2], np.inf), np.zeros(ahead.shape[:2])
+    for x, y, yaw, length, width, height, color in boxes:
+        turn = np.array([[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+        begin, along = turn @ (eye - [x, y, 0.5 * height]), ahead @ turn.T
+        half = 0.5 * np.array([length, width, height])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            enter = (-np.sign(along) * half - begin) / along
+            leave = (np.sign(along) * half - begin) / along
+        first = enter.max(axis=-1)
+        met = (first < leave.min(axis=-1)) & (first > 0) & (first < nearest)
+        nearest[met] = first[met]
+        grey[met] = color * np.array(FACE_LIGHT)[[1, 2, 0]][enter.argmax(axis=-1)][met]
+    shape = (LENS.height, per_pixel, LENS.width, per_pixel)
+    return np.isfinite(nearest).reshape(shape).mean(axis=(1, 3)), grey.reshape(shape).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_boxes_cover_what_rays_meet_first(seed):
+    generator = np.random.default_rng(seed)
+    places = [(ahead, left) for ahead in (-0.2, 0.7, 1.6, 2.6) for left in (-0.7, 0.0, 0.7)]
+    boxes = np.array(
+        [
+            box(*place, *generator.uniform([-3, 0.05, 0.05, 0.02, 0], [3, 0.6, 0.6, 0.5, 255]))
+            for place in places
+            if place != (-0.2, 0.0)
+        ]
+    )
+    covered, grey = met_boxes(boxes, 16)
+    ours = boxed(*boxes)
+    expected = boxed() * (1 - covered) + grey
+    # Where the outlines of two boxes share a pixel, the nearer is taken to cover the same share of both.
+    assert np.abs(ours - expected).mean() < 0.4
+    assert np.quantile(np.abs(ours - expected), 0.99) < 6
+    # What is behind a box, be it a line, is not seen through it.
+    assert np.abs(ours - grey)[covered == 1].mean() < 1
+    assert np.array_equal(ours, boxed(*generator.permutation(boxes)))
+
+
+def test_a_nearer_box_hides_a_farther_one_even_if_its_middle_is_farther():
+    near, far = box(0.6, 0, 0.1, 0.05, 0.6, 0.5, 200), box(1.2, 0, 0.4, 0.2, 0.2, 0.2, 20)
+    assert np.array_equal(boxed(near, far), boxed(near))
+    # A long one along the road, whose middle is farther than the box behind it.
+    long, beside = box(2.5, 0.3, 0, 4.4, 0.05, 0.9, 200), box(1.4, 0.6, 0, 0.2, 0.2, 0.2, 20)
+    assert np.array_equal(boxed(beside, long), boxed(long))
+    assert not np.array_equal(boxed(beside), boxed())
+
+
+def test_a_box_behind_the_camera_or_of_no_height_changes_nothing():
+    assert np.array_equal(boxed(box(-0.5, 0, 0.3, 0.4, 0.4, 0.4, 255)), boxed())
+    assert np.array_equal(boxed(box(1, 0, 0.3, 0.4, 0.4, 0, 255)), boxed())
