@@ -1,8 +1,12 @@
-"""The moving picture at the head of the README: a film of a lap as an animated WebP.
+"""The moving picture at the head of the README, a film of a lap as an animated WebP, and the still of docs/camera.md.
 
 deepracer-exp train experiment=fast_lap name=season
 deepracer-exp evaluate best:season evaluation.held_out=null --video lap.mp4
 python -m benchmarks.lap_picture lap.mp4
+
+deepracer-exp train observation=camera_small name=eye
+deepracer-exp watch best:eye -o eye.mp4
+python -m benchmarks.lap_picture eye.mp4 --still 4.5 --output docs/images/watch.png
 """
 
 import argparse
@@ -18,9 +22,18 @@ WIDTH, FRAMES_PER_S, QUALITY = 720, 15, 55
 def main() -> None:
     """Write the picture and say how large it is."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("film", help="an .mp4 of `deepracer-exp evaluate --video`")
+    parser.add_argument("film", help="an .mp4 of `deepracer-exp evaluate --video` or `watch`")
     parser.add_argument("--output", type=Path, default=OUTPUT)
+    parser.add_argument(
+        "--still", type=float, metavar="S", help="write the frame at this second alone, a .png"
+    )
     args = parser.parse_args()
+    if args.still is not None:
+        reader = read_frames(args.film, input_params=["-ss", str(args.still)])
+        size = next(reader)["source_size"]
+        Image.frombytes("RGB", size, next(reader)).quantize(128).save(args.output, optimize=True)
+        print(f"{args.output}: {args.output.stat().st_size / 1e3:.0f} kB")
+        return
     frames = moving_picture(args.film, args.output)
     print(f"{args.output}: {frames} frames, {args.output.stat().st_size / 1e6:.2f} MB")
 

@@ -130,7 +130,7 @@ def test_every_command_shown_is_accepted(words, folder, monkeypatch):
             compose_experiment(overrides)
     elif words[0] == "validate":
         compose_experiment([word for word in args.overrides if not word.startswith("trial=")])
-    elif words[0] == "evaluate":
+    elif words[0] in ("evaluate", "watch"):
         compose_evaluation([*runs_and_overrides(args)[1], "run=RUN"])
     elif words[0] == "export":
         compose_export([*runs_and_overrides(args)[1], "run=RUN"])

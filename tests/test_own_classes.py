@@ -97,7 +97,7 @@ def test_a_run_stores_names_of_classes_and_no_code(run):
             assert b"class ResidualNet" not in file.read_bytes(), file
 
 
-@pytest.mark.parametrize("command", ["resume", "clone", "evaluate", "export"])
+@pytest.mark.parametrize("command", ["resume", "clone", "evaluate", "watch", "export"])
 def test_a_stored_run_imports_no_code_by_itself(run, command):
     extra = {"resume": ["budget.env_steps=8192"], "export": ["format=onnx"]}.get(command, [])
     ended = call_in(at_home(run), command, run.name, *extra)

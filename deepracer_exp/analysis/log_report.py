@@ -20,7 +20,7 @@ from .findings import Finding, findings
 from .log_tables import best_laps, candidate_rows, facts, headline, iteration_rows, problem_rows
 from .log_view import LogView, prepare
 from .next_steps import next_steps, outcome
-from .page import Plot, plot_of, render
+from .page import Glimpse, Plot, plot_of, render
 from .reward_comparison import RewardComparison
 
 MOST_FILES = 400
@@ -75,6 +75,8 @@ class LogPage:
     """The same driving, paid by another reward function."""
     terms: pd.DataFrame | None = None
     """What each term of the reward function contributed, as `contributed_terms` returns it."""
+    strip: Sequence[Glimpse] = ()
+    """What the best policy sees along a lap."""
 
 
 def write_report(recording: Recording, path: Path) -> Path:
@@ -135,6 +137,7 @@ def html(page: LogPage) -> str:
         replay=page.replay,
         candidates=candidate_rows(view),
         laps=best_laps(view),
+        strip=page.strip,
         sections=[(title, [plots[chart.name] for chart in some]) for title, some in sections.items()],
         captions={chart.name: chart.caption for some in sections.values() for chart in some},
         iterations=iteration_rows(view),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
-from deepracer_exp.runs.files import RunRecord, read_config
+from deepracer_exp.runs.files import RunRecord, read_config, sees_pictures
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, FIGURES, INTERRUPTED, read_result
 
 COMMAND = "deepracer-exp"
@@ -52,9 +52,12 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     steps = []
     if summary["iteration"]:
         evaluate = command_line("evaluate", word, config, OF_POLICY)
+        film = (f"{evaluate} --video lap.mp4", "film its fastest lap")
+        if sees_pictures(config):
+            film = (command_line("watch", word, config, OF_POLICY), "film what it sees, and where it looks")
         steps += [
             (evaluate, "race the best checkpoint"),
-            (f"{evaluate} --video lap.mp4", "film its fastest lap"),
+            film,
             (command_line("clone", word, config), "train it further, at a tenth of the learning rate"),
         ]
     if summary["status"] in (INTERRUPTED, FAILED):

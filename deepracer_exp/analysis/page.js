@@ -92,6 +92,13 @@
   desk.addEventListener("change", unfold);
   contents.addEventListener("click", (event) => { if (event.target.closest("a")) unfold(); });
 
+  // Of a page that is served while its contents change.
+  const version = document.querySelector("meta[name=version]")?.content;
+  if (version) setInterval(async () => {
+    const now = await fetch("version").then((answer) => answer.text(), () => version);
+    if (now !== version) location.reload();
+  }, 1000);
+
   document.querySelectorAll(".command").forEach((box) => {
     const button = document.createElement("button");
     button.textContent = "Copy";

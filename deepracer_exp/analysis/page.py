@@ -41,6 +41,22 @@ class Plot:
     """Its JSON, gzip in base64."""
 
 
+@dataclass(frozen=True)
+class Glimpse:
+    """What a policy saw in one step of a lap; both pictures as `png_uri` returns them."""
+
+    seen: str
+    looked: str
+    """The same picture under its saliency."""
+    where: str
+    decision: str
+
+
+def png_uri(png: bytes) -> str:
+    """Return the address of a picture that a page holds in itself."""
+    return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
+
+
 def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int = 0) -> Plot:
     """Pack a figure.
 
@@ -80,13 +96,16 @@ def packed(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode("ascii")
 
 
-def render(package: str, template: str, plots: Sequence[Plot], **values: Any) -> str:
+def render(package: str, template: str, plots: Sequence[Plot], is_live: bool = False, **values: Any) -> str:
     """Return a page that extends `page.html.j2`; all values are escaped, and it can load nothing.
+
+    A live page alone may ask its own server for `version`, and is loaded again when that has changed.
 
     Args:
         package: where the template is.
         template: its file; its sections are the macro `part`, which enters them into `contents`.
         plots: all figures of the page.
+        is_live: it is served, with its version in the block `version`.
         values: for the template.
     """
     environment = jinja2.Environment(
@@ -101,7 +120,7 @@ def render(package: str, template: str, plots: Sequence[Plot], **values: Any) ->
     environment.filters["themed"] = _themed
     script = (files(__package__) / "page.js").read_text(encoding="utf-8")
     return environment.get_template(template).render(
-        policy=_policy(script, get_plotlyjs()),
+        policy=_policy(script, get_plotlyjs()) + ("; connect-src 'self'" if is_live else ""),
         contents=[],
         plots=plots,
         dark=Markup(json.dumps(DARK)),  # our own colours

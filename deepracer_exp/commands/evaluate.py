@@ -1,4 +1,4 @@
-"""`deepracer-exp evaluate`, `checkpoints`, `stopping` and `analyze`: how good a run is, and how it went."""
+"""`deepracer-exp evaluate`, `watch`, `checkpoints`, `stopping` and `analyze`: how good a run is, and how it went."""
 
 import argparse
 import ctypes.util
@@ -28,6 +28,7 @@ from .startup import check_policy
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
+    from deepracer_exp.analysis.page import Glimpse
     from deepracer_exp.config.car import CarConfig
 
 _EVALUATE_EPILOG = """\
@@ -63,6 +64,27 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "--cfg", action="store_true", help="print the composed configuration as YAML and stop"
     )
+
+    parser = add_command(
+        commands,
+        "watch",
+        _watch,
+        help="film what a trained car sees, or watch a training",
+        description=(
+            "Race a run's best policy and film its best lap: what the car sees, where the policy looks, how likely "
+            "each action is, and the view from above. With --live, serve a page on 127.0.0.1 with the newest "
+            "evaluation laps of a training while it runs, until Ctrl-C."
+        ),
+        epilog=_WATCH_EPILOG,
+        runs_rewards=True,
+        entry="evaluate",
+    )
+    add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
+    parser.add_argument(
+        *("-o", "--output"), metavar="FILE", help="film to write (.mp4; default: films/ in the run's folder)"
+    )
+    parser.add_argument("--live", action="store_true", help="serve a page that follows the training")
+    parser.add_argument("--port", type=int, help="port of the page (default: a free one)")
 
     parser = add_command(
         commands,
@@ -109,6 +131,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     config, _ = compose_evaluation([*overrides, override_line("run", run)])
     args.debug = config.debug
     if args.video is not None:
+        _check_film("--video", Path(args.video))
         _choose_graphics()
     check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
 
@@ -123,6 +146,64 @@ def _evaluate(args: argparse.Namespace) -> int:
     return 0
 
 
+_WATCH_EPILOG = """\
+  deepracer-exp watch RUN                                   film the best lap of its best checkpoint
+  deepracer-exp watch RUN checkpoint=last -o last.mp4
+  deepracer-exp watch RUN evaluation.tracks=[Oval_track]    on another track
+  deepracer-exp watch RUN --live                            a page that follows the training
+
+The page shows the laps that the training evaluates its policy by; evaluation=NAME shows others.
+"""
+
+
+def _watch(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.compose import compose_evaluation
+    from deepracer_exp.config.overrides import group_of, override_line
+
+    run, overrides = run_and_overrides(args)
+    chosen = [given for given in overrides if given.startswith("checkpoint=")]
+    if args.live and (chosen or args.output is not None):
+        given = chosen[0] if chosen else f"--output {args.output}"
+        raise BadInput(
+            f"{given}: --live serves a page of the newest checkpoint; accepted: only without --live"
+        )
+    if args.port is not None and not args.live:
+        raise BadInput(f"--port {args.port}: accepted: only with --live")
+    if args.output is not None:
+        _check_film("--output", Path(args.output))
+    config, _ = compose_evaluation([*overrides, override_line("run", run)])
+    args.debug = config.debug
+    if not args.live:
+        check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+
+        from rich.console import Console
+
+        from deepracer_exp.evaluation.watch import film_run
+
+        file = None if args.output is None else Path(args.output)
+        with warnings_on_stderr():
+            film_run(config, file, Console(), Console(stderr=True))
+        return 0
+    from deepracer_exp.config.own_class import OF_POLICY
+    from deepracer_exp.config.parse import import_own_classes
+    from deepracer_exp.evaluation.live_server import LiveServer
+    from deepracer_exp.runs.resolve import resolve
+
+    # Its first checkpoint may be still to come.
+    stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
+    import_own_classes(stored.experiment, OF_POLICY)
+    own_trials = not any(group_of(given) == "evaluation" for given in overrides)
+
+    protocol = stored.experiment.evaluation if own_trials else config.evaluation
+    with LiveServer(args.port or 0) as server, warnings_on_stderr():
+        print(server.url, flush=True)
+
+        from deepracer_exp.evaluation.live import serve_live
+
+        serve_live(stored, protocol, server)
+    return 0
+
+
 _CHECKPOINTS_EPILOG = """\
   deepracer-exp checkpoints RUN                             the trials by which the training chose its best one
   deepracer-exp checkpoints RUN evaluation=summit evaluation.trials=40
@@ -131,6 +212,16 @@ _CHECKPOINTS_EPILOG = """\
 
 Every checkpoint drives the same trials, on the conditions of its training and on conditions it was not trained on.
 """
+
+
+def _check_film(flag: str, file: Path) -> None:
+    """Check where a film is to be written.
+
+    Raises:
+        BadInput: the file is not an .mp4, or its folder does not exist.
+    """
+    if file.suffix != ".mp4" or not file.absolute().parent.is_dir():
+        raise BadInput(f"{flag} {file}: accepted: an .mp4 in an existing folder")
 
 
 def _choose_graphics() -> None:
@@ -299,12 +390,17 @@ def _analyze(args: argparse.Namespace) -> int:
     recording = read_log(place)
     car = _car(place)
     view, terms = run_terms(prepare(recording, args.track), car)
+    strip: list[Glimpse] = []
+    if _sees_pictures(place):
+        from deepracer_exp.evaluation.sight import run_glimpses
+
+        view, strip = run_glimpses(view, place)
     others = [_light(prepare(read_log(other))) for other in beside]
     replay = None if reward is None else compare_rewards(view, replay_reward(view, reward, car))
     out = Path(args.output) if args.output else _default_out(place, recording.name)
     found = findings(view, target_s)
     try:
-        write_page(out, LogPage(view, found, others, replay, terms))
+        write_page(out, LogPage(view, found, others, replay, terms, strip))
     except OSError as error:
         raise BadInput(
             f"--output {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
@@ -359,6 +455,16 @@ def _car(place: Path) -> "CarConfig":
     except BadInput:  # another version, whose cars had the same dimensions
         pass
     return compose_experiment([])[0].car
+
+
+def _sees_pictures(place: Path) -> bool:
+    from deepracer_exp.runs.files import read_config, sees_pictures
+    from deepracer_exp.runs.own_recording import is_own_run
+
+    try:
+        return is_own_run(place) and sees_pictures(read_config(place))
+    except BadInput:  # the page lists which files could not be read
+        return False
 
 
 def _light(view: "LogView") -> "LogView":

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
+from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import RunFailed, count
 from deepracer_exp.files import atomic_write
@@ -143,12 +144,10 @@ def evaluate_run(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
         highlight=False,
     )
-    evaluation = evaluator(stored.networks.policy, film.record if film is not None else None)
+    evaluation = evaluator(stored.networks.policy, film.recorder if film is not None else None)
     file = write_evaluation(run.path, evaluation, config.evaluation, stored)
-    # A track file replaces an option and keeps its name, so it is not the track of that name.
-    own = [name for name, track in run.experiment.tracks.items() if track.file is None]
-    trained_on = evaluation.tracks if config.evaluation.tracks is None else own
-    out.print(results_table(evaluation, config.evaluation, trained_on, out))
+    known = trained_on(run.experiment, config.evaluation, evaluation)
+    out.print(results_table(evaluation, config.evaluation, known, out))
     out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
     if film is not None:
         film.write(evaluation, err)
@@ -156,10 +155,18 @@ def evaluate_run(
     tracking = run.experiment.tracking
     uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
     files = {file: EVALUATIONS} | ({} if film is None else {film.file: FILMS})
-    metrics = _metrics(evaluation, trained_on)
+    metrics = _metrics(evaluation, known)
     runs_dir = run.path.resolve().parents[1]
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
     return evaluation
+
+
+def trained_on(experiment: Experiment, config: EvaluationConfig, evaluation: Evaluation) -> list[str]:
+    """Return the names of the tracks that the policy of an evaluation was trained on."""
+    if config.tracks is None:
+        return evaluation.tracks
+    # A track file replaces an option and keeps its name, so it is not the track of that name.
+    return [name for name, track in experiment.tracks.items() if track.file is None]
 
 
 def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, float | None]:

@@ -27,7 +27,8 @@ from deepracer_exp.tracks.track import Track
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, Group
 
-OnStep = Callable[[Race, RaceProtocol], None]
+OnStep = Callable[[Race, RaceProtocol, TensorDict], None]
+"""Gets the cars, the protocol, and what the policy read and wrote in this step, [trials]."""
 
 # An evaluation needs no reward; the run's own reward function may no longer exist.
 _NO_REWARD = RewardSource(
@@ -124,13 +125,14 @@ class Evaluator:
                 seen = TensorDict(
                     {key: torch.from_numpy(values) for key, values in race.seen.items()}, [race.n_cars]
                 )
-                race.step(policy(seen)["action"].numpy())
+                acted = policy(seen)
+                race.step(acted["action"].numpy())
                 row = race.trace
                 back = protocol.step(
                     row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
                 )
                 if on_step is not None:
-                    on_step(race, protocol)
+                    on_step(race, protocol, acted)
                 if len(back.cars):
                     race.put_back(back.cars, back.progress)
         return Evaluation(tuple(self._groups(protocol)))

@@ -1,37 +1,29 @@
 """Video of the best lap of an evaluation, rendered by MuJoCo."""
 
-import io
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import mujoco
 import numpy as np
-from imageio_ffmpeg import write_frames
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
-from rich.progress import track as with_progress
 from shapely import get_coordinates, get_parts
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.deepracer.trace import PACKED
-from deepracer_exp.env.race import Race
-from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
 from deepracer_exp.tracks.track import Track
 
 from .evaluator import Evaluator
-from .race_protocol import Attempt, RaceProtocol
-from .result import USUAL, Evaluation
+from .film import Lap, LapRecorder, best_attempt, png, write_film
+from .result import Evaluation
 
 View = Literal["chase", "top"]
 VIEWS: tuple[View, ...] = ("chase", "top")
 
 WIDTH, HEIGHT = 960, 544
 """Multiples of 16, as video codecs want them."""
-_LINGER_S = 1.0
-"""The last frame is shown this long."""
-_COLUMNS = [PACKED[name] for name in ("X", "Y", "yaw", "steer", "speed_mps", "progress")]
 
 _PIXELS_PER_M, _MOST_PIXELS, _FINER = 160, 4096, 2
 _MARGIN_M = 0.5
@@ -53,7 +45,7 @@ class LapRenderer:
     def __init__(self, track: Track, car: CarConfig, view: View, width: int, height: int):
         """Draw the track and set up the renderer."""
         self._car, self._view = car, view
-        self._low, self._high = _extent(track)
+        self._low, self._high = extent(track)
         self._model = _build(track, car, view, (self._low, self._high), width, height)
         self._data = mujoco.MjData(self._model)
         self._place = [self._model.joint(name).qposadr[0] for name in ("x", "y", "yaw")]
@@ -120,7 +112,8 @@ class LapRenderer:
         camera.azimuth = np.degrees(self._azimuth_rad)
 
 
-def _extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest x and y that a view from above shows, (2,) each."""
     points = np.concatenate([track.inner, track.outer])
     return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
 
@@ -146,10 +139,10 @@ def _build(
     spec.geom("floor").rgba = [0, 0, 0, 0]
     # Textures are shaded differently from plain shapes, so the surrounding ground is a texture, too.
     pictures = {
-        "track": _draw(track, low, high),
+        "track": draw_track(track, min(_PIXELS_PER_M, _MOST_PIXELS / float(np.max(high - low)))),
         "ground": Image.new("RGB", (4, 4), track.floor.ground_color),
     }
-    spec.assets = {f"{name}.png": _png(picture) for name, picture in pictures.items()}
+    spec.assets = {f"{name}.png": png(picture) for name, picture in pictures.items()}
     for name in pictures:
         spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
         material = spec.add_material(name=name, specular=0.0, reflectance=0.0)
@@ -176,9 +169,9 @@ def _build(
     return spec.compile()
 
 
-def _draw(track: Track, low: NDArray[np.float64], high: NDArray[np.float64]) -> Image.Image:
-    """Draw the track from above, x to the right and y up."""
-    scale = _FINER * min(_PIXELS_PER_M, _MOST_PIXELS / float(np.max(high - low)))
+def draw_track(track: Track, pixels_per_m: float) -> Image.Image:
+    """Draw the `extent` of a track from above, x to the right and y up."""
+    (low, high), scale = extent(track), _FINER * pixels_per_m
     width, height = (int(size) for size in np.ceil((high - low) * scale))
     image = Image.new("RGB", (width, height), track.floor.ground_color)
     draw = ImageDraw.Draw(image)
@@ -202,30 +195,13 @@ def _draw(track: Track, low: NDArray[np.float64], high: NDArray[np.float64]) -> 
     return image.reduce(_FINER)
 
 
-def _png(image: Image.Image) -> bytes:
-    file = io.BytesIO()
-    image.save(file, "PNG")
-    return file.getvalue()
-
-
 class LapVideo:
     """Records all trials while they are driven, then renders the best lap."""
 
     def __init__(self, evaluator: Evaluator, file: Path, view: View):
-        """Prepare a video of an evaluation, in an .mp4 file, from behind the car or from above.
-
-        Raises:
-            BadInput: the file is not an .mp4, or its folder does not exist.
-        """
-        if file.suffix != ".mp4" or not file.parent.is_dir():
-            raise BadInput(f"--video {file}: accepted: an .mp4 in an existing folder")
-        self.file, self._view = file, view
-        self._evaluator = evaluator
-        self._steps: list[NDArray[np.float64]] = []
-
-    def record(self, race: Race, protocol: RaceProtocol) -> None:
-        """Record one control step."""
-        self._steps.append(np.column_stack([race.trace[:, _COLUMNS], protocol.clock_s]))
+        """Prepare a video of an evaluation, in an .mp4 file, from behind the car or from above."""
+        self.file, self._view, self._setup = file, view, evaluator.race.setup
+        self.recorder = LapRecorder(evaluator)
 
     def write(self, evaluation: Evaluation, err: Console) -> None:
         """Render the fastest lap on the usual conditions, or the one with the most progress if none is complete.
@@ -233,43 +209,19 @@ class LapVideo:
         Raises:
             RunFailed: the file cannot be written.
         """
-        best = max(
-            evaluation.on(USUAL).attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress)
-        )
-        trial, setup = self._evaluator.trials[best.trial], self._evaluator.race.setup
-        course = setup.courses[trial.course]
-        hertz = setup.car.control_hz
-        rows = self._lap(best)
-        driven_m = np.cumsum(rows[:, 4]) / hertz
-        title = f"{course.tracks[0].title} · {trial.condition.replace('_', ' ')}"
-        with LapRenderer(course.tracks[0], setup.car, self._view, WIDTH, HEIGHT) as renderer:
-            writer = write_frames(str(self.file), (WIDTH, HEIGHT), fps=hertz, quality=8, macro_block_size=16)
-            try:
-                writer.send(None)
-                for at in with_progress(range(len(rows)), "rendering", console=err, transient=True):
-                    x, y, yaw_deg, steer_deg, speed_mps, progress, clock_s = rows[at]
-                    picture = renderer.draw(x, y, np.radians(yaw_deg), np.radians(steer_deg), driven_m[at])
-                    frame = _overlay(picture, title, clock_s - best.begin_s, speed_mps, progress)
-                    writer.send(frame)
-                for _ in range(round(_LINGER_S * hertz)):
-                    writer.send(frame)
-            except OSError as error:
-                raise RunFailed(f"{self.file}: cannot be written: {error.strerror or error}") from error
-            finally:
-                writer.close()
+        lap, car = self.recorder.lap(best_attempt(evaluation)), self._setup.car
+        driven_m = np.cumsum(lap.speed_mps) / car.control_hz
+        with LapRenderer(lap.track, car, self._view, WIDTH, HEIGHT) as renderer:
 
-    def _lap(self, lap: Attempt) -> NDArray[np.float64]:
-        """Return the rows of a lap, columns `_COLUMNS` and the race clock."""
-        rows = np.array([step[lap.trial] for step in self._steps])
-        clock_s = rows[:, -1]
-        # The clock of a finished trial stands still.
-        going = np.r_[True, np.diff(clock_s) > 0]
-        return rows[going & (clock_s >= lap.begin_s - 1e-9) & (clock_s <= lap.begin_s + lap.time_s + 1e-9)]
+            def frames() -> Iterator[NDArray[np.uint8]]:
+                for at in range(len(lap)):
+                    pose = lap.x_m[at], lap.y_m[at], lap.yaw_rad[at], lap.steering_rad[at]
+                    yield _overlay(renderer.draw(*pose, driven_m[at]), lap, at)
+
+            write_film(self.file, frames(), len(lap), (WIDTH, HEIGHT), car.control_hz, err)
 
 
-def _overlay(
-    picture: NDArray[np.uint8], title: str, lap_s: float, speed_mps: float, progress: float
-) -> NDArray[np.uint8]:
+def _overlay(picture: NDArray[np.uint8], lap: Lap, at: int) -> NDArray[np.uint8]:
     """Draw lap time, speed and progress onto a frame."""
     image = Image.fromarray(picture).convert("RGBA")
     shade = Image.new("RGBA", image.size)
@@ -277,14 +229,12 @@ def _overlay(
     large, small = ImageFont.load_default(34), ImageFont.load_default(18)
     right = 330
     draw.rounded_rectangle((16, 16, right + 14, 122), 10, fill=(0, 0, 0, 150))
-    draw.text((30, 22), title, font=small, fill=(235, 235, 235, 255))
+    draw.text((30, 22), lap.title, font=small, fill=(235, 235, 235, 255))
     white = (255, 255, 255, 255)
     # Right-aligned, so that the numbers do not jump.
-    draw.text((150, 46), f"{lap_s:.2f} s", font=large, fill=white, anchor="ra")
-    draw.text((right, 46), f"{max(speed_mps, 0.0):.2f} m/s", font=large, fill=white, anchor="ra")
-    # A flying lap starts with the last pose of the previous one, which has that lap's progress.
-    share = float(np.clip(progress, 0.0, 100.0)) / 100 if lap_s > 0 else 0.0
+    draw.text((150, 46), f"{lap.time_s[at]:.2f} s", font=large, fill=white, anchor="ra")
+    draw.text((right, 46), f"{max(lap.speed_mps[at], 0.0):.2f} m/s", font=large, fill=white, anchor="ra")
     draw.rectangle((30, 98, right, 108), fill=(255, 255, 255, 60))
-    draw.rectangle((30, 98, 30 + (right - 30) * share, 108), fill=(245, 166, 35, 255))
+    draw.rectangle((30, 98, 30 + (right - 30) * lap.share(at), 108), fill=(245, 166, 35, 255))
     framed: NDArray[np.uint8] = np.asarray(Image.alpha_composite(image, shade).convert("RGB"))
     return np.ascontiguousarray(framed)

@@ -2,6 +2,7 @@
 
 import glob
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,11 @@ def read_config(path: Path) -> dict[str, Any]:
     if not isinstance(mapping, dict):
         raise BadInput(f"{file}: holds no values; a run writes its experiment there")
     return {str(key): value for key, value in mapping.items()}
+
+
+def sees_pictures(config: Mapping[str, Any]) -> bool:
+    """Return whether the policy of a run with this config.yaml sees through a camera."""
+    return bool((config.get("observation") or {}).get("camera"))
 
 
 def read_object(file: Path) -> dict[str, Any]:

@@ -27,6 +27,8 @@ from deepracer_exp.runs.files import (
     REWARD,
     SUMMARY,
     TRACE,
+    read_config,
+    sees_pictures,
 )
 from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import read_trace
@@ -399,11 +401,17 @@ def _write_page(run_dir: Path, car: CarConfig) -> str | None:
         from deepracer_exp.analysis.findings import findings
         from deepracer_exp.analysis.log_report import LogPage, write_page
         from deepracer_exp.analysis.log_view import prepare
+        from deepracer_exp.analysis.page import Glimpse
         from deepracer_exp.evaluation.reward_terms import run_terms
         from deepracer_exp.runs.own_recording import read_own_recording
 
         view, terms = run_terms(prepare(read_own_recording(run_dir)), car, just_trained=True)
-        write_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms))
+        strip: list[Glimpse] = []
+        if sees_pictures(read_config(run_dir)):
+            from deepracer_exp.evaluation.sight import run_glimpses
+
+            view, strip = run_glimpses(view, run_dir, just_trained=True)
+        write_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, strip=strip))
     except KeyboardInterrupt:
         return f"{REPORT} was left off; `deepracer-exp analyze {run_dir.name}` writes it"
     except Exception as error:

@@ -78,6 +78,15 @@ def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fi
     assert int(refused.complaint.split("up to ")[1].split(",")[0]) < 10_000_000
 
 
+def test_the_report_shows_what_the_policy_sees_along_a_lap(trained, call, tmp_path):
+    ended = trained(*CAMERA)
+    page = tmp_path / "report.html"
+    assert call("analyze", str(ended.folder), "-o", str(page)).code == 0
+    html = page.read_text(encoding="utf-8")
+    assert "What it sees" in html
+    assert html.count("data:image/png;base64,") == 16
+
+
 def test_a_clone_keeps_what_the_networks_were_made_for(call):
     parent = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512").folder
     cloned = call("clone", str(parent), "budget.env_steps=512", "tracking=off")

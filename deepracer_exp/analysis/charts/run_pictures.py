@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
@@ -14,6 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import EngFormatter, MaxNLocator
+from numpy.typing import NDArray
 from shapely import get_coordinates, get_parts, get_rings, orient_polygons
 
 from deepracer_exp.tracks.track import Track
@@ -62,41 +64,62 @@ def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
         trace: rows as `runs.trace.read_trace` gives them.
         tracks: the courses by their names in the trace; one that was not driven on is shown empty.
     """
-    one = len(tracks) == 1
-    columns = len(tracks) if len(tracks) <= 3 else math.ceil(math.sqrt(len(tracks)))
-    rows = math.ceil(len(tracks) / columns)
+    shown = []
+    for name, track in tracks.items():
+        here = trace[trace["track"] == name]
+        table = episodes(here)
+        if not len(table):
+            shown.append(TrackLines(track, "not driven", ()))
+            continue
+        laps = table["lap_time_s"]
+        best = laps.idxmin() if laps.notna().any() else table["progress"].idxmax()
+        driven = here[here["episode"] == best]
+        words = _result(table.loc[best])
+        if len(tracks) == 1:
+            speed_mps = driven["speed_mps"].to_numpy(dtype=np.float64)[1:]
+            words += (
+                f"  ·  {track.length_m:.2f} m, mean {speed_mps.mean():.2f} m/s, top {speed_mps.max():.2f} m/s"
+            )
+            words += f"  ·  iteration {table['iteration'][best]}, episode {best}, car {table['car'][best]}"
+        shown.append(TrackLines(track, words, (driven[["X", "Y", "speed_mps"]].to_numpy(np.float64),)))
+    return lines_figure(shown)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackLines:
+    """Driven lines on a track."""
+
+    track: Track
+    words: str
+    """Said above it."""
+    lines: Sequence[NDArray[np.float64]]
+    """Columns x_m, y_m and speed_mps, of each line (n, 3)."""
+
+
+def lines_figure(shown: Sequence[TrackLines]) -> Figure:
+    """Draw lines on their tracks, coloured by measured speed, on one scale."""
+    one = len(shown) == 1
+    columns = len(shown) if len(shown) <= 3 else math.ceil(math.sqrt(len(shown)))
+    rows = math.ceil(len(shown) / columns)
     shape = 0.8
     if one:
-        ((left, right), (bottom, top)) = _bounds(next(iter(tracks.values())))
+        ((left, right), (bottom, top)) = _bounds(shown[0].track)
         shape = float(np.clip((top - bottom) / (right - left), 0.25, 0.9))
     cell = (10.0 if one else 13.0) / columns  # inches
     figure = Figure((columns * cell, rows * (0.9 * shape * cell + 0.9)), dpi=150, layout=_LAYOUT)
     cells = figure.subplots(rows, columns, squeeze=False)
     lines = []
-    for axes, (name, track) in zip(cells.flat, tracks.items(), strict=False):
-        here = trace[trace["track"] == name]
-        table = episodes(here)
-        words = "not driven"
-        _draw_road(axes, track)
-        if len(table):
-            laps = table["lap_time_s"]
-            best = laps.idxmin() if laps.notna().any() else table["progress"].idxmax()
-            driven = here[here["episode"] == best]
-            lines.append(_draw_line(axes, driven, width=3.0 if one else 1.8, arrow=11.0 if one else 7.0))
-            words = _result(table.loc[best])
-            if one:
-                speed_mps = driven["speed_mps"].to_numpy(dtype=np.float64)[1:]
-                words += f"  ·  {track.length_m:.2f} m, mean {speed_mps.mean():.2f} m/s, top {speed_mps.max():.2f} m/s"
-                words += (
-                    f"  ·  iteration {table['iteration'][best]}, episode {best}, car {table['car'][best]}"
-                )
+    for axes, here in zip(cells.flat, shown, strict=False):
+        _draw_road(axes, here.track)
+        width = (3.0 if one else 1.8) / math.sqrt(max(len(here.lines), 1))
+        lines += [_draw_line(axes, line, width, arrow=11.0 if one else 7.0) for line in here.lines]
         size = 11.0 if one else 8.5
         axes.set_title(
-            track.title, loc="left", fontsize=1.5 * size, fontweight="bold", color=INK, pad=2 * size
+            here.track.title, loc="left", fontsize=1.5 * size, fontweight="bold", color=INK, pad=2 * size
         )
         above = {"xytext": (0, 0.7 * size), "textcoords": "offset points", "xycoords": "axes fraction"}
-        axes.annotate(words, (0, 1), fontsize=size, color=FAINT, **above)
-    for axes in cells.flat[len(tracks) :]:
+        axes.annotate(here.words, (0, 1), fontsize=size, color=FAINT, **above)
+    for axes in cells.flat[len(shown) :]:
         axes.set_axis_off()
     if lines:
         speeds = np.concatenate([np.asarray(line.get_array()) for line in lines])
@@ -193,12 +216,12 @@ def _result(episode: pd.Series) -> str:
     return f"{episode['progress']:.1f} % of the lap, {str(episode['status']).replace('_', ' ')}"
 
 
-def _draw_line(axes: Axes, rows: pd.DataFrame, width: float, arrow: float) -> LineCollection:
-    points = rows[["X", "Y"]].to_numpy()
+def _draw_line(axes: Axes, rows: NDArray[np.float64], width: float, arrow: float) -> LineCollection:
+    points = rows[:, :2]
     segments = list(np.stack([points[:-1], points[1:]], axis=1))
     line = LineCollection(segments, cmap=SPEED, linewidths=width, capstyle="round", zorder=4)
     # A segment has the speed at its end: the row before it may be the standing start.
-    line.set_array(rows["speed_mps"].to_numpy(dtype=np.float64)[1:])
+    line.set_array(rows[1:, 2])
     axes.add_collection(line)
     ahead_x, ahead_y = points[min(5, len(points) - 1)] - points[0]
     marker = (3, 0, math.degrees(math.atan2(ahead_y, ahead_x)) - 90)

@@ -1,0 +1,175 @@
+"""A lap of an evaluation, recorded step by step, and the encoder of its film."""
+
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from imageio_ffmpeg import write_frames
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+from rich.progress import track as with_progress
+from tensordict import TensorDict
+from torch import nn
+
+from deepracer_exp.deepracer.trace import PACKED
+from deepracer_exp.env.race import Race
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.tracks.track import Track
+
+from .evaluator import Evaluator
+from .race_protocol import Attempt, RaceProtocol
+from .result import USUAL, Evaluation
+
+_LINGER_S = 1.0
+"""The last frame is shown this long."""
+_COLUMNS = [PACKED[name] for name in ("X", "Y", "yaw", "steer", "speed_mps", "progress")]
+
+
+@dataclass(frozen=True, eq=False)
+class Lap:
+    """The steps of an attempted lap, n of them, the prepare step first."""
+
+    attempt: Attempt
+    track: Track
+    title: str
+    """Track and conditions."""
+    x_m: NDArray[np.float64]
+    """Front point of the car, (n,)."""
+    y_m: NDArray[np.float64]
+    yaw_rad: NDArray[np.float64]
+    steering_rad: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+    progress: NDArray[np.float64]
+    """Per cent."""
+    time_s: NDArray[np.float64]
+    """Since its start, penalties included."""
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def share(self, step: int) -> float:
+        """Return the share of the lap driven before a step."""
+        # A flying lap starts with the last pose of the previous one, which has that lap's progress.
+        return float(np.clip(self.progress[step] / 100, 0.0, 1.0)) if self.time_s[step] > 0 else 0.0
+
+
+class LapRecorder:
+    """Records the poses of all trials while they are driven, and of one lap what the policy read and wrote."""
+
+    def __init__(self, evaluator: Evaluator, seen_in: Attempt | None = None) -> None:
+        """Record the next evaluation.
+
+        Args:
+            evaluator: called with this object.
+            seen_in: the lap whose inputs and outputs are kept, of an earlier evaluation of the same policy: pictures of
+                all laps would not fit into memory. None: of no lap.
+        """
+        self._evaluator, self._seen_in = evaluator, seen_in
+        self._steps: list[NDArray[np.float64]] = []
+        self._acted: list[TensorDict] = []
+
+    def __call__(self, race: Race, protocol: RaceProtocol, acted: TensorDict) -> None:
+        """Record one control step."""
+        self._steps.append(np.column_stack([race.trace[:, _COLUMNS], protocol.clock_s]))
+        if self._seen_in is not None:
+            trial = self._seen_in.trial
+            before = self._steps[-2][trial, -1] if len(self._steps) > 1 else -1.0
+            if _within(self._seen_in, before, protocol.clock_s[trial]):
+                self._acted.append(acted[trial].clone())
+
+    @property
+    def acted(self) -> TensorDict:
+        """What the policy read and wrote in the lap `seen_in`, [n]."""
+        return torch.stack(self._acted)
+
+    def lap(self, attempt: Attempt) -> Lap:
+        """Return the steps of a lap."""
+        trial, setup = self._evaluator.trials[attempt.trial], self._evaluator.race.setup
+        track = setup.courses[trial.course].tracks[0]
+        rows = np.array([step[attempt.trial] for step in self._steps])
+        clock_s = rows[:, -1]
+        wanted = [
+            _within(attempt, before, now) for before, now in zip(np.r_[-1.0, clock_s], clock_s, strict=False)
+        ]
+        x_m, y_m, yaw_deg, steering_deg, speed_mps, progress, clock_s = rows[wanted].T
+        return Lap(
+            attempt=attempt,
+            track=track,
+            title=f"{track.title} · {trial.condition.replace('_', ' ')}",
+            x_m=x_m,
+            y_m=y_m,
+            yaw_rad=np.radians(yaw_deg),
+            steering_rad=np.radians(steering_deg),
+            speed_mps=speed_mps,
+            progress=progress,
+            time_s=clock_s - attempt.begin_s,
+        )
+
+
+def _within(lap: Attempt, before_s: float, now_s: float) -> bool:
+    """Return whether a step belongs to a lap; the clock of a finished trial stands still."""
+    return now_s > before_s and lap.begin_s - 1e-9 <= now_s <= lap.begin_s + lap.time_s + 1e-9
+
+
+def best_attempt(evaluation: Evaluation) -> Attempt:
+    """Return the fastest lap on the usual conditions, or the one with the most progress if none is complete."""
+    return max(
+        evaluation.on(USUAL).attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress)
+    )
+
+
+def drive_best_lap(evaluator: Evaluator, policy: nn.Module) -> tuple[Lap, TensorDict]:
+    """Drive all trials, and again to record the best lap: every drive of a policy is the same.
+
+    Returns:
+        The lap of n steps, and what the policy read and wrote in these, [n].
+    """
+    best = best_attempt(evaluator(policy))
+    recorder = LapRecorder(evaluator, best)
+    evaluator(policy, recorder)
+    return recorder.lap(best), recorder.acted
+
+
+def write_film(
+    file: Path,
+    frames: Iterable[NDArray[np.uint8]],
+    count: int,
+    size: tuple[int, int],
+    frames_per_s: float,
+    err: Console,
+) -> None:
+    """Encode frames as an .mp4; the last one is shown for a second.
+
+    Args:
+        file: to write.
+        frames: (height, width, 3), at least one.
+        count: of the frames.
+        size: their width and height, multiples of 16 as video codecs want them.
+        frames_per_s: of the film.
+        err: shows the progress.
+
+    Raises:
+        RunFailed: the file cannot be written.
+    """
+    writer = write_frames(str(file), size, fps=frames_per_s, quality=8, macro_block_size=16)
+    try:
+        writer.send(None)
+        for frame in with_progress(frames, "rendering", count, console=err, transient=True):
+            writer.send(frame)
+        for _ in range(round(_LINGER_S * frames_per_s)):
+            writer.send(frame)
+    except OSError as error:
+        raise RunFailed(f"{file}: cannot be written: {error.strerror or error}") from error
+    finally:
+        writer.close()
+
+
+def png(image: Image.Image) -> bytes:
+    """Return a picture as the bytes of a PNG."""
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return file.getvalue()

@@ -1,0 +1,56 @@
+"""The server of a live page: one page and its version, for this machine only."""
+
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from deepracer_exp.errors import BadInput
+
+HOST = "127.0.0.1"
+
+
+class LiveServer(ThreadingHTTPServer):
+    """Serves a page at `/` and its version at `/version`; the page loads itself again when that changes.
+
+    Attributes:
+        shown: the version and the page, replaced together.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, port: int) -> None:
+        """Open a port, 0: a free one.
+
+        Raises:
+            BadInput: the port is in use or none.
+        """
+        self.shown = ("0", "")
+        try:
+            super().__init__((HOST, port), _Answer)
+        except (OSError, OverflowError) as error:
+            reason = str(getattr(error, "strerror", None) or error).lower()
+            raise BadInput(
+                f"--port {port}: {reason} on {HOST}; accepted: a port that is free, or none for any"
+            ) from None
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{HOST}:{self.server_port}/"
+
+
+class _Answer(BaseHTTPRequestHandler):
+    server: LiveServer
+
+    def do_GET(self) -> None:
+        version, page = self.server.shown
+        answers = {"/": (page, "text/html"), "/version": (version, "text/plain")}
+        text, kind = answers.get(self.path, ("no such page\n", "text/plain"))
+        body = text.encode()
+        self.send_response(200 if self.path in answers else 404)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing: the page asks every second."""

@@ -1,0 +1,272 @@
+"""The command `watch`: a film of what a policy sees, where it looks, what it decides and where it drives."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from tensordict import TensorDict
+from torch import nn
+
+from deepracer_exp.analysis.charts.run_pictures import SPEED
+from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.config.evaluation import EvaluateConfig
+from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
+from deepracer_exp.errors import RunFailed, count
+from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.files import FILMS
+from deepracer_exp.runs.resolve import resolve
+
+from .evaluator import Evaluator
+from .film import Lap, drive_best_lap, write_film
+from .sight import degrees, picture_of, saliency, under_heat
+from .video import draw_track, extent
+
+WIDTH, HEIGHT = 1280, 720
+_EYE = (480, 360)
+"""Room for what the cameras see, and as much below it for where the policy looks."""
+_PAGE, _RULE, _INK, _FAINT, _CHOSEN, _BAR = "#14171a", "#343a42", "#f2f4f6", "#98a1ac", "#f5a623", "#5b87b8"
+_BOARD_HEIGHT, _ACTIONS_HEIGHT = 84, 216
+_FINER = 2
+
+
+class Frames:
+    """Draws the frames of a lap.
+
+    On the left what the cameras see, enlarged without smoothing, and below it the same under its saliency, each frame
+    scaled to its own highest value; on the right the view from above and what the policy decides. Without a camera the
+    right side is as wide as the frame.
+    """
+
+    def __init__(
+        self,
+        lap: Lap,
+        acted: TensorDict,
+        policy: nn.Module,
+        actions: ActionSpace,
+        camera: CameraConfig | None,
+    ) -> None:
+        """Draw what stays the same.
+
+        Args:
+            lap: of n steps.
+            acted: what the policy read and wrote in these, [n].
+            policy: that drove.
+            actions: what it chooses from.
+            camera: what it sees through; None: it reads features.
+        """
+        self._lap, self._acted, self._policy, self._camera = lap, acted, policy, camera
+        self._left = 0 if camera is None else _EYE[0]
+        self._decision: _Probabilities | _Distribution = (
+            _Probabilities(actions, acted["logits"].softmax(-1).numpy(), WIDTH - self._left)
+            if isinstance(actions, DiscreteActions)
+            else _Distribution(actions.low, actions.high, WIDTH - self._left)
+        )
+        self._map = _Map(lap, (WIDTH - self._left, HEIGHT - _BOARD_HEIGHT - _ACTIONS_HEIGHT))
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        for at in range(len(self._lap)):
+            yield self._frame(at)
+
+    def _frame(self, at: int) -> NDArray[np.uint8]:
+        frame = Image.new("RGB", (WIDTH, HEIGHT), _PAGE)
+        if self._camera is not None:
+            self._draw_sight(frame, self._acted[at], self._camera)
+        frame.paste(_board(self._lap, at, WIDTH - self._left), (self._left, 0))
+        frame.paste(self._map.draw(at), (self._left, _BOARD_HEIGHT))
+        frame.paste(self._decision.draw(at, self._acted[at]), (self._left, HEIGHT - _ACTIONS_HEIGHT))
+        return np.asarray(frame)
+
+    def _draw_sight(self, frame: Image.Image, acted: TensorDict, camera: CameraConfig) -> None:
+        picture = picture_of(acted, camera)
+        size = _fitted(picture.size, _EYE)
+        corner = ((_EYE[0] - size[0]) // 2, (_EYE[1] - size[1]) // 2)
+        frame.paste(picture.resize(size, Image.Resampling.NEAREST), corner)
+        looked = under_heat(picture, saliency(self._policy, acted, camera), size)
+        frame.paste(looked, (corner[0], corner[1] + _EYE[1]))
+        draw = ImageDraw.Draw(frame, "RGBA")
+        for top, words in ((0, "what it sees"), (_EYE[1], "where it looks")):
+            _label(draw, (10, top + 8), words)
+
+
+def _fitted(size: tuple[int, int], room: tuple[int, int]) -> tuple[int, int]:
+    """Return the size of a picture in a room: a whole multiple of its own, or reduced if it is larger."""
+    scale = min(room[0] / size[0], room[1] / size[1])
+    scale = float(int(scale)) if scale >= 1 else scale
+    return round(scale * size[0]), round(scale * size[1])
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], words: str) -> None:
+    """Write words that can be read on any picture."""
+    left, top, right, bottom = draw.textbbox((corner[0] + 7, corner[1] + 3), words, font=_font(15))
+    draw.rounded_rectangle((left - 7, top - 5, right + 7, bottom + 5), 5, fill=(0, 0, 0, 150))
+    draw.text((corner[0] + 7, corner[1] + 3), words, font=_font(15), fill=_INK)
+
+
+def _board(lap: Lap, at: int, width: int) -> Image.Image:
+    """Draw track, lap time, speed and progress."""
+    image = Image.new("RGB", (width, _BOARD_HEIGHT), _PAGE)
+    draw = ImageDraw.Draw(image)
+    share, end = lap.share(at), width - 24
+    draw.text((24, 16), lap.title, font=_font(18), fill=_INK)
+    # Right-aligned, so that the numbers do not jump.
+    words = (f"{lap.time_s[at]:.2f} s", f"{lap.speed_mps[at]:.2f} m/s", f"{100 * share:.0f} %")
+    for right, text in zip((end - 240, end - 90, end), words, strict=True):
+        draw.text((right, 12), text, font=_font(26), fill=_INK, anchor="ra")
+    draw.rounded_rectangle((24, 56, end, 64), 4, fill=_RULE)
+    draw.rounded_rectangle((24, 56, 24 + max(8, (end - 24) * share), 64), 4, fill=_CHOSEN)
+    return image
+
+
+class _Map:
+    """The track from above with the driven line, coloured by speed, and the car."""
+
+    def __init__(self, lap: Lap, size: tuple[int, int]) -> None:
+        low, high = extent(lap.track)
+        scale = float(np.min(np.array(size) / (high - low)))
+        road = draw_track(lap.track, _FINER * scale)
+        self._canvas = Image.new("RGB", (_FINER * size[0], _FINER * size[1]), lap.track.floor.ground_color)
+        left, top = ((self._canvas.width - road.width) // 2, (self._canvas.height - road.height) // 2)
+        self._canvas.paste(road, (left, top))
+        self._x = left + (lap.x_m - low[0]) * _FINER * scale
+        self._y = top + road.height - (lap.y_m - low[1]) * _FINER * scale
+        self._yaw_rad = lap.yaw_rad
+        # The few steps after a standing start would take half of the colours.
+        slow, fast = float(np.percentile(lap.speed_mps, 5)), float(lap.speed_mps.max())
+        shares = (lap.speed_mps - slow) / max(fast - slow, 1e-6)
+        self._colors = [tuple(color) for color in (255 * SPEED(shares)[:, :3]).astype(int).tolist()]
+        self._drawn = 0
+
+    def draw(self, at: int) -> Image.Image:
+        """Return the view at a step; steps are drawn in their order."""
+        pen = ImageDraw.Draw(self._canvas)
+        for step in range(self._drawn + 1, at + 1):
+            ends = [(self._x[step - 1], self._y[step - 1]), (self._x[step], self._y[step])]
+            pen.line(ends, fill=self._colors[step], width=4 * _FINER)
+        self._drawn = at
+        now = self._canvas.copy()
+        ahead = np.array([np.cos(self._yaw_rad[at]), -np.sin(self._yaw_rad[at])])
+        left = np.array([ahead[1], -ahead[0]])
+        corners = ((4, 0), (-19, 8), (-14, 0), (-19, -8))  # an arrow, pixels ahead and to the left
+        at_px = np.array([self._x[at], self._y[at]])
+        arrow = [tuple(at_px + _FINER * (along * ahead + aside * left)) for along, aside in corners]
+        ImageDraw.Draw(now).polygon(arrow, fill="#ffffff", outline="#000000", width=_FINER)
+        return now.reduce(_FINER)
+
+
+class _Probabilities:
+    """Bars of the probabilities of discrete actions, from left to right as they steer, slow ones first."""
+
+    def __init__(self, actions: DiscreteActions, probabilities: NDArray[np.float32], width: int) -> None:
+        self._order = np.lexsort((actions.speed_mps, -actions.steering_deg))
+        self._steering = [degrees(value) for value in actions.steering_deg]
+        self._speed = [f"{value:.1f}" for value in actions.speed_mps]
+        self._probabilities, self._width = probabilities, width
+        # One scale for the lap.
+        self._highest = next(share for share in (0.2, 0.5, 1.0) if probabilities.max() <= share or share == 1)
+
+    def draw(self, at: int, acted: TensorDict) -> Image.Image:
+        """Return the bars of a step; that of the chosen action is highlighted."""
+        image = Image.new("RGB", (self._width, _ACTIONS_HEIGHT), _PAGE)
+        draw = ImageDraw.Draw(image)
+        chosen, shares = int(acted["action"]), self._probabilities[at]
+        step = (self._width - 48) / len(self._order)
+        top, bottom = 38, _ACTIONS_HEIGHT - 52
+        draw.text(
+            (24, 12), f"probability of each action, up to {self._highest:.0%}", font=_font(15), fill=_FAINT
+        )
+        words = f"{self._steering[chosen]}, {self._speed[chosen]} m/s: {shares[chosen]:.0%}"
+        draw.text((self._width - 24, 12), words, font=_font(15), fill=_CHOSEN, anchor="ra")
+        for y in (top, bottom):
+            draw.line((24, y, self._width - 24, y), fill=_RULE)
+        size = 14 if step > 40 else 11
+        for place, action in enumerate(self._order):
+            middle, half = 24 + (place + 0.5) * step, 0.4 * step
+            height = (bottom - top) * float(shares[action]) / self._highest
+            color, ink = (_CHOSEN, _CHOSEN) if action == chosen else (_BAR, _FAINT)
+            draw.rectangle((middle - half, bottom - height, middle + half, bottom), fill=color)
+            draw.text((middle, bottom + 6), self._steering[action], font=_font(size), fill=ink, anchor="ma")
+            draw.text((middle, bottom + 24), self._speed[action], font=_font(size), fill=ink, anchor="ma")
+        return image
+
+
+class _Distribution:
+    """Mean and standard deviation of steering and speed, on the ranges of a continuous action space."""
+
+    def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], width: int) -> None:
+        self._low, self._high, self._width = low, high, width
+
+    def draw(self, at: int, acted: TensorDict) -> Image.Image:
+        """Return the two scales."""
+        image = Image.new("RGB", (self._width, _ACTIONS_HEIGHT), _PAGE)
+        draw = ImageDraw.Draw(image)
+        half = 0.5 * (self._high - self._low)
+        means = self._low + half * (acted["loc"].numpy().clip(-1, 1) + 1)
+        deviations = half * acted["scale"].numpy()
+        names = (("steering", "°", 1), ("speed", " m/s", 2))
+        draw.text((24, 8), "mean and standard deviation", font=_font(15), fill=_FAINT)
+        for row, (name, unit, digits) in enumerate(names):
+            # Left is left: the steering's scale runs from its highest value down.
+            ends = (self._high[row], self._low[row]) if row == 0 else (self._low[row], self._high[row])
+            begin, end, y = 24, self._width - 24, 74 + 80 * row
+
+            def place(
+                value: float, ends: tuple[float, float] = ends, begin: int = begin, end: int = end
+            ) -> float:
+                share = (value - ends[0]) / (ends[1] - ends[0]) if ends[0] != ends[1] else 0.5
+                return begin + (end - begin) * min(max(share, 0.0), 1.0)
+
+            mean, deviation = float(means[row]), float(deviations[row])
+            draw.rounded_rectangle((begin, y - 5, end, y + 5), 5, fill=_RULE)
+            low, high = sorted((place(mean - deviation), place(mean + deviation)))
+            draw.rounded_rectangle((low, y - 5, high, y + 5), 5, fill=_BAR)
+            draw.ellipse((place(mean) - 10, y - 10, place(mean) + 10, y + 10), fill=_CHOSEN)
+            words = f"{name} {mean:.{digits}f}{unit} ± {deviation:.{digits}f}"
+            draw.text((self._width / 2, y - 32), words, font=_font(16), fill=_INK, anchor="ma")
+            for x, value, anchor in ((begin, ends[0], "la"), (end, ends[1], "ra")):
+                draw.text((x, y + 12), f"{value:g}{unit}", font=_font(13), fill=_FAINT, anchor=anchor)
+        return image
+
+
+def film_run(config: EvaluateConfig, file: Path | None, out: Console, err: Console) -> None:
+    """Race a run's checkpoint under a protocol and film its best lap on the usual conditions.
+
+    Args:
+        config: validated; its held-out conditions are left out.
+        file: .mp4 to write; None: named after the checkpoint, in the run's folder.
+        out: for the result.
+        err: for progress.
+
+    Raises:
+        BadInput: the run, the checkpoint, a track or a condition cannot be used.
+        RunFailed: a car's state became NaN, or the file cannot be written.
+    """
+    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
+    torch.set_num_threads(1)
+    evaluator = Evaluator(run.experiment, replace(config.evaluation, held_out=None))
+    err.print(
+        f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
+        highlight=False,
+    )
+    policy = stored.networks.policy
+    lap, acted = drive_best_lap(evaluator, policy)
+    if file is None:
+        file = run.path / FILMS / f"{stored.path.name}.mp4"
+        try:
+            file.parent.mkdir(exist_ok=True)
+        except OSError as error:
+            raise RunFailed(f"{file.parent}: cannot be made: {error.strerror or error}") from error
+    frames = Frames(lap, acted, policy, evaluator.race.setup.actions, run.experiment.observation.camera)
+    write_film(file, frames, len(lap), (WIDTH, HEIGHT), evaluator.race.setup.car.control_hz, err)
+    out.print(f"  film  {file}", soft_wrap=True, highlight=False)

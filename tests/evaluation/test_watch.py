@@ -1,0 +1,157 @@
+"""Films of what a policy sees, and the page that follows a training."""
+
+import http.client
+import io
+import itertools
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from imageio_ffmpeg import read_frames
+from rich.console import Console
+from tensordict import TensorDict
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import drive_best_lap, write_film
+from deepracer_exp.evaluation.live import LivePage
+from deepracer_exp.evaluation.live_server import LiveServer
+from deepracer_exp.evaluation.sight import picture_of, saliency
+from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames
+from deepracer_exp.runs.resolve import StoredRun
+
+STEREO = CameraConfig(width=80, height=60, color="rgb", frames=2, stereo_m=0.06, field_of_view_deg=65)
+MONO = CameraConfig(width=80, height=60, color="grey", frames=2, stereo_m=0, field_of_view_deg=65)
+
+
+class Reader(torch.nn.Module):
+    """Decides by the contrast of some pixels alone."""
+
+    def __init__(self, *where: slice | int) -> None:
+        super().__init__()
+        self._where = (..., *where)
+
+    def forward(self, seen: TensorDict) -> TensorDict:
+        read = seen["pixels"].float()[self._where].flatten(1).std(1) / 255
+        logits = torch.stack([10 * read, torch.zeros_like(read)], -1)
+        return seen.set("logits", logits).set("action", logits.argmax(-1))
+
+
+def step(camera: CameraConfig, policy: torch.nn.Module) -> TensorDict:
+    """One step in which noise was seen."""
+    pixels = torch.randint(
+        0, 256, (1, *camera.shape), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
+    )
+    return policy(TensorDict({"pixels": pixels}, [1]))[0]
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_a_network_that_reads_the_left_half_of_any_picture_looks_there(frame):
+    policy = Reader(frame, slice(None), slice(0, 40))
+    heat = saliency(policy, step(MONO, policy), MONO)
+    assert heat.shape == (60, 80)
+    assert heat[:, :40].max() == 1
+    assert heat[:, 54:].max() < 0.01
+    other = Reader(frame, slice(None), slice(40, 80))
+    assert saliency(other, step(MONO, other), MONO)[:, :26].max() < 0.01
+
+
+def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
+    policy = Reader([3, 4, 5, 9, 10, 11], slice(None), slice(None))
+    heat = saliency(policy, step(STEREO, policy), STEREO)
+    assert picture_of(step(STEREO, policy), STEREO).size == (160, 60) == heat.shape[::-1]
+    assert heat[:, 80:].max() == 1
+    assert heat[:, :80].max() == 0
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [("observation=camera_small",), ("observation=camera_small", "action_space=continuous"), ()],
+    ids=["pictures", "continuous", "features"],
+)
+def test_a_film_has_a_frame_a_step_and_shows_another_picture_in_each(circle, protocol, overrides):
+    experiment = compose_experiment([f"track.file={circle}", *overrides])[0]
+    evaluator = Evaluator(experiment, protocol("three_trials", trials=2, time_s=0.4), threads=1)
+    actions = evaluator.race.setup.actions
+    observed = observation_shape(experiment.observation)
+    networks = build_actor_critic(experiment.network, observed, actions.n, torch.Generator().manual_seed(0))
+    lap, acted = drive_best_lap(evaluator, networks.policy)
+    assert len(lap) == len(acted) == 7  # the prepare step and six more
+    frames = list(Frames(lap, acted, networks.policy, actions, experiment.observation.camera))
+    assert {frame.shape for frame in frames} == {(HEIGHT, WIDTH, 3)}
+    assert all((one != other).any() for one, other in itertools.pairwise(frames))
+    if experiment.observation.camera is not None:
+        shown = frames[4][0:360:6, 0:480:6]
+        assert (shown[8:] == acted["pixels"][4, 0].numpy()[8:, :, None]).all(), "smoothed, or of another step"
+
+
+def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
+    frames = [np.full((32, 48, 3), 20 * at, np.uint8) for at in range(10)]
+    write_film(tmp_path / "lap.mp4", frames, len(frames), (48, 32), 15, Console(file=io.StringIO()))
+    about, *written = read_frames(str(tmp_path / "lap.mp4"))
+    assert (about["fps"], about["size"]) == (15, (48, 32))
+    assert len(written) == 10 + 15
+    shades = [np.frombuffer(one, np.uint8).mean() for one in written]
+    assert np.abs(np.array(shades) - [20 * min(at, 9) for at in range(25)]).max() < 6
+
+
+@pytest.fixture
+def run(trained, tmp_path) -> StoredRun:
+    """A run of features, of which one checkpoint is there."""
+    return StoredRun(shutil.copytree(trained().folder, tmp_path / "run", symlinks=True))
+
+
+def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run, protocol):
+    page = LivePage(run, protocol("three_trials", trials=2, time_s=1))
+    first = page.shown
+    assert "waiting for the first checkpoint" in first[1]
+    assert page.update()
+    second = page.shown
+    assert page.update() is False, "drawn again for nothing"
+    newest = (run.checkpoints / "last").resolve()
+    assert f"checkpoint {newest.name}" in second[1]
+    before = {path.relative_to(run.path) for path in run.path.rglob("*")}
+    newer = run.checkpoints / "999999"
+    shutil.copytree(newest, newer)
+    (run.checkpoints / "last").unlink()
+    (run.checkpoints / "last").symlink_to(newer.name)
+    assert page.update()
+    assert "checkpoint 999999" in page.shown[1]
+    assert len({version for version, _ in (first, second, page.shown)}) == 3
+    after = {path.relative_to(run.path) for path in run.path.rglob("*")}
+    assert {path for path in after - before if path.parts[:2] != ("checkpoints", "999999")} == set()
+
+
+def test_the_live_page_is_served_to_this_machine_alone():
+    with LiveServer(0) as server:
+        server.shown = ("7", "<p>laps</p>")
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        assert server.server_address[0] == "127.0.0.1"
+
+        def get(path: str) -> tuple[int, str]:
+            asked = http.client.HTTPConnection(*server.server_address, timeout=10)
+            asked.request("GET", path)
+            answer = asked.getresponse()
+            return answer.status, answer.read().decode()
+
+        assert [get("/"), get("/version")] == [(200, "<p>laps</p>"), (200, "7")]
+        assert get("/../config.yaml")[0] == 404
+        with pytest.raises(BadInput, match=f"--port {server.server_port}: .*in use"):
+            LiveServer(server.server_port)
+        server.shutdown()
+
+
+def test_the_film_is_put_into_the_folder_of_the_run(trained, call, tmp_path):
+    folder = Path(shutil.copytree(trained().folder, tmp_path / "filmed", symlinks=True))
+    ended = call("watch", str(folder), "evaluation.trials=1", "evaluation.time_s=0.6")
+    assert ended.code == 0, ended.stderr
+    (film,) = folder.glob("films/*.mp4")
+    assert film.stem == (folder / "checkpoints" / "best").resolve().name
+    assert film.name in ended.stdout
