@@ -6,7 +6,7 @@ python -m benchmarks.lap_picture lap.mp4
 
 deepracer-exp train observation=camera_small name=eye
 deepracer-exp watch best:eye -o eye.mp4
-python -m benchmarks.lap_picture eye.mp4 --still 4.5 --output docs/images/watch.png
+python -m benchmarks.lap_picture eye.mp4 --still 3.3 --output docs/images/watch.png
 """
 
 import argparse
@@ -31,7 +31,7 @@ def main() -> None:
     if args.still is not None:
         reader = read_frames(args.film, input_params=["-ss", str(args.still)])
         size = next(reader)["source_size"]
-        Image.frombytes("RGB", size, next(reader)).quantize(128).save(args.output, optimize=True)
+        Image.frombytes("RGB", size, next(reader)).save(args.output, optimize=True)
         print(f"{args.output}: {args.output.stat().st_size / 1e3:.0f} kB")
         return
     frames = moving_picture(args.film, args.output)
