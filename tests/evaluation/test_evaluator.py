@@ -74,7 +74,7 @@ def test_summit_puts_the_car_back_at_its_last_progress_standing(experiment, prot
     config = protocol("summit", trials=1, time_s=20.0)
     seen = []
 
-    def look(race, stewards):
+    def look(race, protocol, acted):
         row = race.trace[0]
         seen.append((row[PACKED["progress"]], row[PACKED["speed_mps"]], row[PACKED["episode_status"]]))
 
