@@ -51,7 +51,9 @@ class ActorCritic(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """What collectors carry: `observation` or `pixels` -> `action` and `action_log_prob`, on these very parameters.
+        """What collectors carry: what is seen -> `action` and `action_log_prob`, on these very parameters.
+
+        What is seen is `observation`, or `pixels` and `lidar` where there are such sensors.
 
         It samples; `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action.
         A discrete action is an int64 index of shape [...], a continuous one two unbounded float32 numbers,
@@ -67,7 +69,7 @@ class ActorCritic(nn.Module):
 
     @property
     def value(self) -> TensorDictModuleBase:
-        """`observation` or `pixels` -> `state_value` of shape [..., 1]."""
+        """What is seen, or `observation` beside it, -> `state_value` of shape [..., 1]."""
         if self.trunk is None:
             return self.value_head
         return ActorValueOperator(self.trunk, self.policy_head, self.value_head).get_value_operator()
@@ -86,7 +88,7 @@ def build_actor_critic(
     Args:
         network: Sizes and kind, or a class of the user's own: a `torch.nn.Module` called with the numbers of inputs and
             outputs, of which there is one for the policy and one for the value. With a camera the inputs are channels,
-            height and width of `pixels`.
+            height and width of `pixels`; the number of a LIDAR's readings follows as an argument of its own.
         observed: What there is to read.
         action_count: Number of discrete actions, or None for the two continuous ones.
         generator: Source of the initial weights; the global random state has no part in them.
@@ -98,17 +100,17 @@ def build_actor_critic(
     if isinstance(network, CNNConfig):
         return _cnn(network, observed, outputs, action_count is None, generator)
     if isinstance(network, OwnClass):
-        in_key, inputs = (
-            ("observation", observed.features) if observed.picture is None else ("pixels", observed.picture)
-        )
+        keys = list(observed.seen)
+        # The number itself where an input has only one axis.
+        inputs = [shape if len(shape) > 1 else shape[0] for shape in observed.seen.values()]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
             layers, value = (
-                build_own(network, "network.target", nn.Module, inputs, size) for size in (outputs, 1)
+                build_own(network, "network.target", nn.Module, *inputs, size) for size in (outputs, 1)
             )
         initial_std = float(getattr(layers, "initial_std", _INITIAL_STD))
-        policy = _policy(in_key, layers, action_count is None, initial_std)
-        return ActorCritic(policy, ValueOperator(value, in_keys=[in_key]))
+        policy = _policy(keys, layers, action_count is None, initial_std)
+        return ActorCritic(policy, ValueOperator(value, in_keys=keys))
     return _mlp(network, observed.features, outputs, action_count is None, generator)
 
 
@@ -124,7 +126,7 @@ def _mlp(
             layers = MLP(in_features, outputs, num_cells=hidden, activation_class=activation)
             return _initialize(layers, gain, generator)
 
-        policy = _policy(in_key, mlp(outputs, _POLICY_GAIN), continuous, network.initial_std)
+        policy = _policy([in_key], mlp(outputs, _POLICY_GAIN), continuous, network.initial_std)
         return policy, ValueOperator(mlp(1, _VALUE_GAIN), in_keys=[in_key])
 
     if not network.shared_trunk:
@@ -141,43 +143,92 @@ def _mlp(
     return ActorCritic(*heads("hidden", width, ()), trunk)
 
 
-class PictureNet(nn.Module):
-    """Convolutions and a perceptron for pictures, uint8 [..., channels, height, width] -> float32 [..., outputs].
+class SensorNet(nn.Module):
+    """Convolutions for pictures, layers for a LIDAR, and a perceptron that joins them.
 
-    Products are in bfloat16 where the processor has matrix units for it (Intel AMX: three times as fast).
+    Called with what there is of pictures, uint8 [..., channels, height, width], and readings, float32 [..., readings];
+    returns float32 [..., outputs]. Beside pictures, products are in bfloat16 where the processor has matrix units for
+    it (Intel AMX: three times as fast).
     """
 
-    def __init__(self, config: CNNConfig, picture: tuple[int, int, int], outputs: int | None) -> None:
+    def __init__(self, config: CNNConfig, observed: ObservationShape, outputs: int | None) -> None:
         """Build the layers; without `outputs` the last hidden layer is what comes out."""
         super().__init__()
         activation = _ACTIVATIONS[config.activation]
-        channels, *size = picture
-        layers: list[nn.Module] = []
-        for filters, kernel, stride in zip(config.filters, config.kernels, config.strides, strict=True):
-            layers += [nn.Conv2d(channels, filters, kernel, stride), activation()]
-            channels = filters
-        height, width = config.outputs(*size)
-        self.convolutions = nn.Sequential(*layers)
-        *cells, last = config.hidden if outputs is None else (*config.hidden, outputs)
-        self.perceptron = MLP(
-            channels * height * width,
-            last,
-            num_cells=cells,
-            activation_class=activation,
-            activate_last_layer=outputs is None,
-        )
-        self.matrix_units: bool = torch.cpu._is_amx_tile_supported()
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        """Return the outputs."""
-        *batch, channels, height, width = pixels.shape
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.matrix_units):
-            pictures = pixels.reshape(-1, channels, height, width).to(
-                torch.bfloat16 if self.matrix_units else torch.float32
+        def dense(inputs: int, cells: tuple[int, ...], outputs: int | None = None) -> MLP:
+            *before, last = cells if outputs is None else (*cells, outputs)
+            return MLP(
+                inputs,
+                last,
+                num_cells=before,
+                activation_class=activation,
+                activate_last_layer=outputs is None,
             )
-            pictures = (pictures / 255).contiguous(memory_format=torch.channels_last)
-            outputs = self.perceptron(self.convolutions(pictures).flatten(1))
+
+        size, hidden = 0, config.hidden
+        self.has_picture, self.has_lidar = observed.picture is not None, observed.lidar is not None
+        self.matrix_units: bool = self.has_picture and torch.cpu._is_amx_tile_supported()
+        if observed.picture is not None:
+            channels, *pixels = observed.picture
+            layers: list[nn.Module] = []
+            for filters, kernel, stride in zip(config.filters, config.kernels, config.strides, strict=True):
+                layers += [nn.Conv2d(channels, filters, kernel, stride), activation()]
+                channels = filters
+            height, width = config.outputs(*pixels)
+            if config.attention is not None:
+                layers.insert(-1, Attention(channels, config.attention))
+                height = 1
+            self.convolutions = nn.Sequential(*layers)
+            self.embedder: nn.Module = nn.Identity()
+            size = channels * height * width
+        if observed.lidar is not None:
+            if config.lidar_joins_after:
+                alone, hidden = hidden[: config.lidar_joins_after], hidden[config.lidar_joins_after :]
+                self.embedder, size = dense(size, alone), alone[-1]
+            self.lidar = dense(observed.lidar, config.lidar_hidden)
+            size += config.lidar_hidden[-1]
+        self.perceptron = dense(size, hidden, outputs)
+
+    def forward(self, *sensed: Tensor) -> Tensor:
+        """Return the outputs."""
+        batch = sensed[-1].shape[:-1] if self.has_lidar else sensed[0].shape[:-3]
+        parts = []
+        if self.has_lidar:
+            parts.append(self.lidar(sensed[-1].reshape(-1, sensed[-1].shape[-1])))
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.matrix_units):
+            if self.has_picture:
+                pictures = (
+                    sensed[0]
+                    .reshape(-1, *sensed[0].shape[-3:])
+                    .to(torch.bfloat16 if self.matrix_units else torch.float32)
+                )
+                pictures = (pictures / 255).contiguous(memory_format=torch.channels_last)
+                parts.insert(0, self.embedder(self.convolutions(pictures).flatten(1)))
+            outputs = self.perceptron(parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1))
         return outputs.float().reshape(*batch, -1)
+
+
+class Attention(nn.Module):
+    """A weighted sum of the places of a column of a picture, [n, channels, height, width] -> [n, channels, 1, width].
+
+    The weights of a column's places sum to 1, so that what is seen keeps its direction. Source: deepracer-simapp,
+    `bundle/markov/presets/left_stereo_attention.py`.
+    """
+
+    def __init__(self, channels: int, units: int) -> None:
+        """Build the layer of `units` that scores each place."""
+        super().__init__()
+        self.score, self.weight = nn.Linear(channels, units), nn.Linear(units, 1)
+
+    def forward(self, places: Tensor) -> Tensor:
+        """Return the sums."""
+        return (self.weights(places) * places).sum(dim=2, keepdim=True)
+
+    def weights(self, places: Tensor) -> Tensor:
+        """Return the weight of each place, [n, 1, height, width]."""
+        scores = self.weight(self.score(places.movedim(1, -1)).tanh())
+        return scores.movedim(-1, 1).softmax(dim=2)
 
 
 def _cnn(
@@ -187,25 +238,24 @@ def _cnn(
     continuous: bool,
     generator: torch.Generator,
 ) -> ActorCritic:
-    picture = observed.picture
-    assert picture is not None, "checked with the configuration"
+    keys = list(observed.seen)
 
     def layers(outputs: int | None, gain: float) -> nn.Module:
-        return _initialize(PictureNet(network, picture, outputs), gain, generator)
+        return _initialize(SensorNet(network, observed, outputs), gain, generator)
 
     if network.shared_trunk:
-        trunk = TensorDictModule(layers(None, _HIDDEN_GAIN), ["pixels"], ["hidden"])
+        trunk = TensorDictModule(layers(None, _HIDDEN_GAIN), keys, ["hidden"])
         width = network.hidden[-1]
         policy = _initialize(nn.Sequential(nn.Linear(width, outputs)), _POLICY_GAIN, generator)
         value = _initialize(nn.Sequential(nn.Linear(width, 1)), _VALUE_GAIN, generator)
         return ActorCritic(
-            _policy("hidden", policy, continuous, network.initial_std),
+            _policy(["hidden"], policy, continuous, network.initial_std),
             ValueOperator(value, in_keys=["hidden"]),
             trunk,
         )
-    policy = _policy("pixels", layers(outputs, _POLICY_GAIN), continuous, network.initial_std)
+    policy = _policy(keys, layers(outputs, _POLICY_GAIN), continuous, network.initial_std)
     if network.critic == "pictures":
-        return ActorCritic(policy, ValueOperator(layers(1, _VALUE_GAIN), in_keys=["pixels"]))
+        return ActorCritic(policy, ValueOperator(layers(1, _VALUE_GAIN), in_keys=keys))
     critic = MLP(
         observed.features, 1, num_cells=_CRITIC_HIDDEN, activation_class=_ACTIVATIONS[network.activation]
     )
@@ -214,14 +264,16 @@ def _cnn(
     )
 
 
-def _policy(in_key: str, layers: nn.Module, continuous: bool, initial_std: float) -> ProbabilisticActor:
+def _policy(
+    in_keys: list[str], layers: nn.Module, continuous: bool, initial_std: float
+) -> ProbabilisticActor:
     if continuous:
         scale = AddStateIndependentNormalScale(CONTINUOUS_ACTION_SIZE, init_value=math.log(initial_std))
-        layers, parameters, distribution = nn.Sequential(layers, scale), ["loc", "scale"], IndependentNormal
+        layers, parameters, distribution = _Gaussian(layers, scale), ["loc", "scale"], IndependentNormal
     else:
         parameters, distribution = ["logits"], Categorical
     return ProbabilisticActor(
-        TensorDictModule(layers, [in_key], parameters),
+        TensorDictModule(layers, in_keys, parameters),
         in_keys=parameters,
         distribution_class=distribution,
         # Non-finite parameters are caught where they arise (PPO.update); a check per distribution costs
@@ -231,6 +283,15 @@ def _policy(in_key: str, layers: nn.Module, continuous: bool, initial_std: float
         # The library's default is the mode: a policy called outside a collector would not explore.
         default_interaction_type=InteractionType.RANDOM,
     )
+
+
+class _Gaussian(nn.Sequential):
+    """Layers for one or more inputs, and the scale after them."""
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        layers, scale = self
+        parameters: tuple[Tensor, ...] = scale(layers(*inputs))
+        return parameters
 
 
 def _initialize(layers: nn.Module, head_gain: float, generator: torch.Generator) -> nn.Module:

@@ -373,7 +373,7 @@ def _promote(args: argparse.Namespace) -> int:
         raise BadInput(f"checkpoint={given}: {error}") from None
     run = resolve(name, stores.runs_dir, stores.uri)
 
-    from deepracer_exp.env.observation import feature_names
+    from deepracer_exp.env.observation import feature_names, observation_shape
 
     config = read_config(run.path)
     observation = parse_config(config.get("observation", {}), ObservationConfig)
@@ -383,9 +383,9 @@ def _promote(args: argparse.Namespace) -> int:
         args.model or run.path.resolve().parent.name,
         args.alias,
         feature_names(observation),
+        observation_shape(observation).seen,
         stores.uri,
         stores.runs_dir,
-        observation.picture,
     )
     print(f"{registered}: version {registered.version}")
     print(f"  run         {run.path}")

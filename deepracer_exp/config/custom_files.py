@@ -12,7 +12,7 @@ import yaml
 
 from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperparameters
-from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, read_model_metadata
+from deepracer_exp.deepracer.model_metadata import LIDARS, Action, ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 
@@ -50,10 +50,10 @@ NOT_APPLICABLE = {
     "stack_size": "the service ignores it, too",
     "term_cond_avg_score": "the service only stores it",
     "sac_alpha": "for SAC only",
-    "sensor": "here observation=NAME chooses what the policy sees",
+    "sensor": "here observation=NAME chooses what the policy sees; the same sensors:",
     "neural_network": "for camera images; here use network=NAME",
     "version": "the service's physics; here use car=NAME",
-    "lidar_config": "here the policy has no lidar",
+    "lidar_config": "here values of observation.lidar",
 }
 """Keys of both JSON files that have no effect here, and why."""
 
@@ -118,7 +118,8 @@ class CustomFiles:
         for key in metadata.given:
             if key in NOT_APPLICABLE:
                 shown = f"{key}={values[key]}" if key in values else key
-                yield shown, f"not applicable: {NOT_APPLICABLE[key]}"
+                same = [" ".join(sensor_overrides(metadata))] if key == "sensor" else []
+                yield shown, " ".join([f"not applicable: {NOT_APPLICABLE[key]}", *same])
         if metadata.renumbered:
             yield "action_space: index", "ignored: an action's number is its position, as in the service"
         yield from _unknown(metadata.given, model_metadata.KEYS)
@@ -138,6 +139,26 @@ class CustomFiles:
             if key in NOT_APPLICABLE:
                 yield f"{key}={getattr(given, key)}", f"not applicable: {NOT_APPLICABLE[key]}"
         yield from _unknown(given.given, hyperparameters.KEYS)
+
+
+def sensor_overrides(metadata: ModelMetadata) -> list[str]:
+    """Return the overrides with which a policy sees what the sensors of a model do."""
+    stereo = "STEREO_CAMERAS" in metadata.sensor
+    lidar = next((name for name in metadata.sensor if name in LIDARS), None)
+    if lidar is None:
+        return ["observation=stereo" if stereo else "observation=camera"]
+    lines = ["observation=camera_lidar"] + ["observation.camera.stereo_m=0.06"] * stereo
+    if lidar == "SECTOR_LIDAR":
+        lines.append("observation.lidar.kind=sectors")
+    elif lidar == "DISCRETIZED_SECTOR_LIDAR":
+        sectors, values, clip_m = metadata.lidar_config
+        lines += [
+            "observation.lidar.kind=discretized",
+            f"observation.lidar.sectors={sectors}",
+            f"observation.lidar.values_per_sector={values}",
+            f"observation.lidar.reach_m={clip_m:g}",
+        ]
+    return lines
 
 
 def read_custom_files(folder: str) -> CustomFiles:

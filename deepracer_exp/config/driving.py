@@ -97,8 +97,42 @@ class CameraConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LidarConfig:
+    """The LIDAR readings that the policy sees; where the scanner sits is the service's."""
+
+    kind: Literal["plain", "sectors", "discretized"]
+    """The service's LIDAR (distances), SECTOR_LIDAR (is something near?), DISCRETIZED_SECTOR_LIDAR (how near?)."""
+    reach_m: Annotated[float, Field(ge=0.15, le=12, allow_inf_nan=False)] | None
+    """Distance beyond which nothing is seen; None: the service's of this kind."""
+    sectors: Literal[1, 2, 4, 8, 16, 32, 64]
+    """With `discretized`: parts into which the rays are divided."""
+    values_per_sector: Annotated[int, Field(ge=1, le=64)]
+    """With `discretized`: steps of distance that are distinguished."""
+    noise_m: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+    """Standard deviation of the Gaussian noise on each distance."""
+    yaw_deg: Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
+    """Direction of the middle ray, 0: ahead."""
+
+    @property
+    def furthest_m(self) -> float:
+        """Distance beyond which nothing is seen."""
+        services = {"plain": 1.0, "sectors": 0.5, "discretized": 2.0}[self.kind]
+        return services if self.reach_m is None else self.reach_m
+
+    @property
+    def sector_shape(self) -> tuple[int, int]:
+        """Number of sectors, and of values of each."""
+        return (8, 1) if self.kind == "sectors" else (self.sectors, self.values_per_sector)
+
+    @property
+    def size(self) -> int:
+        """Number of readings."""
+        return 64 if self.kind == "plain" else self.sector_shape[0] * self.sector_shape[1]
+
+
+@dataclass(frozen=True, kw_only=True)
 class ObservationConfig:
-    """What is observed: the features, each divided by its scale, and the pictures of a camera."""
+    """What is observed: the features, each divided by its scale, the pictures of a camera, and a LIDAR."""
 
     lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
     """Distances ahead along the centre line at which the road is observed."""
@@ -108,12 +142,8 @@ class ObservationConfig:
     parts: tuple[OwnClass, ...] = ()
     """Classes of your own that add features."""
     camera: CameraConfig | None = None
-    """Pictures for the policy, which then sees nothing else; None: it sees the features."""
-
-    @property
-    def picture(self) -> tuple[int, int, int] | None:
-        """Channels, height and width of the pictures."""
-        return None if self.camera is None else self.camera.shape
+    """Pictures for the policy; with them or a LIDAR it does not see the features."""
+    lidar: LidarConfig | None = None
 
 
 class ObservationShape(NamedTuple):
@@ -122,6 +152,18 @@ class ObservationShape(NamedTuple):
     features: int
     picture: tuple[int, int, int] | None = None
     """Channels, height and width; None: there is no camera."""
+    lidar: int | None = None
+    """Number of readings; None: there is no LIDAR."""
+
+    @property
+    def seen(self) -> dict[str, tuple[int, ...]]:
+        """Keys of the batch that the policy reads, and their shapes."""
+        seen: dict[str, tuple[int, ...]] = {}
+        if self.picture is not None:
+            seen["pixels"] = self.picture
+        if self.lidar is not None:
+            seen["lidar"] = (self.lidar,)
+        return seen or {"observation": (self.features,)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,24 +70,36 @@ class Experiment:
             raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")
         if self.teacher is not None and not self.algorithm.teacher_iterations:
             raise ValueError("teacher: only algorithm=distill learns from one; accepted: algorithm=distill")
-        camera = self.observation.camera
-        if camera is None and isinstance(self.network, CNNConfig):
+        camera, lidar, network = self.observation.camera, self.observation.lidar, self.network
+        if isinstance(network, MLPConfig) and camera is not None:
             raise ValueError(
-                "network: convolutions need pictures; accepted: observation=camera, or network=mlp_small"
+                "network: reads features, and observation.camera gives pictures; accepted: network=cnn_small, "
+                "shallow, medium, deep, attention"
             )
-        if camera is not None:
-            if isinstance(self.network, MLPConfig):
-                raise ValueError(
-                    "network: reads features, and observation.camera gives pictures; accepted: network=cnn_small, "
-                    "shallow, medium, deep"
-                )
-            if (
-                isinstance(self.network, CNNConfig)
-                and min(self.network.outputs(camera.height, camera.width)) < 1
-            ):
-                raise ValueError(
-                    f"network.kernels: a picture of {camera.width}x{camera.height} is too small for these layers"
-                )
+        if isinstance(network, MLPConfig) and lidar is not None:
+            raise ValueError(
+                "network: reads features, and observation.lidar gives distances; accepted: network=lidar"
+            )
+        if not isinstance(network, CNNConfig):
+            return
+        if network.filters and camera is None:
+            raise ValueError(
+                "network: convolutions need pictures; accepted: observation=camera, or network="
+                + ("mlp_small" if lidar is None else "lidar")
+            )
+        if not network.filters and camera is not None:
+            raise ValueError("network.filters=[]: pictures need convolutions; accepted: network=cnn_small")
+        if not network.filters and lidar is None:
+            raise ValueError("network: reads a LIDAR; accepted: observation=lidar, or network=mlp_small")
+        if camera is not None and min(network.outputs(camera.height, camera.width)) < 1:
+            raise ValueError(
+                f"network.kernels: a picture of {camera.width}x{camera.height} is too small for these layers"
+            )
+        if camera is not None and lidar is not None and network.lidar_joins_after >= len(network.hidden):
+            raise ValueError(
+                f"network.lidar_joins_after={network.lidar_joins_after}: of {len(network.hidden)} hidden layers at "
+                f"least one comes after; accepted: 0 to {len(network.hidden) - 1}"
+            )
 
     @property
     def tracks(self) -> dict[str, TrackConfig]:

@@ -30,10 +30,13 @@ class MLPConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CNNConfig:
-    """Convolutional layers without padding for the pictures of a camera, then a multi-layer perceptron."""
+    """Convolutional layers without padding for the pictures of a camera, then a multi-layer perceptron.
 
-    filters: Annotated[tuple[Annotated[int, Field(ge=1, le=512)], ...], Field(min_length=1, max_length=8)]
-    """Of each convolutional layer."""
+    The readings of a LIDAR go through layers of their own and join before one of the perceptron's.
+    """
+
+    filters: Annotated[tuple[Annotated[int, Field(ge=1, le=512)], ...], Field(max_length=8)]
+    """Of each convolutional layer; none for a LIDAR without a camera."""
     kernels: tuple[Annotated[int, Field(ge=1, le=16)], ...]
     """Width and height of each layer's filters."""
     strides: tuple[Annotated[int, Field(ge=1, le=8)], ...]
@@ -41,11 +44,17 @@ class CNNConfig:
     """Units of each hidden layer after the convolutions."""
     activation: Literal["tanh", "relu", "elu", "silu"]
     critic: Literal["features", "pictures"]
-    """What the value network sees; it is of no use to a car that drives."""
+    """What the value network sees, `pictures`: the same as the policy; it is of no use to a car that drives."""
     shared_trunk: bool
     """One trunk with two heads; only where both see pictures."""
     initial_std: Positive
     """As in `MLPConfig`."""
+    attention: Units | None = None
+    """Units of the layer that scores each place of a picture; None: all places go into the perceptron."""
+    lidar_hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)] = (32, 32)
+    """Units of each hidden layer that sees a LIDAR alone."""
+    lidar_joins_after: Annotated[int, Field(ge=0, le=7)] = 0
+    """So many layers of `hidden` see pictures alone."""
 
     def __post_init__(self) -> None:
         """Refuse layers that are not complete, and a trunk that has nothing to share."""
@@ -53,6 +62,8 @@ class CNNConfig:
             raise ValueError("filters, kernels and strides: one number each per layer")
         if self.shared_trunk and self.critic == "features":
             raise ValueError("shared_trunk=true: a value network that sees features has no layers to share")
+        if self.attention is not None and not self.filters:
+            raise ValueError(f"attention={self.attention}: needs filters; accepted without: null")
 
     def outputs(self, height: int, width: int) -> tuple[int, int]:
         """Return height and width after the convolutions; below 1 where a picture is too small for them."""

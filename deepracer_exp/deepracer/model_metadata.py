@@ -34,6 +34,17 @@ class Action(NamedTuple):
     speed_mps: float
 
 
+class LidarSectors(NamedTuple):
+    """How a DISCRETIZED_SECTOR_LIDAR divides what it sees; `clipping_dist` in metres."""
+
+    num_sectors: int = 8
+    num_values_per_sector: int = 8
+    clipping_dist: float = 2.0
+
+
+SERVICES_SECTORS = LidarSectors()
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelMetadata:
     """One model_metadata.json with every default filled in.
@@ -50,6 +61,7 @@ class ModelMetadata:
     version: int = 5
     """Of the simulator; 5 has the newest physics that deepracer-for-cloud writes."""
     training_algorithm: str = "clipped_ppo"
+    lidar_config: LidarSectors = SERVICES_SECTORS
     given: tuple[str, ...] = field(default=(), compare=False)
     """Keys of the file, in its order; the service ignores those not in KEYS."""
     renumbered: bool = field(default=False, compare=False)
@@ -105,6 +117,7 @@ def read_model_metadata(path: str | Path, raw: bytes | None = None) -> ModelMeta
         neural_network=choice("neural_network", NEURAL_NETWORKS, lower=False),
         version=version,
         training_algorithm=algorithm,
+        lidar_config=_lidar_config(file) if set(sensor) & set(LIDARS) else SERVICES_SECTORS,
         given=tuple(data),
         renumbered=isinstance(space, list)
         and any(str(item.get("index", number)) != str(number) for number, item in enumerate(space)),
@@ -173,6 +186,19 @@ def _version_and_sensor(file: JsonObject) -> tuple[int, tuple[str, ...]]:
     return version, tuple(sensor)
 
 
+def _lidar_config(file: JsonObject) -> LidarSectors:
+    given = file.data.get("lidar_config", {})
+    if not isinstance(given, dict):
+        raise file.bad("lidar_config", given, "an object with " + ", ".join(LidarSectors._fields))
+    values = SERVICES_SECTORS._asdict() | given
+    sectors, many, clip_m = (values[key] for key in LidarSectors._fields)
+    sectors = file.whole("lidar_config.num_sectors", sectors, 1, 64)
+    if 64 % sectors:
+        raise file.bad("lidar_config.num_sectors", sectors, "a number that divides the 64 rays")
+    many = file.whole("lidar_config.num_values_per_sector", many, 1, 64)
+    return LidarSectors(sectors, many, file.number("lidar_config.clipping_dist", clip_m, 0.15, 12.0, " m"))
+
+
 def model_metadata_text(metadata: ModelMetadata) -> str:
     """Return the text of a model_metadata.json; `read_model_metadata` gives the same again."""
     if metadata.low is not None and metadata.high is not None:
@@ -191,4 +217,6 @@ def model_metadata_text(metadata: ModelMetadata) -> str:
         "action_space_type": metadata.action_space_type,
         "version": str(metadata.version),
     }
+    if "DISCRETIZED_SECTOR_LIDAR" in metadata.sensor:
+        values["lidar_config"] = metadata.lidar_config._asdict()
     return json.dumps(values, indent=2) + "\n"

@@ -20,15 +20,22 @@ from numpy.typing import NDArray
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.trace import EPISODE_STATUS, PACKED
 from deepracer_exp.errors import BadInput
+from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
 from .setup import RaceSetup, build_setup, deal
 
+Observed = Any
+"""An array, or with two sensors a dictionary of arrays."""
 
-class DeepRacerEnv(gym.Env[NDArray[Any], Any]):
+_BOUNDS = {"observation": (-np.inf, np.inf), "pixels": (0, 255), "lidar": (0, FURTHEST_M)}
+
+
+class DeepRacerEnv(gym.Env[Observed, Any]):
     """One car; with several tracks, every episode is on another one, by their weights.
 
-    Observation: the features of `Features`, float32; with a camera only its pictures, uint8. Action: an index into the
+    Observation: the features of `Features`, float32; with a camera or a LIDAR only its pictures, uint8, or readings,
+    float32; with both a dictionary of `pixels` and `lidar`. Action: an index into the
     action space's list, or steering and speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of
     the pose before the step.
     """
@@ -50,7 +57,7 @@ class DeepRacerEnv(gym.Env[NDArray[Any], Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[Any], dict[str, Any]]:
+    ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode, further along the track than the last; with a seed, start over."""
         super().reset(seed=seed)
         if seed is not None:
@@ -58,9 +65,9 @@ class DeepRacerEnv(gym.Env[NDArray[Any], Any]):
             self._courses = deal(self._weights)
         # Successive episodes are distributed over the courses as cars are.
         self._race.reset(course=np.array([next(self._courses)]))
-        return _observed(self._race)[0], {}
+        return _observed(self._race, 0), {}
 
-    def step(self, action: Any) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Drive for 1/15 s."""
         race = self._race
         race.step(np.asarray(action)[None])
@@ -69,10 +76,10 @@ class DeepRacerEnv(gym.Env[NDArray[Any], Any]):
             "episode_status": EPISODE_STATUS[int(race.trace[0, PACKED["episode_status"]])],
         }
         terminated, truncated = bool(race.terminated[0]), bool(race.truncated[0])
-        return _observed(race)[0], float(race.reward[0]), terminated, truncated, info
+        return _observed(race, 0), float(race.reward[0]), terminated, truncated, info
 
 
-class DeepRacerVectorEnv(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
+class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
 
     `infos` holds arrays `progress` and `episode_status` (codes of `deepracer.trace.EPISODE_STATUS`) of the poses
@@ -114,7 +121,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[Any], dict[str, Any]]:
+    ) -> tuple[Observed, dict[str, Any]]:
         """Start an episode with every car; with a seed (of a list, the first), start over."""
         first = seed[0] if isinstance(seed, list) else seed
         super().reset(seed=first)
@@ -125,7 +132,7 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
 
     def step(
         self, actions: NDArray[Any]
-    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    ) -> tuple[Observed, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Drive for 1/15 s with every car."""
         race = self._race
         race.step(np.asarray(actions))
@@ -138,8 +145,8 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
         if ended.any():
             ids = np.flatnonzero(ended)
             final = np.full(self.num_envs, None, dtype=object)
-            for car in ids:
-                final[car] = _observed(race)[car]
+            for car in ids.tolist():
+                final[car] = _observed(race, car)
             infos |= {
                 "final_obs": final,
                 "_final_obs": ended,
@@ -150,16 +157,22 @@ class DeepRacerVectorEnv(VectorEnv[NDArray[Any], NDArray[Any], NDArray[Any]]):
         return _observed(race), reward, terminated, truncated, infos
 
 
-def _observed(race: Race) -> NDArray[Any]:
-    """Return what a policy sees, (N, ...)."""
-    return race.seen.get("pixels", race.observation)
+def _keys(race: Race) -> list[str]:
+    return [key for key in ("pixels", "lidar") if key in race.seen] or ["observation"]
+
+
+def _observed(race: Race, car: int | slice = slice(None)) -> Observed:
+    """Return what a policy sees, of one car or of all, (N, ...)."""
+    seen = {key: race.seen[key][car] for key in _keys(race)}
+    return seen if len(seen) > 1 else seen.popitem()[1]
 
 
 def _spaces(race: Race) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-    observed = _observed(race)
-    observation: spaces.Space[Any] = spaces.Box(-np.inf, np.inf, observed.shape[1:], np.float32)
-    if observed.dtype == np.uint8:
-        observation = spaces.Box(0, 255, observed.shape[1:], np.uint8)
+    boxes: dict[str, spaces.Space[Any]] = {}
+    for key in _keys(race):
+        values = race.seen[key]
+        boxes[key] = spaces.Box(*_BOUNDS[key], values.shape[1:], values.dtype.type)
+    observation = spaces.Dict(boxes) if len(boxes) > 1 else boxes.popitem()[1]
     n_actions = race.setup.actions.n
     if n_actions is None:
         return observation, spaces.Box(-1.0, 1.0, (2,), np.float32)

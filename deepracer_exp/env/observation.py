@@ -54,7 +54,11 @@ def observation_shape(config: ObservationConfig) -> ObservationShape:
     Raises:
         BadInput: a part of the user's own cannot be used.
     """
-    return ObservationShape(len(feature_names(config)), config.picture)
+    return ObservationShape(
+        len(feature_names(config)),
+        None if config.camera is None else config.camera.shape,
+        None if config.lidar is None else config.lidar.size,
+    )
 
 
 def _names(config: ObservationConfig, parts: Sequence[ObservationPart]) -> tuple[str, ...]:

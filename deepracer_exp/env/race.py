@@ -12,6 +12,7 @@ from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.sim.batch import CarBatch, CarState
 
+from .lidar import Lidar
 from .observation import Features
 from .pictures import Pictures
 from .randomization import Randomization
@@ -49,6 +50,7 @@ class Race:
     Attributes:
         observation: features of the poses now, (N, size), float32.
         pixels: what the cameras see now, (N, channels, height, width), uint8; (N, 0) where there is no camera.
+        lidar: what the LIDARs last read, (N, size), float32; (N, 0) where there is none.
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step reached `episode.max_steps`, (N,), bool.
@@ -109,6 +111,10 @@ class Race:
             None if camera is None else Pictures(camera, setup.car, tracks, pictures, self.cars.tolist())
         )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
+        lidar = setup.observation.lidar
+        self._lidar = None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s)
+        self.lidar = np.zeros((n_cars, lidar.size if lidar is not None else 0), np.float32)
+        self._kept = _KEPT if lidar is None else (*_KEPT, "lidar")
         self.reward = np.zeros(n_cars)
         self.terminated = np.zeros(n_cars, bool)
         self.truncated = np.zeros(n_cars, bool)
@@ -123,14 +129,21 @@ class Race:
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """What a policy may read: `observation`, and with a camera `pixels`."""
-        return {"observation": self.observation} | ({"pixels": self.pixels} if self._pictures else {})
+        """What networks may read: `observation`, with a camera `pixels`, and with a LIDAR `lidar`."""
+        seen = {"observation": self.observation}
+        if self._pictures is not None:
+            seen["pixels"] = self.pixels
+        if self._lidar is not None:
+            seen["lidar"] = self.lidar
+        return seen
 
     def seed(self, seed: int) -> None:
         """Start over: random streams from `seed`, start positions and clocks from the first episode."""
         self.randomization.seed(seed)
         if self._pictures is not None:
             self._pictures.seed(seed)
+        if self._lidar is not None:
+            self._lidar.seed(seed)
         self.rules.restart()
 
     def reset(
@@ -161,6 +174,8 @@ class Race:
         self.randomization.begin(ids, self.rules.episode[ids])
         if self._pictures is not None:
             self._pictures.begin(ids, self.rules.episode[ids], self.rules.course[ids])
+        if self._lidar is not None:
+            self._lidar.begin(ids, self.rules.episode[ids])
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
         """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn again.
@@ -217,7 +232,7 @@ class Race:
             "cars": self.cars.copy(),
             "referee": self.rules.state_dict(),
             "randomization": self.randomization.state_dict(),
-            **{name.lstrip("_"): getattr(self, name).copy() for name in _KEPT},
+            **{name.lstrip("_"): getattr(self, name).copy() for name in self._kept},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -235,13 +250,16 @@ class Race:
                 f"the checkpoint does not fit: its first car has number {state['cars'][0]}; accepted here: "
                 f"{self.cars[0]}"
             )
-        for name in _KEPT:
+        for name in self._kept:
             setattr(self, name, checked_array(state, name.lstrip("_"), getattr(self, name).shape))
         self.rules.load_state_dict(state["referee"])
         self.randomization.load_state_dict(state["randomization"])
         if self._pictures is not None:
             self._pictures.seed(state["randomization"]["seed"])
             self._pictures.begin(self._everyone, self.rules.episode, self.rules.course)
+        if self._lidar is not None:
+            self._lidar.seed(state["randomization"]["seed"])
+            self._lidar.begin(self._everyone, self.rules.episode)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
         # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics
@@ -309,6 +327,10 @@ class Race:
                 self.rules.steps,
                 self.randomization.dropped,
             )
+        if self._lidar is not None:
+            self.lidar = self._lidar.next(
+                self.lidar, state, self.rules.course, self.rules.steps, self.randomization.dropped
+            )
 
     def _observe_started(self, ids: np.ndarray) -> None:
         """Do the same for the cars `ids` alone: of many cars some start an episode at nearly every step."""
@@ -326,6 +348,9 @@ class Race:
         if self._pictures is not None:
             self.pixels = self.pixels.copy()
             self.pixels[ids] = self._pictures.first(ids, state, self.rules.course[ids])
+        if self._lidar is not None:
+            self.lidar = self.lidar.copy()
+            self.lidar[ids] = self._lidar.read(ids, state, self.rules.course[ids], self.rules.steps[ids])
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
         track_index = self.rules.track_index[ids]

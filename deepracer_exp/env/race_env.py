@@ -10,6 +10,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from deepracer_exp.deepracer.trace import PACKED
+from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
 
@@ -17,10 +18,10 @@ from .race import Race
 class RaceEnv(EnvBase):
     """A `Race` as a TorchRL environment of batch size [N].
 
-    Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), `action` (int64
-    index, or float32 steering and speed in -1..1), and under `next` also `reward`, `done`, `terminated`, `truncated`
-    and `trace` (float64, columns `deepracer.trace.PACKED_COLUMNS`). `trace` is part of the reward spec because it
-    exists after a step only.
+    Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), with a LIDAR
+    `lidar` (float32), `action` (int64 index, or float32 steering and speed in -1..1), and under `next` also `reward`,
+    `done`, `terminated`, `truncated` and `trace` (float64, columns `deepracer.trace.PACKED_COLUMNS`). `trace` is part
+    of the reward spec because it exists after a step only.
     """
 
     def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
@@ -41,6 +42,8 @@ class RaceEnv(EnvBase):
         )
         if "pixels" in race.seen:
             self.observation_spec["pixels"] = Bounded(0, 255, race.pixels.shape, dtype=torch.uint8)
+        if "lidar" in race.seen:
+            self.observation_spec["lidar"] = Bounded(0.0, FURTHEST_M, race.lidar.shape, dtype=torch.float32)
         self.action_spec = (
             Bounded(-1.0, 1.0, (n_cars, 2), dtype=torch.float32)
             if n_actions is None

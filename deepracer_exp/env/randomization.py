@@ -34,6 +34,7 @@ class Purpose(IntEnum):
     OBSERVATION = 1
     EPISODE = 2
     PICTURE = 3
+    LIDAR = 4
 
 
 class CarStreams:

@@ -4,14 +4,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from deepracer_exp.config.custom_files import TAKEN
+from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
-from deepracer_exp.deepracer.model_metadata import (
-    ModelMetadata,
-    model_metadata_text,
-)
+from deepracer_exp.deepracer.model_metadata import LIDARS, LidarSectors, ModelMetadata, model_metadata_text
 from deepracer_exp.env.action_space import ActionSpace, metadata_of
 from deepracer_exp.errors import BadInput
 
@@ -30,7 +29,7 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tupl
         actions: its action space.
         reward: text of the reward function, with its constants filled in.
     """
-    metadata = metadata_of(actions)
+    metadata = replace(metadata_of(actions), **_sensors(experiment.observation))
     learning, changed = _hyperparameters(experiment)
     texts = {
         "reward_function.py": reward,
@@ -38,6 +37,19 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tupl
         "hyperparameters.json": hyperparameters_text(learning),
     }
     return texts, [*_action_notes(metadata), *changed]
+
+
+def _sensors(observation: ObservationConfig) -> dict[str, Any]:
+    """Return the keys of a model's metadata for what is observed; the service's models all have a camera."""
+    stereo = observation.camera is not None and observation.camera.stereo_m > 0
+    camera, lidar = "STEREO_CAMERAS" if stereo else "FRONT_FACING_CAMERA", observation.lidar
+    if lidar is None:
+        return {"sensor": (camera,)}
+    name = LIDARS[("plain", "sectors", "discretized").index(lidar.kind)]
+    return {
+        "sensor": (camera, name),
+        "lidar_config": LidarSectors(lidar.sectors, lidar.values_per_sector, lidar.furthest_m),
+    }
 
 
 def write_texts(texts: Mapping[str, str], folder: Path) -> None:

@@ -3,7 +3,7 @@
 import json
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,11 @@ import torch
 from rich.console import Console
 from torch import Tensor, nn
 
-from deepracer_exp.agents.actor_critic import ActorCritic, PictureNet
+from deepracer_exp.agents.actor_critic import ActorCritic, SensorNet
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.env.observation import feature_names, observation_shape
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import read_checkpoint
@@ -65,18 +65,23 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
     }
     observation = run.experiment.observation
     features = feature_names(observation)
-    if observation.camera is None:
-        facts["features"] = features
-        reads = f"observation  {len(features)} features, named in the file's metadata"
-    else:
+    observed = observation_shape(observation)
+    reads = []
+    if observation.camera is not None:
         facts["camera"] = vars(observation.camera)
         channels, height, width = observation.camera.shape
-        reads = f"pixels       pictures of {width}x{height} in bytes, channels: {channels}"
-    observed = ObservationShape(len(features), observation.picture)
+        reads.append(f"pixels       pictures of {width}x{height} in bytes, channels: {channels}")
+    if observation.lidar is not None:
+        facts["lidar"] = vars(observation.lidar)
+        reads.append(f"lidar        {observation.lidar.size} readings")
+    if not reads:
+        facts["features"] = features
+        reads.append(f"observation  {len(features)} features, named in the file's metadata")
     difference = write_onnx(DeployedPolicy(stored.networks, actions), observed, facts, path)
     out.print(f"{path}", soft_wrap=True)
     out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
-    out.print(f"  {reads}")
+    for line in reads:
+        out.print(f"  {line}")
     what = f"probabilities of {actions.n} actions" if actions.n else "mean steering and speed, -1 to 1"
     out.print(f"  policy       {what}")
     out.print("  command      steering in degrees, positive to the left; speed in m/s")
@@ -118,20 +123,21 @@ def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
 class DeployedPolicy(nn.Module):
     """The deterministic policy of an actor-critic, without value network and sampling.
 
-    `observation` (N, features), or `pixels` (N, channels, height, width), bytes -> `policy`, the probabilities of the
-    actions (N, n), of a continuous policy the mean of [steering, speed] clipped to -1..1 (N, 2); and `command` (N, 2),
-    degrees (positive to the left) and metres per second: of the likeliest action, or of that mean.
+    `observation` (N, features), or `pixels` (N, channels, height, width), bytes, and `lidar` (N, readings) -> `policy`,
+    the probabilities of the actions (N, n), of a continuous policy the mean of [steering, speed] clipped to -1..1
+    (N, 2); and `command` (N, 2), degrees (positive to the left) and metres per second: of the likeliest action, or of
+    that mean.
     """
 
     def __init__(self, networks: ActorCritic, actions: ActionSpace):
         """Share the layers of `networks`, which must not be trained further."""
         super().__init__()
         trunk = networks.trunk
-        self.trunk = nn.Identity() if trunk is None else trunk.module
+        self.trunk = None if trunk is None else trunk.module
         self.head = networks.policy_head[0].module
-        (self.in_key,) = networks.policy.in_keys
+        self.in_keys = list(networks.policy.in_keys)
         for module in self.modules():
-            if isinstance(module, PictureNet):
+            if isinstance(module, SensorNet):
                 module.matrix_units = False  # a file for any processor
         self.discrete = isinstance(actions, DiscreteActions)
         if isinstance(actions, DiscreteActions):
@@ -142,9 +148,9 @@ class DeployedPolicy(nn.Module):
         self.table: Tensor
         self.register_buffer("table", torch.as_tensor(table, dtype=torch.float32))
 
-    def forward(self, observed: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, *observed: Tensor) -> tuple[Tensor, Tensor]:
         """Return policy and command."""
-        outputs = self.head(self.trunk(observed))
+        outputs = self.head(*observed) if self.trunk is None else self.head(self.trunk(*observed))
         if self.discrete:
             policy = torch.softmax(outputs, dim=-1)
             return policy, self.table[policy.argmax(dim=-1)]
@@ -178,13 +184,13 @@ def write_onnx(
             "pip install 'deepracer-exp[export]'"
         ) from error
     observations = _observations(observed)
-    program = _program(model.eval(), observations[:2])
+    program = _program(model.eval(), [values[:2] for values in observations])
     onnx.helper.set_model_props(program, {key: json.dumps(value) for key, value in facts.items()})
     content = program.SerializeToString()
     difference = largest_difference(model, content, observations)
     if not difference <= TOLERANCE:
         raise RunFailed(
-            f"the ONNX file differs from the network by {difference:.3g} on {len(observations)} observations; "
+            f"the ONNX file differs from the network by {difference:.3g} on {len(observations[0])} observations; "
             f"at most {TOLERANCE:g} is rounding"
         )
     try:
@@ -195,44 +201,48 @@ def write_onnx(
     return difference
 
 
-def _observations(observed: ObservationShape) -> Tensor:
-    """Return standard normal features, or pictures of noise."""
+def _observations(observed: ObservationShape) -> list[Tensor]:
+    """Return pictures of noise, and standard normal features or readings."""
     generator = torch.Generator().manual_seed(0)
-    if observed.picture is None:
-        return torch.randn(CHECKED, observed.features, generator=generator)
-    return torch.randint(
-        0, 256, (CHECKED_PICTURES, *observed.picture), generator=generator, dtype=torch.uint8
-    )
+    count = CHECKED if observed.picture is None else CHECKED_PICTURES
+    return [
+        torch.randint(0, 256, (count, *shape), generator=generator, dtype=torch.uint8)
+        if key == "pixels"
+        else torch.randn(count, *shape, generator=generator)
+        for key, shape in observed.seen.items()
+    ]
 
 
-def largest_difference(model: DeployedPolicy, content: bytes, observations: Tensor) -> float:
+def largest_difference(model: DeployedPolicy, content: bytes, observations: Sequence[Tensor]) -> float:
     """Return how far any `policy` of a file is from the network's."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    (theirs,) = session.run([POLICY], {model.in_key: observations.numpy()})
+    inputs = {key: values.numpy() for key, values in zip(model.in_keys, observations, strict=True)}
+    (theirs,) = session.run([POLICY], inputs)
     with torch.no_grad():
-        ours = model(observations)[0].numpy()
+        ours = model(*observations)[0].numpy()
     return float(np.abs(theirs - ours).max())
 
 
-def _program(model: DeployedPolicy, observations: Tensor) -> Any:
+def _program(model: DeployedPolicy, observations: Sequence[Tensor]) -> Any:
     """Return the ONNX model, with the exporter's own messages silenced."""
     quiet = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     before = [logger.level for logger in quiet]
     for logger in quiet:
         logger.setLevel(logging.ERROR)
+    batch = torch.export.Dim("batch")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # between the libraries
             program = torch.onnx.export(
                 model,
-                (observations,),
-                input_names=[model.in_key],
+                tuple(observations),
+                input_names=model.in_keys,
                 output_names=[POLICY, COMMAND],
-                dynamic_shapes={"observed": {0: torch.export.Dim("batch")}},
+                dynamic_shapes={"observed": tuple({0: batch} for _ in observations)},
                 dynamo=True,
                 verbose=False,
             )

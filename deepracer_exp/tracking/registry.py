@@ -115,9 +115,9 @@ def promote(
     model: str,
     alias: str,
     features: Sequence[str],
+    seen: Mapping[str, tuple[int, ...]],
     uri: str | None,
     runs_dir: Path,
-    pixels: tuple[int, int, int] | None = None,
 ) -> Registered:
     """Register a checkpoint as a version of a model and give it the alias.
 
@@ -131,9 +131,9 @@ def promote(
         model: name, created if it does not exist.
         alias: moved from the version that has it.
         features: names of the observed features.
+        seen: keys and shapes of what the policy sees.
         uri: the store, as of `open_client`.
         runs_dir: likewise.
-        pixels: channels, height and width of what the policy sees; None: it sees the features.
 
     Raises:
         BadInput: a name is invalid, the checkpoint is missing or corrupt, the run is not recorded in this store or was
@@ -165,7 +165,7 @@ def promote(
         if version is None:
             metrics = _evaluated(run, folder)
             logged = _log_model(
-                client, recorded.info.experiment_id, run_id, run, folder, tags, features, pixels, metrics
+                client, recorded.info.experiment_id, run_id, run, folder, tags, features, seen, metrics
             )
             shown = (
                 f"Checkpoint {int(folder.name)} of `{run.name}`: {race_result(metrics)}.\n\n{picture(run_id)}"
@@ -192,7 +192,7 @@ def _log_model(
     checkpoint: Path,
     tags: Mapping[str, str],
     features: Sequence[str],
-    pixels: tuple[int, int, int] | None,
+    seen: Mapping[str, tuple[int, ...]],
     metrics: Mapping[str, float],
 ) -> "LoggedModel":
     """Log a checkpoint as a model of MLflow, with the tensors and JSON of the run's folder."""
@@ -202,17 +202,18 @@ def _log_model(
 
     name = f"{run.name}-{checkpoint.name}"
     logged = client.create_logged_model(experiment_id, name, run_id, dict(tags), model_type="policy")
-    observation = TensorSpec(np.dtype(np.float32), (-1, len(features)), "observation")
-    if pixels is not None:
-        observation = TensorSpec(np.dtype(np.uint8), (-1, *pixels), "pixels")
+    observed = [
+        TensorSpec(np.dtype(np.uint8 if key == "pixels" else np.float32), (-1, *shape), key)
+        for key, shape in seen.items()
+    ]
     command = TensorSpec(np.dtype(np.float32), (-1, 2), "command")
     described = Model(
         run_id=run_id,
         model_id=logged.model_id,
-        signature=ModelSignature(Schema([observation]), Schema([command])),
+        signature=ModelSignature(Schema(observed), Schema([command])),
         flavors={"deepracer_exp": {"checkpoint": "checkpoint", "format": "torchrl.checkpoint"}},
         metadata={
-            "observation": list(features) if pixels is None else ["pixels"],
+            "observation": list(features) if "observation" in seen else list(seen),
             "command": ["steering_deg", "speed_mps"],
         },
     )

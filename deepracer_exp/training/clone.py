@@ -107,26 +107,24 @@ def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
         )
         raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
     ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
-    if clone.observation.camera != parent.observation.camera:
-        changed = "; ".join(
-            describe_differences(
-                config_differences(
-                    [
-                        {"camera": one.observation.camera and vars(one.observation.camera)}
-                        for one in (parent, clone)
-                    ]
-                )
-            )
-        )
+    before, after = (
+        {
+            name: sensor and vars(sensor)
+            for name, sensor in (("camera", one.observation.camera), ("lidar", one.observation.lidar))
+        }
+        for one in (parent, clone)
+    )
+    if before != after:
+        changed = "; ".join(describe_differences(config_differences([before, after])))
         raise BadInput(f"observation: cannot be changed in a clone: {changed}; {why}")
     if clone.observation != parent.observation:
         odd = ", ".join(sorted(set(ours) ^ set(theirs))) or "the order, or what is looked ahead"
         raise BadInput(
             f"observation: cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}"
         )
-    before, after = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
-    if before != after:
-        raise BadInput(f"action_space: cannot be changed in a clone: {before} -> {after}; {why}")
+    acted, acts = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
+    if acted != acts:
+        raise BadInput(f"action_space: cannot be changed in a clone: {acted} -> {acts}; {why}")
 
 
 def _notes(parent: StoredRun, clone: Experiment, checkpoint: str) -> list[str]:

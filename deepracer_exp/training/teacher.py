@@ -33,11 +33,13 @@ def find_teacher(experiment: Experiment) -> StoredRun | None:
         raise BadInput(f"{what}: has other actions: {theirs}; accepted: a run with {ours}")
     before, now = run.experiment.observation, experiment.observation
     sees = stored.networks.policy.in_keys
-    if "pixels" in sees and before.camera != now.camera:
-        raise BadInput(
-            f"{what}: sees other pictures; accepted: a run with the same camera, or observation=features"
-        )
-    if "observation" in sees and replace(before, camera=None) != replace(now, camera=None):
+    for key, sensor in (("pixels", "camera"), ("lidar", "lidar")):
+        if key in sees and getattr(before, sensor) != getattr(now, sensor):
+            raise BadInput(
+                f"{what}: sees other {key}; accepted: a run with the same {sensor}, or observation=features"
+            )
+    features = [replace(one, camera=None, lidar=None) for one in (before, now)]
+    if "observation" in sees and features[0] != features[1]:
         raise BadInput(
             f"{what}: sees other features; accepted: a run whose features are those of this observation"
         )

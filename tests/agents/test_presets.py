@@ -6,11 +6,17 @@ import yaml
 from pydantic import TypeAdapter
 from tensordict import TensorDict
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.actor_critic import Attention, SensorNet, build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.driving import ObservationShape
-from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig, MLPConfig, NetworkConfig
+from deepracer_exp.config.learning import (
+    AlgorithmConfig,
+    CNNConfig,
+    LRScheduleConfig,
+    MLPConfig,
+    NetworkConfig,
+)
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -28,17 +34,19 @@ def load(group, name, type_):
     return TypeAdapter(type_).validate_python(values)
 
 
-@pytest.mark.parametrize("action_count", [7, None])
+@pytest.mark.parametrize(("action_count", "sensors"), [(7, "camera"), (None, "both")])
 @pytest.mark.parametrize("name", options("network"))
-def test_every_network_acts_and_judges(name, action_count):
+def test_every_network_acts_and_judges(name, action_count, sensors):
     config = load("network", name, NetworkConfig)
-    networks = build_actor_critic(
-        config, ObservationShape(11, (2, 120, 160)), action_count, torch.Generator()
-    )
     pixels = torch.randint(0, 256, (3, 2, 120, 160), dtype=torch.uint8)
-    steps = networks.value(
-        networks.policy(TensorDict({"observation": torch.randn(3, 11), "pixels": pixels}, [3]))
-    )
+    sensed = {"observation": torch.randn(3, 11), "pixels": pixels, "lidar": torch.rand(3, 64)}
+    if name == "lidar":
+        observed = ObservationShape(11, None, 64)
+    else:
+        observed = ObservationShape(11, (2, 120, 160), 64 if sensors == "both" else None)
+    networks = build_actor_critic(config, observed, action_count, torch.Generator())
+    assert set(networks.policy.in_keys) == ({"observation"} if name.startswith("mlp") else set(observed.seen))
+    steps = networks.value(networks.policy(TensorDict(sensed, [3])))
     assert steps["action"].shape == ((3,) if action_count else (3, 2))
     assert steps["state_value"].shape == (3, 1)
 
@@ -65,3 +73,32 @@ def test_every_key_is_explained_on_the_line_above_it(group, name):
     lines = (CONF / group / f"{name}.yaml").read_text().splitlines()
     for above, line in zip(["", *lines], lines, strict=False):
         assert not line or line.startswith(("#", "  - ")) or above.startswith("# ")
+
+
+def test_attention_sums_each_column_by_weights_that_sum_to_one():
+    torch.manual_seed(0)
+    layer, places = Attention(channels=6, units=5), torch.randn(2, 6, 4, 3)
+    weights = layer.weights(places)
+    assert weights.shape == (2, 1, 4, 3)
+    assert torch.allclose(weights.sum(dim=2), torch.ones(2, 1, 3))
+    hidden = torch.tanh(
+        torch.einsum("bchw,uc->buhw", places, layer.score.weight) + layer.score.bias[:, None, None]
+    )
+    score = torch.einsum("buhw,u->bhw", hidden, layer.weight.weight[0])
+    share = score.exp() / score.exp().sum(dim=1, keepdim=True)
+    expected = torch.einsum("bchw,bhw->bcw", places, share)
+    assert torch.allclose(layer(places)[:, :, 0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "alone", "joined"), [("shallow", None, 512), ("medium", 64, 512), ("deep", 512, 256)]
+)
+def test_lidar_joins_the_picture_before_the_services_middleware(name, alone, joined):
+    net = SensorNet(load("network", name, CNNConfig), ObservationShape(11, (1, 120, 160), 64), 7)
+    readings = {"shallow": 32}.get(name, 256)
+    picture = 11 * 16 * 64 if alone is None else alone
+    assert isinstance(net.embedder, torch.nn.Identity) == (alone is None)
+    first = next(layer for layer in net.perceptron if isinstance(layer, torch.nn.Linear))
+    assert (first.in_features, first.out_features) == (picture + readings, joined)
+    pixels, lidar = torch.zeros(2, 1, 120, 160, dtype=torch.uint8), torch.rand(2, 64)
+    assert not torch.equal(*net(pixels, lidar))

@@ -27,8 +27,9 @@ DRIVEN = ("track", "car", "action_space", "observation", "randomization", "episo
 
 @cache
 def composed(group: str, name: str) -> tuple[Experiment, Composition]:
-    """Compose an option into the default experiment, convolutions with a camera."""
-    sees = ["observation=camera"] if group == "network" and not name.startswith("mlp") else []
+    """Compose an option into the default experiment, a network with what it reads."""
+    reads = "features" if name.startswith("mlp") else "lidar" if name == "lidar" else "camera"
+    sees = [f"observation={reads}"] if group == "network" else []
     return compose_experiment([*sees, f"{group}={name}"])
 
 

@@ -19,6 +19,7 @@ from deepracer_exp.deepracer.hyperparameters import (
 )
 from deepracer_exp.deepracer.model_metadata import (
     Action,
+    LidarSectors,
     ModelMetadata,
     model_metadata_text,
     read_model_metadata,
@@ -42,6 +43,7 @@ DRFC = {
     "term_cond_max_episodes": 1000,
     "sac_alpha": 0.2,
 }
+SENSORS = ["FRONT_FACING_CAMERA", "DISCRETIZED_SECTOR_LIDAR"]
 DISCRETE = [{"steering_angle": -30, "speed": 0.6}, {"steering_angle": 30, "speed": 1.2}]
 CONTINUOUS = {"steering_angle": {"low": -20, "high": 30}, "speed": {"low": 1, "high": 2}}
 
@@ -202,6 +204,9 @@ RANGES = {"action_space_type": "continuous"}
         ({"sensor": ["LEFT_CAMERA", "STEREO_CAMERAS"]}, ["sensor", "one of"]),
         ({"sensor": ["STEREO_CAMERA"]}, ["did you mean STEREO_CAMERAS?"]),
         ({"sensor": ["LEFT_CAMERA", "LIDAR", "SECTOR_LIDAR"]}, ["sensor", "at most one"]),
+        ({"sensor": SENSORS, "lidar_config": [8]}, ["lidar_config", "num_sectors"]),
+        ({"sensor": SENSORS, "lidar_config": {"num_sectors": 7}}, ["lidar_config.num_sectors", "7", "64"]),
+        ({"sensor": SENSORS, "lidar_config": {"clipping_dist": 20}}, ["lidar_config.clipping_dist", "12"]),
     ],
 )
 def test_each_bad_value_is_named_with_its_key_and_what_is_accepted(tmp_path, change, named):
@@ -233,7 +238,8 @@ def test_written_files_read_as_they_were(tmp_path, kind):
     spaces = {
         "discrete": ModelMetadata(
             actions=(Action(-30.0, 0.6), Action(0.0, 2.25), Action(17.5, 4.0)),
-            sensor=("STEREO_CAMERAS", "SECTOR_LIDAR"),
+            sensor=("STEREO_CAMERAS", "DISCRETIZED_SECTOR_LIDAR"),
+            lidar_config=LidarSectors(16, 4, 3.5),
             neural_network="DEEP_CONVOLUTIONAL_NETWORK",
             version=4,
         ),

@@ -3,7 +3,9 @@ import json
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.custom_files import read_custom_files, sensor_overrides
 from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
+from deepracer_exp.deepracer.model_metadata import read_model_metadata
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
 from deepracer_exp.export.aws_files import aws_files, write_texts
@@ -36,6 +38,31 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
         assert getattr(ours, field).tolist() == getattr(theirs, field).tolist()
     assert (tmp_path / "aws" / "reward_function.py").read_text() == REWARD
     assert notes == []
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("observation=camera",),
+        ("observation=stereo",),
+        ("observation=camera_lidar",),
+        ("observation=camera_lidar", "observation.camera.stereo_m=0.06", "observation.lidar.kind=sectors"),
+        (
+            *(
+                "observation=camera_lidar",
+                "observation.lidar.kind=discretized",
+                "observation.lidar.sectors=16",
+            ),
+            *("observation.lidar.values_per_sector=3", "observation.lidar.reach_m=4.5"),
+        ),
+    ],
+)
+def test_exported_sensors_name_the_overrides_that_have_them(tmp_path, overrides):
+    write_texts(files(*overrides)[0], tmp_path)
+    named = sensor_overrides(read_model_metadata(tmp_path / "model_metadata.json"))
+    assert named == list(overrides)
+    note = f"the same sensors: {' '.join(overrides)}"
+    assert any(line.endswith(note) for line in read_custom_files(str(tmp_path)).remarks())
 
 
 @pytest.mark.parametrize(

@@ -110,9 +110,9 @@ def test_the_file_names_its_features(default):
 def test_a_file_of_another_network_is_detected(default):
     content = default.path.read_bytes()
     same = DeployedPolicy(default.networks, default.actions)
-    assert largest_difference(same, content, OBSERVATIONS) < TOLERANCE
+    assert largest_difference(same, content, [OBSERVATIONS]) < TOLERANCE
     other = DeployedPolicy(*policy(seed=1))
-    assert largest_difference(other, content, OBSERVATIONS) > 100 * TOLERANCE
+    assert largest_difference(other, content, [OBSERVATIONS]) > 100 * TOLERANCE
 
 
 def test_a_file_that_computes_something_else_is_not_written(programmed, tmp_path, monkeypatch):

@@ -110,6 +110,7 @@ def server(empty_database: Path, tmp_path: Path, free_port: int) -> Iterator[Ser
 
 FEATURES = ("offset", "speed", "yaw_rate")
 """Of a policy that is promoted."""
+SEEN = {"observation": (len(FEATURES),)}
 
 
 OBSERVATION = {

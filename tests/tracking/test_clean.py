@@ -12,7 +12,7 @@ from deepracer_exp.runs.checkpoint_files import pin
 from deepracer_exp.runs.clean import DELETED, FAILED_TRACE, SPARE_CHECKPOINTS, remove, survey
 from deepracer_exp.tracking.registry import promote, read_overview
 
-from .conftest import FEATURES
+from .conftest import FEATURES, SEEN
 
 HOUR_S = 3600
 
@@ -50,7 +50,7 @@ def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp
 def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
     run = season.run("1")
     season.recorded(run, client)
-    promote(run, "10", "model", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "10", "model", "champion", FEATURES, SEEN, None, season.runs_dir)
     (run / "checkpoints" / "pinned.json").unlink()
     client.delete_registered_model_alias("model", "champion")
     assert listed(season, asked=True) == []
@@ -85,7 +85,7 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
     cloned, registered = season.run("1"), season.run("2")
     season.clone("3", cloned)
     ids = [season.recorded(run, client) for run in (cloned, registered)]
-    promote(registered, "best", "model", "champion", FEATURES, None, season.runs_dir)
+    promote(registered, "best", "model", "champion", FEATURES, SEEN, None, season.runs_dir)
     for run_id in ids:
         client.delete_run(run_id)
     assert DELETED not in [what for _, what, _ in listed(season, asked=True)]

@@ -10,7 +10,7 @@ from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.registry import promote
 from deepracer_exp.tracking.store import folder_of, is_run_id
 
-from .conftest import FEATURES
+from .conftest import FEATURES, SEEN
 
 
 def refusal(run, season) -> str:
@@ -101,7 +101,7 @@ def test_a_summary_that_is_none_is_named(season, text):
 def test_an_alias_leads_to_run_and_checkpoint(season, client):
     run = season.run("1")
     season.recorded(run, client)
-    promote(run, "10", "season", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "10", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
     for given in ("champion", "season@champion"):
         found = resolve(given, season.runs_dir, None)
         assert (found.path, found.checkpoint, found.registered) == (run, "000010", "season@champion")
@@ -110,7 +110,7 @@ def test_an_alias_leads_to_run_and_checkpoint(season, client):
 
 def test_a_runs_name_goes_before_an_alias(season, client):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
     named = season.run("champion-of-all")
     assert resolve("champion", season.runs_dir, None).path == named
     assert resolve("season@champion", season.runs_dir, None).path == run
@@ -118,7 +118,7 @@ def test_a_runs_name_goes_before_an_alias(season, client):
 
 def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, tmp_path):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
     moved = tmp_path / "moved"
     season.runs_dir.rename(moved)
     assert resolve("champion", moved, None).path == moved / "season" / "1"
@@ -126,7 +126,7 @@ def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, t
 
 def test_a_checkpoint_that_is_not_the_registered_one_is_refused(season, client):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
     checkpoint = run / "checkpoints" / "000020"
     file = checkpoint / "agent" / "state.tdz"
     file.write_text("other weights")
@@ -161,7 +161,7 @@ UNKNOWN = {
 
 def test_what_no_model_is_called_by_is_refused(season, client):
     season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
     for reference, words in UNKNOWN.items():
         assert words in refusal(reference, season), reference
 
@@ -169,7 +169,7 @@ def test_what_no_model_is_called_by_is_refused(season, client):
 def test_a_bare_alias_of_two_models_is_refused(season, client):
     season.recorded(run := season.run("1"), client)
     for model in ("a", "b"):
-        promote(run, "best", model, "champion", FEATURES, None, season.runs_dir)
+        promote(run, "best", model, "champion", FEATURES, SEEN, None, season.runs_dir)
     text = refusal("champion", season)
     assert "2 models have this alias" in text
     assert "a@champion, b@champion" in text

@@ -10,7 +10,7 @@ from mlflow.models import Model
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.tracking.registry import is_alias, look_up, promote
 
-from .conftest import FEATURES
+from .conftest import FEATURES, SEEN
 
 
 def model_id(version) -> str:
@@ -20,7 +20,7 @@ def model_id(version) -> str:
 def check_promotion(season, client, uri):
     run = season.run("1")
     run_id = season.recorded(run, client)
-    first = promote(run, "best", "model", "champion", FEATURES, uri, season.runs_dir)
+    first = promote(run, "best", "model", "champion", FEATURES, SEEN, uri, season.runs_dir)
     version = client.get_model_version_by_alias("model", "champion")
     assert version.run_id == run_id
     assert version.tags == {
@@ -31,8 +31,8 @@ def check_promotion(season, client, uri):
     kept = {file.path for file in client.list_logged_model_artifacts(model_id(version), "checkpoint/agent")}
     assert kept == {"checkpoint/agent/state.tdz"}
     assert pinned(run / "checkpoints") == {"000020": ["registered as model"]}
-    assert promote(run, "20", "model", "champion", FEATURES, uri, season.runs_dir) == first
-    second = promote(run, "last", "model", "champion", FEATURES, uri, season.runs_dir)
+    assert promote(run, "20", "model", "champion", FEATURES, SEEN, uri, season.runs_dir) == first
+    second = promote(run, "last", "model", "champion", FEATURES, SEEN, uri, season.runs_dir)
     assert int(second.version) > int(first.version)
     assert look_up("model@champion", uri, season.runs_dir) == second
     assert look_up("champion", uri, season.runs_dir) == second
@@ -61,7 +61,7 @@ def test_a_promoted_version_has_metrics_signature_report_and_description(season,
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (run / "report.html").write_text("<p>what the training reports")
     client.log_metric(run_id, "race/score_s", 9.5, 1234, 2000)
-    promote(run, "best", "model", "champion", FEATURES, None, season.runs_dir)
+    promote(run, "best", "model", "champion", FEATURES, SEEN, None, season.runs_dir)
     version = client.get_model_version_by_alias("model", "champion")
     assert version.description.startswith(
         "Checkpoint 20 of `1`: race score 9.50 s, lap 9.88 s, 98.8 % of the lap."

@@ -33,6 +33,11 @@ CAMERA = (
         ("network.critic=pictures", "network.shared_trunk=true", "observation.camera.color=rgb"),
         ("observation=stereo", "network=medium", "budget.env_steps=512"),
         ("observation=camera", "network=deep", "observation.camera.frames=2", "budget.env_steps=512"),
+        ("observation=lidar", "network.critic=pictures", "observation.lidar.kind=sectors"),
+        (
+            *("observation=camera_lidar", "network=attention", "observation.camera.width=80"),
+            *("observation.camera.height=60", "network.shared_trunk=true", "budget.env_steps=512"),
+        ),
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )
@@ -46,23 +51,29 @@ def test_every_kind_of_picture_and_network_trains_and_is_raced(trained, call, ov
     assert raced.code == 0, raced.stderr
 
 
-def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_path):
-    ended = trained(*CAMERA)
+SENSORS = ("observation=camera_lidar", "observation.camera.width=80", "observation.camera.height=60")
+
+
+@pytest.mark.parametrize("sensors", [(), SENSORS, ("observation=lidar",)], ids=["camera", "both", "lidar"])
+def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_path, sensors):
+    ended = trained(*CAMERA, *sensors)
     exported = call("export", str(ended.folder), "format=onnx", "-o", str(tmp_path / "policy.onnx"))
     assert exported.code == 0, exported.stderr
-    env = gymnasium.make_vec("DeepRacer-v0", num_envs=6, overrides=["observation=camera_small"])
-    pixels, _ = env.reset()
+    env = gymnasium.make_vec("DeepRacer-v0", num_envs=6, overrides=sensors or ["observation=camera_small"])
+    seen, _ = env.reset()
+    if not isinstance(seen, dict):
+        seen = {"lidar" if sensors else "pixels": seen}
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
-    theirs = session.run(["policy"], {"pixels": pixels})[0]
+    theirs = session.run(["policy"], seen)[0]
     policy = load_policy(ended.folder)
     with torch.no_grad():
-        logits = policy.get_dist(policy_input(pixels)).probs
+        logits = policy.get_dist(policy_input(seen)).probs
     assert np.abs(theirs - logits.numpy()).max() < 0.01  # products in bfloat16
     assert np.abs(theirs[0] - theirs[-1]).max() > 0
 
 
-def policy_input(pixels: np.ndarray):
-    return TensorDict({"pixels": torch.from_numpy(pixels)}, [len(pixels)])
+def policy_input(seen: dict[str, np.ndarray]):
+    return TensorDict({key: torch.from_numpy(values) for key, values in seen.items()}, [6])
 
 
 def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(call):
@@ -94,6 +105,7 @@ def test_a_clone_keeps_what_the_networks_were_made_for(call):
     other = call("clone", str(parent), "observation.camera.width=100")
     assert other.code == 2
     assert "camera.width: 80 -> 100" in other.complaint
+    call("clone", str(parent), *SENSORS).assert_bad_input("cannot be changed in a clone", "lidar")
 
 
 def test_a_promoted_model_says_that_it_reads_pictures(call, tmp_path):
@@ -115,6 +127,16 @@ def test_a_promoted_model_says_that_it_reads_pictures(call, tmp_path):
         (("observation=camera", "network=mlp_small"), ("network", "features", "cnn_small")),
         (("network=shallow",), ("network", "pictures", "observation=camera")),
         (("observation=camera_small", "network=deep"), ("network.kernels", "80x60")),
+        (("observation=lidar", "network=mlp_small"), ("network", "features", "network=lidar")),
+        (("observation=lidar", "network=deep"), ("network", "pictures", "network=lidar")),
+        (("observation=camera", "network=lidar"), ("network.filters", "cnn_small")),
+        (("network=lidar",), ("network", "observation=lidar")),
+        (
+            ("observation=camera_lidar", "network.lidar_joins_after=1"),
+            ("network.lidar_joins_after", "0 to 0"),
+        ),
+        (("observation=lidar", "observation.lidar.sectors=7"), ("observation.lidar.sectors", "7")),
+        (("observation=lidar", "observation.lidar.reach_m=13"), ("observation.lidar.reach_m", "13")),
         (("observation=camera_small", "network.shared_trunk=true"), ("shared_trunk", "features")),
         (("observation=camera_small", "network.strides=[1]"), ("network", "strides")),
     ],

@@ -75,6 +75,7 @@ def whole(trained, *overrides):
             *("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
             "algorithm.frames_per_iteration=256",
         ),
+        ("observation=lidar", "randomization=sim2real"),
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )

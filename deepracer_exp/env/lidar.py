@@ -1,0 +1,131 @@
+"""The LIDAR of an observation: what each car's scanner reads, in the forms of the service's three sensors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.driving import LidarConfig
+from deepracer_exp.sim.batch import CarState
+from deepracer_exp.sim.lidar import (
+    FURTHEST_M,
+    MOUNT_X_M,
+    MOUNT_Z_M,
+    NEAREST_M,
+    RAYS,
+    SCANS_PER_S,
+    join_walls,
+    ring_walls,
+    scan,
+)
+from deepracer_exp.sim.scenery import wall_ring
+from deepracer_exp.tracks.track import Track
+
+from .randomization import CarStreams, Ids, Purpose
+
+_NOISE_NUMBERS = 2**16
+"""Standard normal numbers that all scans take their noise from: drawing each would take longer than the scan."""
+_NEXT_SCAN = 7919
+"""Numbers by which the noise of successive scans is apart."""
+
+Readings = NDArray[np.float32]
+
+
+class Lidar:
+    """The LIDARs of N cars; each stays at its height, however the body leans.
+
+    The noise of a scan depends only on the seed, the car's number, and the numbers of its episode and step.
+    """
+
+    def __init__(
+        self, config: LidarConfig, tracks: Sequence[Track], cars: Sequence[int], period_s: float
+    ) -> None:
+        """Set up the walls; call `seed` and then `begin` next.
+
+        Args:
+            config: what is read of a scan.
+            tracks: of each course one.
+            cars: their numbers over all processes.
+            period_s: of control.
+        """
+        self._config, self._cars = config, list(cars)
+        rings = [None if track.floor.walls_height_m < MOUNT_Z_M else wall_ring(track) for track in tracks]
+        self._walls = join_walls([np.empty((0, 4)) if ring is None else ring_walls(ring) for ring in rings])
+        self._scans_per_step = SCANS_PER_S * period_s
+        self._noise_at = np.zeros(len(self._cars), np.int64)
+        self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS)
+
+    def seed(self, seed: int) -> None:
+        """Start all streams from `seed`."""
+        self._streams = CarStreams(seed, self._cars, Purpose.LIDAR)
+
+    def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
+        """Draw the noise of new episodes of the cars `ids`; episodes are numbered per car from 0."""
+        for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True):
+            self._noise_at[car] = self._streams.at(car, episode).integers(_NOISE_NUMBERS)
+
+    def read(self, ids: Ids, state: CarState, course: NDArray[np.intp], steps: NDArray[np.int64]) -> Readings:
+        """Return what new scans of the cars `ids` read, (n, size).
+
+        Args:
+            ids: indices of the cars, (n,).
+            state: of these cars, arrays (n,).
+            course: index of each of these cars' track, (n,).
+            steps: control steps of each of these cars' episodes, (n,).
+        """
+        poses = np.stack(
+            [
+                state.x_m + MOUNT_X_M * np.cos(state.yaw_rad),
+                state.y_m + MOUNT_X_M * np.sin(state.yaw_rad),
+                state.yaw_rad + np.radians(self._config.yaw_deg),
+            ],
+            axis=1,
+        )
+        distances = scan(self._walls, poses, course)
+        distances[distances > FURTHEST_M] = np.inf
+        at = self._noise_at[ids] + _NEXT_SCAN * steps
+        noise = self._noise[(at[:, None] + np.arange(RAYS)) % _NOISE_NUMBERS]
+        return readings(self._config, distances + self._config.noise_m * noise)
+
+    def next(
+        self,
+        before: Readings,
+        state: CarState,
+        course: NDArray[np.intp],
+        steps: NDArray[np.int64],
+        dropped: NDArray[np.bool_] | None,
+    ) -> Readings:
+        """Return what all cars read after `before`, (N, size): a new scan, or the same until there is one.
+
+        Args:
+            before: (N, size).
+            state: arrays (N,).
+            course: index of each car's track, (N,).
+            steps: control steps of each car's episode, (N,).
+            dropped: cars that see nothing new, (N,); None: there are none.
+        """
+        # A step is 2/3 of a scan; the margin is for rounding.
+        scans = np.floor(self._scans_per_step * np.stack([steps, steps - 1]) + 1e-6)
+        same = scans[0] == scans[1]
+        if dropped is not None:
+            same |= dropped
+        now = self.read(np.arange(len(before)), state, course, steps)
+        return np.where(same[:, None], before, now)
+
+
+def readings(config: LidarConfig, distances_m: NDArray[np.float64]) -> Readings:
+    """Return scans (n, RAYS) as the policy sees them, (n, size).
+
+    `plain`: the distances, clipped. Otherwise the nearest of each sector, as one of `values_per_sector` equal steps up
+    to the furthest distance, of which the one it is in is 1; all are 0 where there is nothing nearer (deepracer-simapp,
+    `bundle/markov/filters/observation/observation_sector_discretize_filter.py`).
+    """
+    furthest_m = config.furthest_m
+    clipped = np.clip(distances_m, NEAREST_M, furthest_m)
+    if config.kind == "plain":
+        return clipped.astype(np.float32)
+    sectors, values = config.sector_shape
+    nearest = clipped.reshape(len(clipped), sectors, -1).min(axis=2)
+    step = np.where(nearest < furthest_m, np.floor(nearest * (values / furthest_m)), values)
+    seen: Readings = (step[..., None] == np.arange(values)).astype(np.float32)
+    return seen.reshape(len(seen), -1)

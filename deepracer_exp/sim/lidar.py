@@ -1,0 +1,91 @@
+"""The LIDAR of all cars at once: distances to upright walls, which from above are segments."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+RAYS = 64
+ANGLES_RAD = np.linspace(-2.61799, 2.61799, RAYS)
+"""From the sensor's middle direction, to the right first (this and the next three: deepracer-simapp,
+`bundle/markov/sensors/constants.py`)."""
+NEAREST_M, FURTHEST_M = 0.15, 12.0
+SCANS_PER_S = 10
+"""Slower than the camera: every third control step sees the scan of the step before (`racecar.gazebo`)."""
+MOUNT_X_M, MOUNT_Z_M = 0.02913, 0.1847
+"""Ahead of the chassis origin, and above the floor (`bundle/urdf/deepracer/deepracer_single_cam_lidar.urdf`)."""
+
+
+class Walls(NamedTuple):
+    """What reflects, in groups of segments.
+
+    Attributes:
+        segments_m: ends ax, ay, bx, by, (S, 4).
+        first: of each group, and the number of all segments, (groups + 1,).
+    """
+
+    segments_m: NDArray[np.float64]
+    first: NDArray[np.int64]
+
+
+def join_walls(groups: Sequence[NDArray[np.float64]]) -> Walls:
+    """Return groups of segments, (n, 4) each, none of which need have any."""
+    return Walls(np.concatenate([np.empty((0, 4)), *groups]), np.cumsum([0, *(len(some) for some in groups)]))
+
+
+def ring_walls(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the segments (n - 1, 4) of a closed outline, (n, 2), of a field or a box."""
+    return np.hstack([ring[:-1], ring[1:]])
+
+
+def scan(walls: Walls, poses: NDArray[np.float64], group: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the distances along each of the rays, (N, RAYS), metres; infinite where nothing is hit.
+
+    Args:
+        walls: what reflects.
+        poses: x and y in metres and direction in radians of each sensor, (N, 3).
+        group: of the walls that each sensor sees, (N,).
+    """
+    out = np.empty((len(poses), RAYS))
+    _scan(
+        np.ascontiguousarray(poses),
+        group,
+        walls.segments_m,
+        walls.first,
+        np.cos(ANGLES_RAD),
+        np.sin(ANGLES_RAD),
+        out,
+    )
+    return out
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _scan(poses, group, segments, first, cosines, sines, out):  # type: ignore[no-untyped-def]
+    """Intersect every ray with every segment; without branches the rays of a segment are computed together."""
+    rays = len(cosines)
+    ray_x, ray_y = np.empty(rays), np.empty(rays)
+    end = 1.0 + 1e-9  # rounding opens no gap between two walls
+    for car in range(len(poses)):
+        x, y, direction = poses[car]
+        cos, sin = np.cos(direction), np.sin(direction)
+        nearest = out[car]
+        for ray in range(rays):
+            ray_x[ray] = cos * cosines[ray] - sin * sines[ray]
+            ray_y[ray] = sin * cosines[ray] + cos * sines[ray]
+            nearest[ray] = np.inf
+        for index in range(first[group[car]], first[group[car] + 1]):
+            from_x, from_y = segments[index, 0] - x, segments[index, 1] - y
+            along_x, along_y = (
+                segments[index, 2] - segments[index, 0],
+                segments[index, 3] - segments[index, 1],
+            )
+            area = from_x * along_y - from_y * along_x
+            for ray in range(rays):
+                # from + share * along = distance * ray; parallel ones give no number that passes.
+                turn = ray_x[ray] * along_y - ray_y[ray] * along_x
+                distance = area / turn
+                share = (from_x * ray_y[ray] - from_y * ray_x[ray]) / turn
+                hit = (distance >= 0.0) & (share >= 1.0 - end) & (share <= end) & (distance < nearest[ray])
+                nearest[ray] = distance if hit else nearest[ray]

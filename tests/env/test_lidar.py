@@ -1,0 +1,139 @@
+import dataclasses
+from itertools import pairwise
+
+import gymnasium
+import numpy as np
+import pytest
+import shapely
+from torchrl.envs.utils import check_env_specs
+
+import deepracer_exp.env.gym_env  # noqa: F401 - registers DeepRacer-v0
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.lidar import readings
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
+
+LIDAR, STILL, FAR = "observation=lidar", "observation.lidar.noise_m=0", "observation.lidar.reach_m=12"
+PLAIN = compose_experiment([LIDAR])[0].observation.lidar
+
+
+def drive(race: Race, steps: int) -> list[np.ndarray]:
+    return [(race.step(np.full(race.n_cars, 7)), race.lidar)[1] for _ in range(steps)]
+
+
+@pytest.mark.parametrize("sensors", [LIDAR, "observation=camera_lidar"])
+def test_specs_and_rollouts_agree(setup_of, sensors):
+    check_env_specs(RaceEnv(Race(setup_of(sensors), 3)))
+
+
+def test_it_looks_back_and_sideways_at_the_walls_around_the_field(race_of):
+    race = race_of(LIDAR, STILL, FAR)
+    now, track = race._batch.read(), race.setup.track
+    ring = shapely.box(*track.road.bounds).buffer(track.floor.walls_beyond_m, join_style="mitre").exterior
+    x, y, yaw = (float(values[0]) for values in (now.x_m, now.y_m, now.yaw_rad))
+    eye = np.array([x + MOUNT_X_M * np.cos(yaw), y + MOUNT_X_M * np.sin(yaw)])
+    for ray, read in zip(ANGLES_RAD, race.lidar[0], strict=True):
+        ahead = np.array([np.cos(yaw + np.pi + ray), np.sin(yaw + np.pi + ray)])
+        wall = shapely.LineString([eye, eye + 30 * ahead]).intersection(ring)
+        assert read == pytest.approx(min(shapely.Point(eye).distance(wall), 12.0), abs=1e-5)
+    back = race_of(LIDAR, STILL, FAR, "observation.lidar.yaw_deg=0")
+    assert np.abs(back.lidar - race.lidar).max() > 0.5
+
+
+def test_where_a_world_has_no_walls_it_sees_nothing(race_of):
+    assert (race_of(LIDAR, "track.floor.walls_beyond_m=null").lidar == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "near", "read"),
+    [
+        ({}, [0.02, 0.4, 5.0, np.inf], [0.15, 0.4, 1.0, 1.0]),
+        ({"reach_m": 3.0}, [0.02, 0.4, 5.0, np.inf], [0.15, 0.4, 3.0, 3.0]),
+    ],
+)
+def test_distances_are_clipped(changes, near, read):
+    config = dataclasses.replace(PLAIN, **changes)
+    assert readings(config, np.array([near])).tolist() == [pytest.approx(read)]
+
+
+def test_a_sector_is_one_where_its_nearest_ray_is_within_reach():
+    distances = np.full((1, 64), 0.5)
+    distances[0, [0, 15, 40]] = 0.49, 0.2, np.inf
+    assert readings(dataclasses.replace(PLAIN, kind="sectors"), distances).tolist() == [
+        [1, 1, 0, 0, 0, 0, 0, 0]
+    ]
+
+
+@pytest.mark.parametrize(("sectors", "values", "reach_m"), [(8, 8, 2.0), (4, 7, 0.7), (64, 3, 0.9)])
+def test_a_discretized_sector_marks_the_step_of_its_nearest_ray(sectors, values, reach_m):
+    config = dataclasses.replace(
+        PLAIN, kind="discretized", sectors=sectors, values_per_sector=values, reach_m=reach_m
+    )
+    distances = np.random.default_rng(0).uniform(0.1, 1.5 * reach_m, (30, 64))
+    seen = readings(config, distances).reshape(30, sectors, values)
+    nearest = np.maximum(distances.reshape(30, sectors, -1).min(axis=2), 0.15)
+    assert np.array_equal(seen.sum(axis=2), nearest < reach_m)
+    some = np.argwhere(seen)
+    low, high = some[:, 2] * reach_m / values, (some[:, 2] + 1) * reach_m / values
+    marked = nearest[some[:, 0], some[:, 1]]
+    assert ((low <= marked + 1e-12) & (marked < high + 1e-12)).all()
+    assert config.size == sectors * values
+
+
+def test_two_of_three_steps_bring_a_new_scan(race_of):
+    race = race_of(LIDAR, FAR)
+    scans = [race.lidar, *drive(race, 12)]
+    new = [not np.array_equal(*pair) for pair in pairwise(scans)]
+    assert new == [False, True, True] * 4
+
+
+def test_noise_has_the_deviation_that_was_asked_for_and_differs_from_car_to_car(race_of):
+    options = (LIDAR, FAR, "episode.start_advance=0")
+    still, noisy = (race_of(*options, f"observation.lidar.noise_m={m}", n_cars=50).lidar for m in (0, 0.02))
+    noise = (noisy - still)[still < 11.5]
+    assert noise.std() == pytest.approx(0.02, rel=0.1)
+    assert len(np.unique(noisy, axis=0)) > len(np.unique(still, axis=0))
+
+
+def test_a_cars_noise_depends_on_its_number_and_not_on_the_batch(race_of):
+    options = (LIDAR, FAR, "episode.start_advance=0")
+    together, alone = race_of(*options, n_cars=5), race_of(*options, n_cars=2, first_car=3)
+    for ours, theirs in zip(drive(together, 4), drive(alone, 4), strict=True):
+        assert np.array_equal(ours[3:], theirs)
+
+
+@pytest.mark.parametrize("steps", [6, 7])
+def test_a_race_put_back_reads_on_as_the_original(race_of, steps):
+    options = (LIDAR, FAR, "randomization.observation_dropout=[0.3,0.3]")
+    race, other = race_of(*options, n_cars=4), race_of(*options, n_cars=4)
+    drive(race, steps)
+    other.load_state_dict(race.state_dict())
+    for ours, theirs in zip(drive(race, 5), drive(other, 5), strict=True):
+        assert np.array_equal(ours, theirs)
+
+
+def test_starting_one_car_leaves_what_the_others_read(race_of):
+    race = race_of(LIDAR, FAR, n_cars=3)
+    before = drive(race, 5)[-1]
+    race.reset(np.array([1]))
+    assert np.array_equal(race.lidar[[0, 2]], before[[0, 2]])
+    assert not np.array_equal(race.lidar[1], before[1])
+
+
+def test_gymnasium_sees_readings_or_a_dictionary_of_both_sensors():
+    for overrides, shapes in (
+        ([LIDAR], {"lidar": (64,)}),
+        (["observation=camera_lidar"], {"pixels": (1, 120, 160), "lidar": (64,)}),
+    ):
+        env = gymnasium.make("DeepRacer-v0", overrides=overrides)
+        seen, _ = env.reset()
+        assert env.observation_space.contains(seen)
+        cars = gymnasium.make_vec("DeepRacer-v0", num_envs=3, overrides=overrides)
+        cars.reset()
+        all_seen, *_ = cars.step(np.full(3, 7))
+        assert cars.observation_space.contains(all_seen)
+        if len(shapes) == 1:
+            seen, all_seen = {"lidar": seen}, {"lidar": all_seen}
+        assert {key: values.shape for key, values in seen.items()} == shapes
+        assert {key: values.shape[1:] for key, values in all_seen.items()} == shapes

@@ -1,0 +1,59 @@
+"""The LIDAR's rays against walls whose distances are known."""
+
+import numpy as np
+import pytest
+import shapely
+
+from deepracer_exp.sim.lidar import ANGLES_RAD, RAYS, join_walls, ring_walls, scan
+
+ROOM = ring_walls(np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.5], [0.0, 2.5], [0.0, 0.0]]))
+FIRST = np.zeros(1, np.intp)
+
+
+def poses_in(low: float, high: tuple[float, float], count: int) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    x, y = (low + (far - 2 * low) * rng.random(count) for far in high)
+    return np.stack([x, y, rng.uniform(-np.pi, np.pi, count)], axis=1)
+
+
+def test_in_a_room_every_ray_ends_at_the_nearest_of_its_four_walls():
+    poses = poses_in(0.1, (4.0, 2.5), 300)
+    angle = poses[:, 2:] + ANGLES_RAD
+    cos, sin = np.cos(angle), np.sin(angle)
+    to_x = np.where(cos > 0, 4.0 - poses[:, :1], -poses[:, :1]) / cos
+    to_y = np.where(sin > 0, 2.5 - poses[:, 1:2], -poses[:, 1:2]) / sin
+    distances = scan(join_walls([ROOM]), poses, np.zeros(300, np.intp))
+    assert distances == pytest.approx(np.minimum(to_x, to_y), abs=1e-9)
+
+
+def test_a_sensor_turned_by_one_ray_sees_the_same_ring_moved_by_one():
+    box = ring_walls(np.array([[3.0, 1.0], [3.2, 1.0], [3.2, 1.3], [3.0, 1.3], [3.0, 1.0]]))
+    walls = join_walls([np.vstack([ROOM, box])])
+    pose = np.array([[1.3, 0.7, 0.4]])
+    turned = pose + np.array([0, 0, ANGLES_RAD[1] - ANGLES_RAD[0]])
+    assert scan(walls, turned, FIRST)[0, :-1] == pytest.approx(scan(walls, pose, FIRST)[0, 1:], abs=1e-9)
+
+
+def test_among_segments_that_cross_the_nearest_hides_the_others():
+    segments = np.random.default_rng(1).uniform(-3, 3, (7, 4))
+    pose = np.array([0.3, -0.2, 1.0])
+    lines = shapely.union_all([shapely.LineString(some.reshape(2, 2)) for some in segments])
+    eye = shapely.Point(pose[:2])
+    expected = np.full(RAYS, np.inf)
+    for ray, angle in enumerate(pose[2] + ANGLES_RAD):
+        end = pose[:2] + 10 * np.array([np.cos(angle), np.sin(angle)])
+        crossed = shapely.LineString([pose[:2], end]).intersection(lines)
+        if not crossed.is_empty:
+            expected[ray] = eye.distance(crossed)
+    assert np.isinf(expected).any()
+    distances = scan(join_walls([segments]), pose[None], FIRST)[0]
+    assert distances == pytest.approx(expected, abs=1e-9)
+
+
+def test_each_sensor_sees_the_walls_of_its_own_group():
+    walls = join_walls([np.empty((0, 4)), ROOM, ROOM + 10])
+    poses = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [11.0, 11.0, 0.0]])
+    nothing, here, there = scan(walls, poses, np.arange(3))
+    assert np.isinf(nothing).all()
+    assert here == pytest.approx(there)
+    assert here[RAYS // 2] == pytest.approx(3.0 / np.cos(ANGLES_RAD[RAYS // 2]))
