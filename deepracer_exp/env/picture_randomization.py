@@ -173,19 +173,23 @@ def _places(track: Track) -> Floats:
 def _soil(pictures, spots, depths):  # type: ignore[no-untyped-def]
     """Darken spots of the pictures."""
     count, channels, height, width = pictures.shape
+    across = np.empty(width, np.float32)
     for at in range(count):
         for x, y, size in spots[at] if depths[at] > 0 else spots[at, :0]:
-            middle_x, middle_y, size_px = x * width, y * height, size * width
-            for row in range(max(int(middle_y - 3 * size_px), 0), min(int(middle_y + 3 * size_px), height)):
-                down = (row + 0.5 - middle_y) / size_px
-                for column in range(
-                    max(int(middle_x - 3 * size_px), 0), min(int(middle_x + 3 * size_px), width)
-                ):
-                    across = (column + 0.5 - middle_x) / size_px
-                    left = 1.0 - depths[at] * np.exp(-0.5 * (down * down + across * across))
-                    for channel in range(channels):
-                        value = pictures[at, channel, row, column] * left + 0.5
-                        pictures[at, channel, row, column] = np.uint8(value)
+            reach = 3 * size * width
+            first, last = max(int(x * width - reach), 0), min(int(x * width + reach), width)
+            for column in range(first, last):
+                across[column] = np.exp(-0.5 * (((column + 0.5) / width - x) / size) ** 2)
+            for row in range(max(int(y * height - reach), 0), min(int(y * height + reach), height)):
+                down = np.float32(
+                    depths[at] * np.exp(-0.5 * (((row + 0.5) / width - y * height / width) / size) ** 2)
+                )
+                for channel in range(channels):
+                    for column in range(first, last):
+                        left = np.float32(1) - down * across[column]
+                        pictures[at, channel, row, column] = np.uint8(
+                            left * np.float32(pictures[at, channel, row, column]) + np.float32(0.5)
+                        )
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
