@@ -60,7 +60,7 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
 
     Args:
         car: the car's dimensions and masses.
-        visual: also give the car a shell, a camera housing and wheels that steer and spin to look at, and add a
+        visual: for films, also give the car a shell, a camera housing and wheels that steer and spin, and add a
             light. For pictures of given poses, not to simulate.
     """
     spec = mujoco.MjSpec()
