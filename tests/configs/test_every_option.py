@@ -30,13 +30,14 @@ def composed(group: str, name: str) -> tuple[Experiment, Composition]:
     """Compose an option into the default experiment, a network with what it reads."""
     reads = "features" if name.startswith("mlp") else "lidar" if name == "lidar" else "camera"
     sees = [f"observation={reads}"] if group == "network" else []
-    return compose_experiment([*sees, f"{group}={name}"])
+    teacher = ["teacher=a_run"] if name == "distill" else []
+    return compose_experiment([*sees, *teacher, f"{group}={name}"])
 
 
 def test_the_groups_are_the_fields_of_an_experiment():
     fields = {field.name for field in dataclasses.fields(Experiment)}
     assert set(groups()) - {"experiment"} <= fields
-    assert fields - set(groups()) == {"name", "seed", "runs_dir", "debug", "report"}
+    assert fields - set(groups()) == {"name", "seed", "runs_dir", "debug", "report", "teacher"}
 
 
 def test_every_folder_of_options_belongs_to_an_entry_point():
