@@ -36,7 +36,9 @@ from .command import train
 from .report import benchmark_parser, mean_and_interval, table, write_json
 
 STARTS = 20
-LIMITS = {"scale": (0.5, 2.0), "noise": (0.0, 1.0), "light": (0.0, 1.0), "blur": (0.0, 1.0)}
+LIMITS = {"scale": (0.5, 2.0), "objects": (0, 50)} | dict.fromkeys(
+    ("noise", "light", "blur", "dirt"), (0.0, 1.0)
+)
 """Values that make sense, by the end of a quantity's name; others have no limits."""
 
 
@@ -69,8 +71,8 @@ def drive(run: Path, under: dict[str, PictureRandomizationConfig | None]) -> dic
     torch.set_num_threads(1)
     stored = resolve(str(run), run.parent, None)
     policy = read_checkpoint(stored.experiment, stored.checkpoints, "last").networks.policy
-    protocol = ("evaluation=three_trials", "evaluation.held_out=null", f"evaluation.trials={STARTS}")
-    config = compose_evaluation(["run=any", *protocol])[0].evaluation
+    protocol = ("evaluation=three_trials", "evaluation.usual=null", "evaluation.held_out=null")
+    config = compose_evaluation(["run=any", *protocol, f"evaluation.trials={STARTS}"])[0].evaluation
     completion = {}
     for name, pictures in under.items():
         randomization = dataclasses.replace(stored.experiment.randomization, pictures=pictures)
@@ -98,7 +100,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     trained = compose_experiment(["randomization=sim2real"])[0].randomization.pictures
     assert trained is not None
     under = conditions(trained)
-    ways = {"without": [], "with": [override_line("randomization.pictures", vars(trained))]}
+    ways = {
+        "without": [],
+        "with": [
+            override_line(
+                "randomization.pictures", {name: list(ends) for name, ends in vars(trained).items()}
+            )
+        ],
+    }
     driven: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
     fixed = ["observation=camera_small", "stopping=none", "checkpoints.every=null", "tracking=off"]
     for seed in range(options.seeds):
