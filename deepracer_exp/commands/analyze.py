@@ -1,0 +1,207 @@
+"""`deepracer-exp analyze`: how a training went, from its logs."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deepracer_exp.errors import BadInput, count, reading
+from deepracer_exp.files import LOG_BYTES, open_user_file
+from deepracer_exp.runs.files import REPORT
+
+from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
+
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.log_view import LogView
+    from deepracer_exp.analysis.page import Glimpse
+    from deepracer_exp.config.car import CarConfig
+
+_ANALYZE_EPILOG = """\
+  deepracer-exp analyze RUN                                 one of our runs
+  deepracer-exp analyze ~/Downloads/training.tar.gz         logs of the service, the console or deepracer-for-cloud:
+                                                            a folder, an archive or a file of any layout
+  deepracer-exp analyze RUN --compare RUN logs/             compare how it and others learned
+  deepracer-exp analyze RUN --reward racing_line            what another reward function would have paid for
+  deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
+
+The page needs no network: findings in words first, then figures and tables, then what could not be read and why.
+"""
+
+
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "analyze",
+        _analyze,
+        help="find out from logs how a training went",
+        description="Read the logs of a training, ours or the service's of any year, print the findings, and write a "
+        "page of figures.",
+        epilog=_ANALYZE_EPILOG,
+        runs_rewards=True,
+    )
+    what = parser.add_argument("what", metavar="RUN | LOGS", help="a run, or logs of the service")
+    what.completer = complete_runs  # type: ignore[attr-defined]
+    add_overrides(parser, "runs_dir=DIR | tracking.uri=URI")
+    parser.add_argument(
+        "--compare",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="RUN | LOGS",
+        help="runs or logs to compare it with",
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--reward",
+        metavar="NAME | FILE",
+        help="reward function, of the zoo or a file, to replay on its steps",
+    )
+    parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
+    parser.add_argument(
+        "--track",
+        metavar="NAME | ROUTE",
+        help="one of several tracks, or the route (.npy) of an unknown one",
+    )
+    parser.add_argument(
+        *("-o", "--output"),
+        metavar="FILE",
+        help="page to write (default: report.html of a run, else NAME-analysis.html)",
+    )
+
+
+def _analyze(args: argparse.Namespace) -> int:
+    target_s = None if args.target is None else _seconds(args.target)
+
+    # `--compare RUN LOGS runs_dir=DIR` takes all three words.
+    words = [args.what, *args.overrides]
+    stores = read_stores(word for word in [*words, *args.compare] if is_override(word))
+    logs = [word for word in words if not is_override(word)]
+    if len(logs) != 1:
+        raise BadInput(f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one")
+    place = _place(logs[0], stores)
+    beside = [_place(what, stores) for what in args.compare if not is_override(what)]
+    if args.output is not None and not Path(args.output).absolute().parent.is_dir():
+        raise BadInput(f"--output {args.output}: its folder does not exist; accepted: a file in a folder")
+    reward = None
+    if args.reward is not None:
+        from deepracer_exp.rewards.source import named_reward_source
+
+        reward = named_reward_source(args.reward)
+
+    from deepracer_exp.analysis.findings import findings
+    from deepracer_exp.analysis.log_report import LogPage, write_page
+    from deepracer_exp.analysis.log_tables import headline
+    from deepracer_exp.analysis.log_view import prepare
+    from deepracer_exp.analysis.reward_comparison import compare_rewards
+    from deepracer_exp.evaluation.reward_replay import replay_reward
+    from deepracer_exp.evaluation.reward_terms import run_terms
+    from deepracer_exp.runs.own_recording import read_log
+
+    recording = read_log(place)
+    car = _car(place)
+    view, terms = run_terms(prepare(recording, args.track), car)
+    strip: list[Glimpse] = []
+    if _sees_pictures(place):
+        from deepracer_exp.evaluation.sight import run_glimpses
+
+        view, strip = run_glimpses(view, place)
+    others = [_light(prepare(read_log(other))) for other in beside]
+    replay = None if reward is None else compare_rewards(view, replay_reward(view, reward, car))
+    out = Path(args.output) if args.output else _default_out(place, recording.name)
+    found = findings(view, target_s)
+    try:
+        write_page(out, LogPage(view, found, others, replay, terms, strip))
+    except OSError as error:
+        raise BadInput(
+            f"--output {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
+        ) from error
+
+    print(f"{view.name}: {headline(view)}")
+    for number, one in enumerate(found, 1):
+        print(f"{number:3d}  {one.sentence}")
+    for sentence in replay.sentences if replay is not None else ():
+        print(f"     {sentence}")
+    if view.problems:
+        print(f"\n  {count(len(view.problems), 'problem')} while reading, the first: {view.problems[0]}")
+    print(f"\n  page  {out}")
+    if args.open:
+        import webbrowser
+
+        webbrowser.open(out.resolve().as_uri())
+    return 0
+
+
+def _place(what: str, stores: Stores) -> Path:
+    """Return the file or folder of logs, or the folder of a run.
+
+    Raises:
+        BadInput: there is none, or the name of a run is ambiguous.
+    """
+    with reading(what, "logs of the service, or a run"):
+        path = Path(what).expanduser()
+        if path.exists():
+            if not path.is_dir():
+                open_user_file(path, "logs of the service, or a run", LOG_BYTES).close()
+            return path
+    from deepracer_exp.runs.resolve import resolve
+
+    try:
+        return resolve(what, stores.runs_dir, stores.uri).path
+    except BadInput as error:
+        why = str(error).removeprefix(f"{what}: ")
+        raise BadInput(f"{what}: no such file or folder, and no run: {why}") from None
+
+
+def _car(place: Path) -> "CarConfig":
+    """Return the car of a run of ours; the service's has the dimensions of the default one."""
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.config.parse import parse_experiment
+    from deepracer_exp.runs.files import read_config
+    from deepracer_exp.runs.own_recording import is_own_run
+
+    try:
+        if is_own_run(place):
+            return parse_experiment(read_config(place)).car
+    except BadInput:  # another version, whose cars had the same dimensions
+        pass
+    return compose_experiment([])[0].car
+
+
+def _sees_pictures(place: Path) -> bool:
+    from deepracer_exp.runs.files import read_config, sees_pictures
+    from deepracer_exp.runs.own_recording import is_own_run
+
+    try:
+        return is_own_run(place) and sees_pictures(read_config(place))
+    except BadInput:  # the page lists which files could not be read
+        return False
+
+
+def _light(view: "LogView") -> "LogView":
+    """Return a view without the steps of its training: a comparison shows iterations and races only."""
+    from dataclasses import replace
+
+    steps = view.recording.steps
+    recording = replace(view.recording, steps=steps[steps["stream"] != "training"].copy())
+    return replace(view, steps=view.steps.iloc[:0].copy(), recording=recording)
+
+
+def _default_out(place: Path, name: str) -> Path:
+    from deepracer_exp.runs.own_recording import is_own_run
+
+    if is_own_run(place):
+        return place / REPORT
+    safe = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name).strip("-.")
+    return Path(f"{safe[:80] or 'log'}-analysis.html")
+
+
+def _seconds(text: str) -> float:
+    import math
+
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise BadInput(f"--target {text}: accepted: seconds above 0, such as 9.5")
+    return seconds
