@@ -57,7 +57,8 @@ class LivePage:
         self._evaluator = Evaluator(run.experiment, protocol, threads=1)
         self._newest: tuple[str, bool] | None = None
         self.shown = ("0", "")
-        self._draw("waiting for the first checkpoint", None, [], "")
+        waiting = "its laps are being driven" if (run.checkpoints / _LAST).exists() else "no checkpoint yet"
+        self._draw(waiting, None, [], "")
 
     def update(self) -> bool:
         """Draw the page again if there is something newer; return whether there was."""

@@ -111,7 +111,7 @@ def run(trained, tmp_path) -> StoredRun:
 def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run, protocol):
     page = LivePage(run, protocol("three_trials", trials=2, time_s=1))
     first = page.shown
-    assert "waiting for the first checkpoint" in first[1]
+    assert "its laps are being driven" in first[1]
     assert page.update()
     second = page.shown
     assert page.update() is False, "drawn again for nothing"
