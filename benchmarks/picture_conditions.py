@@ -1,6 +1,6 @@
 """Does a policy of pictures drive under conditions it has never seen? With and without image randomisation in training.
 
-    python -m benchmarks.picture_conditions [--seeds 5] [--steps 250000] [--json FILE] [OVERRIDE...]
+    python -m benchmarks.picture_conditions [--seeds 5] [--steps 200000] [--json FILE] [OVERRIDE...]
 
 For each seed two trainings of the same length run as `deepracer-exp train observation=camera_small`: one always sees
 the same picture of a place, the other trains with the pictures of `randomization=sim2real` (`randomization.pictures`
@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = benchmark_parser("picture_conditions", __doc__)
     parser.add_argument("--seeds", type=int, default=5, help="trainings of each, with the seeds 0, 1, ...")
-    parser.add_argument("--steps", type=int, default=250_000, help="control steps of a training")
+    parser.add_argument("--steps", type=int, default=200_000, help="control steps of a training")
     options = parser.parse_args(arguments)
     trained = compose_experiment(["randomization=sim2real"])[0].randomization.pictures
     assert trained is not None
