@@ -148,14 +148,8 @@ def training(overrides: Sequence[str], iterations: int, rounds: int, folder: Pat
     def peer(physics_threads: int, torch_threads: int, car_racing: bool = False) -> tuple[float, float]:
         command = [sys.executable, "-m", "benchmarks.sb3_peer", *overrides]
         if car_racing:
-            command += [
-                "--car-racing",
-                "--iterations",
-                "1",
-                f"algorithm.frames_per_iteration={CAR_RACING_FRAMES}",
-            ]
-        else:
-            command += ["--iterations", str(iterations)]
+            command += [f"algorithm.frames_per_iteration={CAR_RACING_FRAMES}", "--car-racing"]
+        command += ["--iterations", "1" if car_racing else str(iterations)]
         command += ["--physics-threads", str(physics_threads), "--torch-threads", str(torch_threads)]
         root = Path(__file__).parents[1]
         done = subprocess.run(command, cwd=root, check=True, stdout=subprocess.PIPE, text=True)
