@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from imageio_ffmpeg import read_frames
 
+from deepracer_exp.runs.files import read_config
+
 drawable = os.environ.get("MUJOCO_GL") or any(map(ctypes.util.find_library, ("EGL", "OSMesa")))
 
 
@@ -26,7 +28,7 @@ def test_a_film_shows_the_car_on_its_way(trained, start, tmp_path, view):
     pictures = [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in frames]
     # Two seconds, or less where the car leaves the road, and the last picture a second more.
     assert 16 <= len(pictures) <= 47
-    road = np.array([0x4A, 0x4D, 0x52])
+    road = np.array(list(bytes.fromhex(read_config(folder)["track"]["floor"]["road_color"][1:])))
     seen = (np.abs(pictures[0] - road).max(axis=2) < 12).mean()
     assert seen > 0.02, "no road to be seen"
     assert np.abs(pictures[0] - pictures[-1]).max() > 60, "nothing moves"

@@ -93,7 +93,7 @@ def test_workers_that_die_without_a_word_are_not_looked_for_in_an_empty_log(run_
     tiny = ("experiment=tiny", "tracking=off", "sweep.trials=2", "sweep.workers=1")
     ended = run_at(tmp_path, "sweep", *tiny, "algorithm.lr=1e-3,1e-4", "reward.file=mine.py")
     assert ended.code == 3
-    assert "the last with exit code 0; a reward function can do that;" in ended.complaint
+    assert "the last one with exit code 0; a reward function can do that;" in ended.complaint
 
 
 @pytest.mark.slow
