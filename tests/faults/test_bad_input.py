@@ -1,25 +1,39 @@
 """What the user gave cannot be used: one line, exit code 2, no folder."""
 
+import json
 import pickle
 import resource
+from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
+SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+
 
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
+        (["track=reinvent_bse"], ["track=reinvent_bse", "did you mean reinvent_base?"]),
+        (["network=mpl"], ["network=mpl", "did you mean mlp?"]),
+        (["algorithm.learning_rate=1"], ["algorithm.learning_rate: no such key"]),
+        (["collector.proceses=2"], ["collector.proceses: no such key", "did you mean", "processes?"]),
+        (["tarck=reinvent_base"], ["tarck", "did you mean track?"]),
         (["seed=now"], ['seed="now"', "integer"]),
+        (["algorithm.lr=fast"], ['algorithm.lr="fast"', "number"]),
+        (["algorithm.lr=-1"], ["algorithm.lr=-1", "greater than 0"]),
         (["reward.constants.SPEED=2"], ["reward.constants.SPEED", "no such constant"]),
         (["algorithm.batch_size=2048"], ["algorithm.batch_size=2048", "algorithm.frames_per_iteration=1024"]),
+        (["collector.cars=2000"], ["algorithm.frames_per_iteration=1024", "collector.cars=2000"]),
+        (["algorithm.episodes_per_iteration=5"], ["frames_per_iteration=1024", "episodes_per_iteration=5"]),
+        (["collector.processes=3"], ["collector.processes=3", "collector.mode=in_process"]),
+        (["budget.env_steps=null"], ["env_steps", "iterations", "minutes", "max_cost"]),
         (["=1"], ["=1"]),
         (["seed=[1"], ["seed=[1"]),
     ],
 )
 def test_values_that_cannot_be_used_are_refused_in_one_line(train_here, overrides, words):
-    """What is no value of a key is tested where experiments are composed."""
     train_here(*overrides).assert_bad_input(*words)
 
 
@@ -37,28 +51,90 @@ def test_cars_that_do_not_fit_into_memory_are_refused_in_one_line(train_here):
     assert refused.summary["status"] == "failed"
 
 
-REWARD = "def reward_function(params):\n    return 1.0\n"
+def _route(folder: Path, name: str, kind: str) -> str:
+    path = folder / name
+    match kind:
+        case "shape":
+            np.save(path, np.zeros((10, 5)))
+        case "nan":
+            np.save(path, np.full((10, 6), np.nan))
+        case "text array":
+            np.save(path, np.array([["left"] * 6] * 10))
+        case "pickled":
+            np.save(path, np.array([{"no": "numbers"}], dtype=object), allow_pickle=True)
+        case "plain pickle":
+            path.write_bytes(pickle.dumps(np.zeros((10, 6))))
+        case "text":
+            path.write_text("once round the block\n")
+        case "empty":
+            path.write_bytes(b"")
+        case "torn":
+            np.save(path, np.zeros((10, 6)))
+            path.write_bytes(path.read_bytes()[:200])
+    return str(path)
 
 
 @pytest.mark.parametrize(
-    ("key", "name", "content", "word"),
-    [
-        ("track.file", "route.npy", pickle.dumps(np.zeros((10, 6))), "not a NumPy array file"),
-        ("track.file", "route.yaml", b"knots: [[0, 0]]", "knots"),
-        ("action_space.file", "model_metadata.json", b'{"action_space": []}', "action_space"),
-        ("reward.file", "my_reward.py", None, "my_reward.py"),
-        ("reward.file", "my_reward.py", b"def reward_function(params)\n    return 1.0\n", "line 1"),
-        ("reward.file", "my_reward.py", f"import sys\nsys.exit(0)\n{REWARD}".encode(), "SystemExit"),
-        ("reward.file", "my_reward.py", f"while True:\n    pass\n{REWARD}".encode(), "time limit of 1 s"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
+    "kind", ["missing", "shape", "nan", "text array", "pickled", "plain pickle", "text", "empty", "torn"]
 )
-def test_a_file_that_cannot_be_used_is_refused_with_its_name(train_here, tmp_path, key, name, content, word):
-    """What its reader refuses is tested with each reader."""
-    path = tmp_path / name
-    if content is not None:
-        path.write_bytes(content)
-    train_here(f"{key}={path}", "reward.time_limit_s=1").assert_bad_input(str(path), word)
+def test_a_route_that_is_none_is_refused_with_its_name(train_here, tmp_path, kind):
+    path = _route(tmp_path, "route.npy", kind)
+    train_here(f"track.file={path}").assert_bad_input("route.npy")
+
+
+@pytest.mark.parametrize("text", [None, "", "knots", "knots: [[0, 0]", "knots: [[0, 0]]", "- 1"])
+def test_a_route_of_knots_that_is_none_is_refused_with_its_name(train_here, tmp_path, text):
+    path = tmp_path / "route.yaml"
+    if text is not None:
+        path.write_text(text)
+    train_here(f"track.file={path}").assert_bad_input("route.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        (None, ""),
+        ("", ""),
+        ("{", ""),
+        ("[]", ""),
+        ("{}", "action_space"),
+        ('{"action_space": []}', "action_space"),
+        ('{"action_space": [{"steering_angle": "left", "speed": 1}]}', "steering_angle"),
+        ('{"action_space": [{"steering_angle": 10}]}', "speed"),
+        ('{"action_space": [{"steering_angle": NaN, "speed": 1}]}', "steering_angle"),
+        (json.dumps({"action_space": [{"steering_angle": 0, "speed": -1}]}), "speed"),
+    ],
+)
+def test_a_model_metadata_that_is_none_is_refused_with_its_name(train_here, tmp_path, text, word):
+    path = tmp_path / "model_metadata.json"
+    if text is not None:
+        path.write_text(text)
+    train_here(f"action_space.file={path}").assert_bad_input("model_metadata.json", word)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, []),
+        ("", ["reward_function"]),
+        ("def reward_function(params)\n    return 1.0\n", ["line 1"]),
+        ("def rewardfunction(params):\n    return 1.0\n", ["did you mean", "reward_function"]),
+        ("def reward_function():\n    return 1.0\n", ["line 1", "one argument"]),
+        (
+            "import no_such_module\ndef reward_function(params):\n    return 1.0\n",
+            ["no_such_module", "line 1"],
+        ),
+        ("import sys\nsys.exit(0)\ndef reward_function(params):\n    return 1.0\n", ["SystemExit", "line 2"]),
+        ("1 / 0\ndef reward_function(params):\n    return 1.0\n", ["ZeroDivisionError", "line 1"]),
+        ("while True:\n    pass\ndef reward_function(params):\n    return 1.0\n", ["time limit of 1 s"]),
+        ("reward_function = 3\n", ["reward_function is 3"]),
+    ],
+)
+def test_a_reward_file_that_is_none_is_refused_with_its_name(train_here, tmp_path, text, words):
+    path = tmp_path / "my_reward.py"
+    if text is not None:
+        path.write_text(text)
+    train_here(f"reward.file={path}", "reward.time_limit_s=1").assert_bad_input("my_reward.py", *words)
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused(train_here, tmp_path):
@@ -68,10 +144,15 @@ def test_a_folder_in_the_place_of_a_file_is_refused(train_here, tmp_path):
 
 def test_runs_dir_that_is_a_file_is_refused(train_here, tmp_path):
     (tmp_path / "taken").write_text("")
-    for more in ((), ("tracking=mlflow",)):
-        train_here("runs_dir=taken", *more).assert_bad_input("runs_dir=taken")
+    ended = train_here("runs_dir=taken")
+    ended.assert_bad_input("runs_dir=taken")
     train_here("runs_dir=taken/deeper").assert_bad_input("runs_dir=taken/deeper")
     assert (tmp_path / "taken").read_text() == ""
+
+
+def test_runs_dir_that_is_a_file_is_refused_with_tracking_too(call, tmp_path):
+    (tmp_path / "taken").write_text("")
+    call("train", "experiment=tiny", "collector=in_process", "runs_dir=taken").assert_bad_input("taken")
 
 
 def test_a_grid_with_one_bad_file_runs_nothing(call, tmp_path):
@@ -105,3 +186,9 @@ def test_an_unknown_option_is_refused_by_the_command_itself(start, tmp_path):
     ended = start("train", "track=reinvent_bse").end()
     ended.assert_bad_input("did you mean reinvent_base?")
     assert ended.stderr.count("\n") == 1
+
+
+def test_an_unknown_argument_is_refused(call):
+    ended = call("train", "--fast")
+    assert ended.code == 2
+    assert "--fast" in ended.stderr

@@ -75,7 +75,7 @@ def test_a_second_interruption_ends_at_once(start_training, tmp_path):
     began = time.monotonic()
     training.signal_group(signal.SIGINT)
     ended = training.end()
-    assert time.monotonic() - began < 60
+    assert time.monotonic() - began < 10
     assert ended.code == 130
     assert "Traceback" not in ended.stderr
     assert ended.summary["status"] == "interrupted"

@@ -6,8 +6,7 @@ import time
 import pytest
 
 MODES = pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
-SOON_S = 60.0
-"""On a machine that may be busy; a run that does not notice the loss would take an hour."""
+SOON_S = 30.0
 
 
 def _lost(training, *words):

@@ -171,7 +171,7 @@ def test_cmaes_refuses_several_objectives_and_a_space_of_choices_only():
 def test_gp_does_not_repeat_pruned_values():
     study = optuna.create_study(sampler=build_sampler(settings("gp", startup_trials=1), Space()))
     tried = []
-    for _ in range(5):
+    for _ in range(10):
         study.sampler = build_sampler(settings("gp", startup_trials=1), Space())
         trial = study.ask()
         tried.append(tuple(Space().suggest(trial).values()))
@@ -181,4 +181,4 @@ def test_gp_does_not_repeat_pruned_values():
         study.tell(
             trial, 9.0 + trial.number if done else None, TrialState.COMPLETE if done else TrialState.PRUNED
         )
-    assert len(set(tried)) == 5
+    assert len(set(tried)) == 10

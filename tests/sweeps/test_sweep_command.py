@@ -32,8 +32,13 @@ def assert_nothing_begun(ended):
     ("overrides", "words"),
     [
         ((), ("nothing to search", "KEY='interval(LOW,HIGH)'")),
+        (("algorithm.lrr=interval(0,1)",), ("algorithm.lrr: no such key", "did you mean lr?")),
         ((LR, "sweep.workers=0"), ("sweep.workers=0",)),
+        ((LR, "sweep.sampler=tpee"), ("sweep.sampler", "tpe")),
         ((LR, "sweep.pruners=[median]", "sweep.objectives=[lap_time,completion]"), ("median", "several")),
+        ((LR, "sweep.protocol=three_trial"), ("three_trials",)),
+        ((LR, "seed=0,1"), ("sweep.seeds",)),
+        ((LR, "study=../evil"), ("study",)),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
         ((LR, "--storage", "sqlite:///x.db"), ("--storage", "sweep.storage=sqlite:///x.db")),
         ((LR, "reward.file=missing.py"), ("missing.py",)),
