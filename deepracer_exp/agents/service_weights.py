@@ -1,0 +1,258 @@
+"""The parameters of our networks as the tensors of the service's: names and layouts of its TensorFlow models.
+
+Source: deepracer-simapp, `rl_coach/architectures/tensorflow_components` (embedder, general_network, heads, savers), and
+the index of a checkpoint of the AWS console.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tensordict.nn import AddStateIndependentNormalScale
+from torch import nn
+
+from deepracer_exp.deepracer.model_metadata import CAMERAS, LIDARS
+from deepracer_exp.errors import BadInput
+
+from .actor_critic import ActorCritic, SensorNet
+
+Array = npt.NDArray[np.float32]
+
+ONLINE = "main_level/agent/main/online"
+VALUE, POLICY = f"{ONLINE}/network_0", f"{ONLINE}/network_1"
+"""Scopes of the two networks; the graph's inputs are in the first."""
+VALUE_HEAD = f"{VALUE}/v_values_head_0/output"
+POLICY_HEAD = f"{POLICY}/ppo_head_0"
+_RESCALER = "gradients_from_head_0-0_rescalers"
+"""A factor on gradients that the service keeps among the weights of each network; always 1."""
+_LOG_STD_RANGE = (-20.0, 3.0)
+"""To which the service clips the logarithm of the standard deviation."""
+_UNUSED = re.compile(r"/target/|/(?:Adam(?:_1)?|Variable|global_step)$|(?:^|/)beta[12]_power$")
+"""Tensors beside the weights that the service acts by: target networks, optimizer, counters."""
+
+
+class _Layer(NamedTuple):
+    name: str
+    """Of the service, without `/kernel` and `/bias`."""
+    module: nn.Linear | nn.Conv2d
+    inputs: npt.NDArray[np.int64] | None = None
+    """Our number of each of the service's inputs; None: the same."""
+
+    def to_service(self) -> tuple[Array, Array]:
+        weight = self.module.weight.detach().numpy()
+        if weight.ndim == 4:  # OIHW -> HWIO
+            weight = weight.transpose(2, 3, 1, 0)
+            kernel = weight[0, 0] if "/Dense_" in self.name else weight
+        else:
+            kernel = weight.T if self.inputs is None else weight.T[self.inputs]
+        return np.ascontiguousarray(kernel), self.module.bias.detach().numpy().copy()  # type: ignore[union-attr]
+
+    def from_service(self, kernel: Array, bias: Array) -> None:
+        weight = kernel.reshape(1, 1, *kernel.shape) if kernel.ndim == 2 else kernel
+        if isinstance(self.module, nn.Conv2d):
+            weight = weight.transpose(3, 2, 0, 1)
+        elif self.inputs is None:
+            weight = kernel.T
+        else:
+            weight = np.empty_like(kernel)
+            weight[self.inputs] = kernel
+            weight = weight.T
+        with torch.no_grad():
+            self.module.weight.copy_(torch.from_numpy(np.ascontiguousarray(weight)))
+            self.module.bias.copy_(torch.from_numpy(bias))  # type: ignore[union-attr]
+
+
+def to_service(networks: ActorCritic, sensors: Sequence[str]) -> dict[str, Array]:
+    """Return the parameters as the service's tensors, by name.
+
+    Kernels of convolutions are [height, width, in, out] and those of dense layers [in, out]; pictures are flattened
+    row by row with all channels of a pixel together; the readings of sensors follow each other in the order of their
+    names. Convolutions of 1x1 at the end of a picture's layers are the service's dense layers of an embedder, which it
+    applies to each pixel. A trunk that both share is written twice. Where the value network does not see what the
+    policy does, there are the policy's tensors alone.
+
+    Args:
+        networks: of `SensorNet`s.
+        sensors: names of the camera and the LIDAR as in model_metadata.json.
+
+    Raises:
+        BadInput: the networks have layers that the service's do not.
+    """
+    layers, scale = _layers(networks, sensors)
+    tensors = {}
+    for layer in layers:
+        tensors[f"{layer.name}/kernel"], tensors[f"{layer.name}/bias"] = layer.to_service()
+    for scope in sorted({_scope(name) for name in tensors}):
+        tensors[f"{scope}/{_RESCALER}"] = np.ones((), np.float32)
+    if scale is not None:
+        log_std = scale.state_independent_scale.detach().numpy()
+        tensors[f"{POLICY_HEAD}/policy_log_std"] = log_std.reshape(1, -1).copy()
+    return dict(sorted(tensors.items()))
+
+
+def from_service(
+    tensors: Mapping[str, Array], networks: ActorCritic, sensors: Sequence[str], where: str
+) -> list[str]:
+    """Give networks the parameters of the service's tensors.
+
+    Tensors are matched by name, else by order and shape among the layers of their scope: newer versions of the service
+    number layers differently.
+
+    Args:
+        tensors: by name; of any agent (`agent`, `agent_0`), online or global.
+        networks: with separate trunks, both of which see what the service's do.
+        sensors: as for `to_service`.
+        where: file of the tensors, for messages.
+
+    Returns:
+        What there was no tensor for: scopes or names of what a frozen graph does not hold (the value network, the
+        standard deviation), which stays as it is.
+
+    Raises:
+        BadInput: a tensor is missing, has another shape, is not finite, or is none of these networks'.
+    """
+    layers, scale = _layers(networks, sensors)
+    targets: dict[str, tuple[int, ...]] = {}
+    for layer in layers:
+        kernel, bias = layer.to_service()
+        targets |= {f"{layer.name}/kernel": kernel.shape, f"{layer.name}/bias": bias.shape}
+    log_std = f"{POLICY_HEAD}/policy_log_std"
+    if scale is not None:
+        targets[log_std] = (1, *scale.scale_shape)
+    found = _match(tensors, targets, where)
+    missing = [name for name in targets if name not in found]
+    absent = [VALUE] if all(_scope(name) != VALUE for name in found) else []
+    absent += [log_std] * (log_std in missing)
+    for name in missing:
+        if name != log_std and _scope(name) not in absent:
+            raise BadInput(f"{where}: has no tensor {name} of shape {list(targets[name])}")
+    for name, value in found.items():
+        if not np.isfinite(value).all():
+            raise BadInput(f"{where}: {name}: is not finite; choose another checkpoint")
+    for layer in layers:
+        if _scope(layer.name) not in absent:
+            layer.from_service(found[f"{layer.name}/kernel"], found[f"{layer.name}/bias"])
+    if scale is not None and log_std in found:
+        with torch.no_grad():
+            clipped = np.clip(found[log_std][0], *_LOG_STD_RANGE)
+            scale.state_independent_scale.copy_(torch.from_numpy(clipped))
+    return absent
+
+
+def _match(
+    tensors: Mapping[str, Array], targets: Mapping[str, tuple[int, ...]], where: str
+) -> dict[str, Array]:
+    """Return the tensors under the names of `targets`."""
+    given: dict[str, Array] = {}
+    for name, value in tensors.items():
+        ours = re.sub(r"^main_level/agent(?:_\d+)?/main/(?:online|global)/", f"{ONLINE}/", name)
+        if not _UNUSED.search(name) and not ours.endswith(f"/{_RESCALER}"):
+            given[ours] = value
+    found = {name: given.pop(name) for name in targets if name in given}
+    for name, shape in targets.items():
+        if name not in found:
+            alike = (one for one in sorted(given, key=_natural) if _unnumbered(one) == _unnumbered(name))
+            match = next((one for one in alike if given[one].shape == shape), None)
+            if match is not None:
+                found[name] = given.pop(match)
+    for name, value in found.items():
+        if value.shape != targets[name]:
+            raise BadInput(
+                f"{where}: {name}: has the shape {list(value.shape)}; accepted: {list(targets[name])}"
+            )
+    if given:
+        name = min(given)
+        raise BadInput(
+            f"{where}: {name}: a tensor of shape {list(given[name].shape)} that the network of these files has "
+            f"no layer for"
+        )
+    return found
+
+
+def _unnumbered(name: str) -> str:
+    """Return a tensor's name without the number of its layer, `.../Conv2d_4/kernel` -> `.../conv2d/kernel`."""
+    *scope, layer, kind = name.split("/")
+    return "/".join([*scope, layer.lower().rstrip("0123456789_"), kind])
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _scope(name: str) -> str:
+    return VALUE if name.startswith(f"{VALUE}/") else POLICY
+
+
+def _layers(
+    networks: ActorCritic, sensors: Sequence[str]
+) -> tuple[list[_Layer], AddStateIndependentNormalScale | None]:
+    """Return the layers in the order of the service, the value network's first, and the standard deviation."""
+    policy, value = networks.policy_head[0].module, networks.value_head.module
+    scale = None
+    if isinstance(policy, nn.Sequential) and isinstance(policy[-1], AddStateIndependentNormalScale):
+        policy, scale = policy
+    trunk = None if networks.trunk is None else networks.trunk.module
+    policy_head = f"{POLICY_HEAD}/{'policy_fc' if scale is None else 'policy_mean'}"
+    layers: list[_Layer] = []
+    if isinstance(value, SensorNet) or (trunk is not None and isinstance(value, nn.Sequential)):
+        layers += _trunk(trunk or value, VALUE, sensors)
+        layers.append(_last(value, VALUE_HEAD))
+    layers += _trunk(trunk or policy, POLICY, sensors)
+    layers.append(_last(policy, policy_head))
+    return layers, scale
+
+
+def _last(module: nn.Module, name: str) -> _Layer:
+    return _Layer(name, [one for one in module.modules() if isinstance(one, nn.Linear)][-1])
+
+
+def _trunk(net: nn.Module, scope: str, sensors: Sequence[str]) -> Iterator[_Layer]:
+    """Yield the layers of a network up to its last hidden one."""
+    if not isinstance(net, SensorNet):
+        raise BadInput(
+            "network: sees features or is a class of your own, and models of the service see a camera; accepted: a run "
+            "with a camera and network=shallow, medium, deep or cnn_small"
+        )
+    known = (nn.Conv2d, nn.Linear, nn.ReLU, nn.Sequential, nn.Identity, SensorNet)
+    odd = [one for one in net.modules() if not isinstance(one, known)]
+    if odd:
+        raise BadInput(
+            f"network: has {type(odd[0]).__name__} layers; the service's networks have convolutions, dense layers and "
+            "network.activation=relu alone"
+        )
+    if not isinstance(net.embedder, nn.Identity):
+        raise BadInput(
+            "network.lidar_joins_after: not 0; in the service's networks the LIDAR joins right after the convolutions"
+        )
+    order: dict[str, npt.NDArray[np.int64]] = {}
+    dense = [one for one in net.perceptron if isinstance(one, nn.Linear)]
+    readings = 0
+    if net.has_lidar:
+        (lidar,) = (name for name in sensors if name in LIDARS)
+        alone = [one for one in net.lidar if isinstance(one, nn.Linear)]
+        for number, module in enumerate(alone):
+            yield _Layer(f"{scope}/{lidar}/Dense_{2 * number}", module)
+        readings = alone[-1].out_features
+        order[lidar] = np.arange(dense[0].in_features - readings, dense[0].in_features)
+    if net.has_picture:
+        (camera,) = (name for name in sensors if name in CAMERAS)
+        convolutions = [one for one in net.convolutions if isinstance(one, nn.Conv2d)]
+        seen, accepted = convolutions[0].in_channels, 2 if camera == "STEREO_CAMERAS" else 1
+        if seen != accepted:
+            raise BadInput(
+                f"observation.camera: the policy sees {seen} channels; with {camera} the service's models see "
+                f"{accepted}: color=grey, frames=1"
+            )
+        wide = [number for number, one in enumerate(convolutions) if one.kernel_size != (1, 1)]
+        for number, convolution in enumerate(convolutions):
+            kind = "Conv2d" if number <= max(wide, default=0) else "Dense"
+            yield _Layer(f"{scope}/{camera}/{kind}_{2 * number}", convolution)
+        pixels = np.arange(dense[0].in_features - readings)
+        order[camera] = pixels.reshape(convolutions[-1].out_channels, -1).T.ravel()
+    inputs = np.concatenate([order[name] for name in sorted(order)])
+    hidden = dense[:-1] if isinstance(net.perceptron[-1], nn.Linear) else dense
+    for number, module in enumerate(hidden):
+        yield _Layer(f"{scope}/middleware_fc_embedder/Dense_{2 * number}", module, None if number else inputs)
