@@ -147,8 +147,8 @@ class SensorNet(nn.Module):
     """Convolutions for pictures, layers for a LIDAR, and a perceptron that joins them.
 
     Called with what there is of pictures, uint8 [..., channels, height, width], and readings, float32 [..., readings];
-    returns float32 [..., outputs]. Beside pictures, products are in bfloat16 where the processor has matrix units for
-    it (Intel AMX: three times as fast).
+    returns float32 [..., outputs]. Beside pictures, products are in bfloat16 on a GPU, and on processors with matrix
+    units for it (Intel AMX: three times as fast).
     """
 
     def __init__(self, config: CNNConfig, observed: ObservationShape, outputs: int | None) -> None:
@@ -193,15 +193,14 @@ class SensorNet(nn.Module):
     def forward(self, *sensed: Tensor) -> Tensor:
         """Return the outputs."""
         batch = sensed[-1].shape[:-1] if self.has_lidar else sensed[0].shape[:-3]
+        half = self.has_picture and (self.matrix_units or sensed[0].is_cuda)
         parts = []
         if self.has_lidar:
             parts.append(self.lidar(sensed[-1].reshape(-1, sensed[-1].shape[-1])))
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.matrix_units):
+        with torch.autocast(sensed[0].device.type, torch.bfloat16, enabled=half):
             if self.has_picture:
                 pictures = (
-                    sensed[0]
-                    .reshape(-1, *sensed[0].shape[-3:])
-                    .to(torch.bfloat16 if self.matrix_units else torch.float32)
+                    sensed[0].reshape(-1, *sensed[0].shape[-3:]).to(torch.bfloat16 if half else torch.float32)
                 )
                 pictures = (pictures / 255).contiguous(memory_format=torch.channels_last)
                 parts.insert(0, self.embedder(self.convolutions(pictures).flatten(1)))

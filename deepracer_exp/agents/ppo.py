@@ -1,5 +1,6 @@
 """Algorithms: the base class, and clipped proximal policy optimisation from TorchRL's parts."""
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -19,6 +20,7 @@ from deepracer_exp.errors import RunFailed
 from .actor_critic import ActorCritic
 from .schedules import Schedule, build_schedule
 
+_CPU = torch.device("cpu")
 _PICTURES_AT_ONCE = 1024
 _TEMPERATURE = 0.1
 """Of a teacher's distribution of actions."""
@@ -108,13 +110,27 @@ class PPO(Algorithm):
     """
 
     def __init__(
-        self, actor_critic: ActorCritic, config: AlgorithmConfig, schedule: Schedule, seed: int
+        self,
+        actor_critic: ActorCritic,
+        config: AlgorithmConfig,
+        schedule: Schedule,
+        seed: int,
+        device: torch.device = _CPU,
     ) -> None:
-        """Set up loss, advantages and optimizer; `seed` starts the stream that shuffles the minibatches."""
+        """Set up loss, advantages and optimizer.
+
+        Args:
+            actor_critic: On the CPU, where it drives; updated in place.
+            config: The group `algorithm`.
+            schedule: Of the learning rate.
+            seed: Of the stream that shuffles the minibatches.
+            device: Where updates are computed; if it is not the CPU, by a copy of the networks there.
+        """
         super().__init__(actor_critic, config, schedule, seed)
         self._generator = torch.Generator().manual_seed(seed)
-        self._parameters = list(actor_critic.parameters())
-        device = self._parameters[0].device
+        self._device = device
+        self._learner = actor_critic if device == _CPU else copy.deepcopy(actor_critic).to(device)
+        self._parameters = list(self._learner.parameters())
         # Adam's epsilon as in DeepRacer's trainer; one fused kernel instead of a dozen over all tensors.
         self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
         self._max_grad_norm = config.max_grad_norm or math.inf
@@ -128,8 +144,8 @@ class PPO(Algorithm):
             device=device,
         )
         self._loss = _Loss(
-            actor_critic.policy_head,
-            actor_critic.value_head,
+            self._learner.policy_head,
+            self._learner.value_head,
             clip_epsilon=config.clip_epsilon,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
@@ -157,6 +173,9 @@ class PPO(Algorithm):
         lr = self.config.lr * self.schedule.factor(iteration, fraction)
         for group in self._optimizer.param_groups:
             group["lr"] = lr
+        if self._learner is not self.networks:
+            self._learner.load_state_dict(self.networks.state_dict())
+            batch = batch.to(self._device, non_blocking_pin=self._device.type == "cuda")
         steps, explained_variance = self._prepare(batch)
         count = steps.shape[0]
         size = min(self._batch_size, count)
@@ -171,6 +190,8 @@ class PPO(Algorithm):
         policy_loss, value_loss, entropy, clip_fraction, _, grad_norm = table.mean(0).tolist()
         kl = table[-minibatches:, 4].mean().item()
         self.schedule.observe(kl)
+        if self._learner is not self.networks:
+            self.networks.load_state_dict(self._learner.state_dict())
         return UpdateMetrics(
             policy_loss=policy_loss,
             value_loss=value_loss / self.config.critic_coeff,
@@ -183,10 +204,15 @@ class PPO(Algorithm):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, optimizer, schedule and shuffling stream: tensors and plain values only."""
+        """Return networks, optimizer, schedule and shuffling stream: tensors on the CPU and plain values only."""
+        optimizer = self._optimizer.state_dict()
+        moments = {
+            index: {key: value.cpu() for key, value in state.items()}
+            for index, state in optimizer["state"].items()
+        }
         return {
             "networks": self.networks.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
+            "optimizer": {**optimizer, "state": moments},
             "schedule": self.schedule.state_dict(),
             "generator": self._generator.get_state(),
         }
@@ -198,7 +224,7 @@ class PPO(Algorithm):
         self._generator.set_state(state["generator"])
 
     def _shuffled(self, count: int) -> Tensor:
-        return torch.randperm(count, generator=self._generator).to(self._parameters[0].device)
+        return torch.randperm(count, generator=self._generator).to(self._device)
 
     @torch.no_grad()
     def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:
@@ -210,7 +236,7 @@ class PPO(Algorithm):
         ends = batch["next", "done"].squeeze(-1).clone()
         ends[..., -1] = True
         next_value = value.roll(-1, dims=-2)
-        next_value[ends] = self._value_of(batch["next"].select(*self.networks.value.in_keys)[ends])
+        next_value[ends] = self._value_of(batch["next"].select(*self._learner.value.in_keys)[ends])
         estimates = TensorDict(
             {
                 "state_value": value,
@@ -224,25 +250,25 @@ class PPO(Algorithm):
         self._advantages(estimates)
         target = estimates["value_target"]
         unexplained, total = (target - value).var(correction=0), target.var(correction=0)
-        steps = batch.select(*self.networks.in_keys, "action", "action_log_prob")
+        steps = batch.select(*self._learner.in_keys, "action", "action_log_prob")
         steps.update(estimates.select("advantage", "value_target"))
         # A constant target has no variance to explain.
         explained = 1 - unexplained / total.clamp_min(torch.finfo(total.dtype).tiny)
         return steps.reshape(-1), explained.item() if total > 0 else 0.0
 
     def _value_of(self, steps: TensorDictBase) -> Tensor:
-        steps = steps.select(*self.networks.value.in_keys)
+        steps = steps.select(*self._learner.value.in_keys)
         if "pixels" not in steps:
-            return self.networks.value(steps)["state_value"]
+            return self._learner.value(steps)["state_value"]
         # All steps' first layer at once would take gigabytes.
         parts = steps.reshape(-1).split(_PICTURES_AT_ONCE)
-        values = torch.cat([self.networks.value(part)["state_value"] for part in parts])
+        values = torch.cat([self._learner.value(part)["state_value"] for part in parts])
         return values.reshape(*steps.shape, 1)
 
     def _gradient_step(self, minibatch: TensorDictBase) -> Tensor:
         """Step along one minibatch's gradient and return the parts of UpdateMetrics on the device."""
-        if self.networks.trunk is not None:
-            minibatch = self.networks.trunk(minibatch)
+        if self._learner.trunk is not None:
+            minibatch = self._learner.trunk(minibatch)
         losses = self.loss(minibatch)
         loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
         self._optimizer.zero_grad()
@@ -262,7 +288,7 @@ class PPO(Algorithm):
         for key, name in _LOSS_NAMES.items():
             if not torch.isfinite(losses[key]):
                 raise RunFailed(f"{name} is {losses[key].item()}; the gradient step was not made")
-        for name, parameter in self.networks.named_parameters():
+        for name, parameter in self._learner.named_parameters():
             if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
                 raise RunFailed(f"gradient of {name} is not finite; the gradient step was not made")
         raise RunFailed("norm of the gradient is not finite; the gradient step was not made")
@@ -286,10 +312,11 @@ class Distillation(PPO):
         schedule: Schedule,
         seed: int,
         teacher: TensorDictModuleBase,
+        device: torch.device = _CPU,
     ) -> None:
-        """Set up both; the teacher stays as it is."""
-        super().__init__(actor_critic, config, schedule, seed)
-        self._teacher = teacher
+        """Set up both; the teacher keeps its weights."""
+        super().__init__(actor_critic, config, schedule, seed, device)
+        self._teacher = teacher.to(device)
         self._imitates = False
 
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
@@ -305,12 +332,12 @@ class Distillation(PPO):
         """Return the losses as PPO does."""
         if not self._imitates:
             return super().loss(minibatch)
-        policy = self.networks.policy_head.get_dist(minibatch)
-        teacher = self.networks.policy_head.build_dist_from_params(minibatch["teacher"])
+        policy = self._learner.policy_head.get_dist(minibatch)
+        teacher = self._learner.policy_head.build_dist_from_params(minibatch["teacher"])
         value_loss, *_ = self._loss.loss_critic(minibatch)
         with torch.no_grad():
             log_ratio = policy.log_prob(minibatch["action"]) - minibatch["action_log_prob"]
-            nothing = torch.zeros(())
+            nothing = torch.zeros((), device=self._device)
         return TensorDict(
             {
                 "loss_objective": kl_divergence(teacher, policy).mean(),
@@ -356,6 +383,7 @@ def build_agent(
     lr_schedule: LRScheduleConfig,
     seed: int,
     teacher: TensorDictModuleBase | None = None,
+    device: torch.device = _CPU,
 ) -> Algorithm:
     """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
 
@@ -365,15 +393,16 @@ def build_agent(
         lr_schedule: The group `lr_schedule`.
         seed: Of the algorithm's own random streams.
         teacher: A policy with the same actions that is imitated for the first `config.teacher_iterations`.
+        device: Where updates are computed; a class of the user's own chooses it itself.
 
     Raises:
         BadInput: a class of the user's own cannot be used.
     """
     schedule = build_schedule(lr_schedule)
     if teacher is not None:
-        return Distillation(actor_critic, config, schedule, seed, teacher)
+        return Distillation(actor_critic, config, schedule, seed, teacher, device)
     if config.target is None:
-        return PPO(actor_critic, config, schedule, seed)
+        return PPO(actor_critic, config, schedule, seed, device)
     own = OwnClass(target=config.target, kwargs=config.kwargs)
     # Its constructor may draw weights; the global random state has no part in them.
     with torch.random.fork_rng(devices=[]):

@@ -31,6 +31,12 @@ def safe_name(name: str) -> str:
 SafeName = Annotated[str, AfterValidator(safe_name)]
 
 
+def _device(name: str) -> str:
+    if not re.fullmatch(r"cpu|cuda(:\d)?", name):
+        raise ValueError("no such device; accepted: cpu, cuda, cuda:NUMBER")
+    return name
+
+
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """Everything that defines a run."""
@@ -63,11 +69,17 @@ class Experiment:
     tracking: TrackingConfig
     teacher: Annotated[str, Field(min_length=1)] | None = None
     """A run whose policy this one's first learns to act like."""
+    device: Annotated[str, AfterValidator(_device)] = "cpu"
+    """Where updates are computed; cars, cameras and the policy that drives are on the CPU."""
 
     def __post_init__(self) -> None:
         """Refuse a network that cannot read what is observed."""
         if self.teacher is None and self.algorithm.teacher_iterations:
             raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")
+        if self.device != "cpu" and self.algorithm.target is not None:
+            raise ValueError(
+                f"device={self.device}: an algorithm of your own chooses where it computes; accepted: device=cpu"
+            )
         if self.teacher is not None and not self.algorithm.teacher_iterations:
             raise ValueError("teacher: only algorithm=distill learns from one; accepted: algorithm=distill")
         camera, lidar, network = self.observation.camera, self.observation.lidar, self.network

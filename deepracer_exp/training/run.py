@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import psutil
+import torch
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import ActorCritic
@@ -22,7 +23,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, is_refused_memory, reading
+from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import intact_checkpoint, read_training
 from deepracer_exp.runs.convergence import UNDECIDED
@@ -153,6 +154,12 @@ def read_files(experiment: Experiment) -> RaceSetup:
     with reading(f"car {experiment.car.name}", "dimensions, masses and settings of a car that can stand"):
         CarBatch(setup.car, 1, 1)
     check_collector(experiment.collector)
+    gpus = torch.cuda.device_count()
+    if experiment.device != "cpu" and (torch.device(experiment.device).index or 0) >= gpus:
+        names = ["cpu", *(f"cuda:{number}" for number in range(gpus))]
+        raise BadInput(
+            f"device={experiment.device}: PyTorch finds {count(gpus, 'GPU')} here; accepted: {', '.join(names)}"
+        )
     return setup
 
 

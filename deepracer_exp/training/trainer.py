@@ -188,6 +188,7 @@ class Trainer:
             experiment.lr_schedule,
             experiment.seed,
             None if experiment.teacher is None else read_teacher(folder.path),
+            torch.device(experiment.device),
         )
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}

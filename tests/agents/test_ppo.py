@@ -30,7 +30,7 @@ KINDS = [(shared, actions) for shared in (False, True) for actions in (3, None)]
 
 
 def make(
-    shared: bool = False, actions: int | None = 3, seed: int = 0, **changes: object
+    shared: bool = False, actions: int | None = 3, seed: int = 0, device: str = "cpu", **changes: object
 ) -> tuple[ActorCritic, PPO]:
     network = MLPConfig(hidden=(16, 16), activation="tanh", shared_trunk=shared, initial_std=0.5)
     networks = build_actor_critic(network, ObservationShape(4), actions, torch.Generator().manual_seed(seed))
@@ -45,7 +45,8 @@ def make(
             highest_factor=2.0,
         )
     )
-    return networks, PPO(networks, dataclasses.replace(CONFIG, **changes), schedule, seed=seed)
+    config = dataclasses.replace(CONFIG, **changes)
+    return networks, PPO(networks, config, schedule, seed, torch.device(device))
 
 
 def drive(networks: ActorCritic, cars: int = 8, length: int = 32, seed: int = 0) -> TensorDict:
@@ -111,6 +112,34 @@ def test_the_same_seed_gives_identical_parameters(shared, actions):
         runs.append(parameters(networks))
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0], runs[2])
+
+
+@pytest.mark.parametrize(("shared", "actions"), KINDS)
+def test_a_copy_on_another_device_teaches_the_networks_that_drive(shared, actions):
+    results = []
+    for device in ("cpu", "cpu:0"):  # the second is another device by name, and computes the same
+        networks, ppo = make(shared, actions, device=device)
+        train(networks, ppo, 2)
+        again, restored = make(shared, actions, seed=1, device=device)
+        restored.load_state_dict(ppo.state_dict())
+        train(again, restored, 2, start=2)
+        results.append((parameters(networks), parameters(again)))
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch finds no GPU here")
+@pytest.mark.parametrize(("shared", "actions"), KINDS)
+def test_a_gpu_learns_what_the_processor_learns(shared, actions):
+    results = []
+    for device in ("cpu", "cuda", "cuda"):
+        networks, ppo = make(shared, actions, device=device)
+        train(networks, ppo, 1)
+        results.append(parameters(networks))
+        state = ppo.state_dict()["optimizer"]["state"]
+        assert all(value.device.type == "cpu" for one in state.values() for value in one.values())
+    torch.testing.assert_close(results[1], results[0], rtol=1e-3, atol=1e-4)
+    assert torch.equal(results[1], results[2])
 
 
 @pytest.mark.parametrize("loss_type", ["huber", "mean squared error"])

@@ -115,6 +115,7 @@ def test_quotes_home_and_environment_variables_are_understood(monkeypatch, tmp_p
         ("experiment=tyni", ["experiment=tyni", "did you mean tiny?"]),
         ("network=3", ["network=3: no such network", "mlp_small"]),
         ("track={a:1}", ["no such track", "`deepracer-exp train --options track` lists them"]),
+        ("device=gpu", ['device="gpu"', "accepted: cpu, cuda"]),
         ("sed=1", ["sed: no such key (did you mean seed?)"]),
         ("algoritm=ppo", ["did you mean algorithm?"]),
         ("lr=1", ["did you mean algorithm.lr?"]),
