@@ -14,6 +14,7 @@ from deepracer_exp.sim.lidar import (
     NEAREST_M,
     RAYS,
     SCANS_PER_S,
+    box_sides,
     join_walls,
     ring_walls,
     scan,
@@ -32,7 +33,7 @@ Readings = NDArray[np.float32]
 
 
 class Lidar:
-    """The LIDARs of N cars; each stays at its height, however the body leans.
+    """The LIDARs of N cars; each stays at its height, however the body leans, and sees walls and boxes.
 
     The noise of a scan depends only on the seed, the car's number, and the numbers of its episode and step.
     """
@@ -54,13 +55,24 @@ class Lidar:
         self._scans_per_step = SCANS_PER_S * period_s
         self._noise_at = np.zeros(len(self._cars), np.int64)
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS)
+        self._beside = np.empty((len(self._cars), 0, 4))
 
     def seed(self, seed: int) -> None:
         """Start all streams from `seed`."""
         self._streams = CarStreams(seed, self._cars, Purpose.LIDAR)
 
-    def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
-        """Draw the noise of new episodes of the cars `ids`; episodes are numbered per car from 0."""
+    def begin(self, ids: Ids, episodes: NDArray[np.int64], boxes: NDArray[np.float32] | None) -> None:
+        """Draw the noise of new episodes of the cars `ids`; episodes are numbered per car from 0.
+
+        Args:
+            ids: indices of the cars, (n,).
+            episodes: of these cars, (n,).
+            boxes: around these cars, (n, boxes, 6 or more), see `camera.take_pictures`; None: there are none.
+        """
+        if boxes is not None:
+            if not self._beside.size:
+                self._beside = np.full((len(self._cars), 4 * boxes.shape[1], 4), np.nan)
+            self._beside[ids] = box_sides(boxes)
         for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True):
             self._noise_at[car] = self._streams.at(car, episode).integers(_NOISE_NUMBERS)
 
@@ -81,7 +93,7 @@ class Lidar:
             ],
             axis=1,
         )
-        distances = scan(self._walls, poses, course)
+        distances = scan(self._walls, poses, course, self._beside[ids])
         distances[distances > FURTHEST_M] = np.inf
         at = self._noise_at[ids] + _NEXT_SCAN * steps
         noise = self._noise[(at[:, None] + np.arange(RAYS)) % _NOISE_NUMBERS]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.driving import CameraConfig, PictureRandomizationConfig
+from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.sim.camera import Lens, take_pictures
@@ -36,8 +36,7 @@ class Pictures:
         config: CameraConfig,
         car: CarConfig,
         tracks: Sequence[Track],
-        randomizations: Sequence[PictureRandomizationConfig | None],
-        cars: Sequence[int],
+        varied: PictureRandomization | None,
     ) -> None:
         """Build the scenery.
 
@@ -45,14 +44,9 @@ class Pictures:
             config: size, colour and number of pictures.
             car: where the camera sits.
             tracks: of each course one.
-            randomizations: of each car, (N,).
-            cars: their numbers over all processes.
+            varied: what each episode's pictures differ in, drawn before they are taken; None: nothing.
         """
-        self._varied = (
-            PictureRandomization(randomizations, cars, tracks)
-            if any(one is not None for one in randomizations)
-            else None
-        )
+        self._varied = varied
         self.shape = config.shape
         self._now = config.shape[0] // config.frames  # channels of one moment
         sides_m = (0.5 * config.stereo_m, -0.5 * config.stereo_m) if config.stereo_m else (0.0,)
@@ -72,16 +66,6 @@ class Pictures:
         self._scenery = join_sceneries([build_scenery(track) for track in tracks])
         self._floor_colors = np.stack([floor_colors(track.floor) for track in tracks])
         self._grey = config.color == "grey"
-
-    def seed(self, seed: int) -> None:
-        """Start the random streams from `seed`."""
-        if self._varied is not None:
-            self._varied.seed(seed)
-
-    def begin(self, ids: Ids, episodes: NDArray[np.int64], course: NDArray[np.intp]) -> None:
-        """Draw what pictures differ in for new episodes of the cars `ids` on tracks `course`, (n,)."""
-        if self._varied is not None:
-            self._varied.begin(ids, episodes, course)
 
     def first(self, ids: Ids, state: CarState, course: NDArray[np.intp]) -> Pixels:
         """Return the observations of the cars `ids`, which stand, (n, *shape): as if they had always stood there.

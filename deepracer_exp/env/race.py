@@ -14,6 +14,7 @@ from deepracer_exp.sim.batch import CarBatch, CarState
 
 from .lidar import Lidar
 from .observation import Features
+from .picture_randomization import PictureRandomization
 from .pictures import Pictures
 from .randomization import Randomization
 from .rules import RaceRules, StepResult
@@ -107,11 +108,15 @@ class Race:
         self.observation = np.zeros((n_cars, self._features.size), np.float32)
         camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
         pictures = [one.pictures for one in randomizations or [setup.randomization] * n_cars]
-        self._pictures = (
-            None if camera is None else Pictures(camera, setup.car, tracks, pictures, self.cars.tolist())
-        )
-        self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         lidar = setup.observation.lidar
+        seen = camera is not None or lidar is not None
+        self._varied = (
+            PictureRandomization(pictures, self.cars.tolist(), tracks)
+            if seen and any(one is not None for one in pictures)
+            else None
+        )
+        self._pictures = None if camera is None else Pictures(camera, setup.car, tracks, self._varied)
+        self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         self._lidar = None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s)
         self.lidar = np.zeros((n_cars, lidar.size if lidar is not None else 0), np.float32)
         self._kept = _KEPT if lidar is None else (*_KEPT, "lidar")
@@ -140,8 +145,8 @@ class Race:
     def seed(self, seed: int) -> None:
         """Start over: random streams from `seed`, start positions and clocks from the first episode."""
         self.randomization.seed(seed)
-        if self._pictures is not None:
-            self._pictures.seed(seed)
+        if self._varied is not None:
+            self._varied.seed(seed)
         if self._lidar is not None:
             self._lidar.seed(seed)
         self.rules.restart()
@@ -172,10 +177,15 @@ class Race:
     def _begin(self, ids: np.ndarray) -> None:
         """Draw what differs from episode to episode."""
         self.randomization.begin(ids, self.rules.episode[ids])
-        if self._pictures is not None:
-            self._pictures.begin(ids, self.rules.episode[ids], self.rules.course[ids])
+        self._begin_sight(ids)
+
+    def _begin_sight(self, ids: np.ndarray) -> None:
+        """Draw what cameras and LIDARs see differently from episode to episode."""
+        episode = self.rules.episode[ids]
+        if self._varied is not None:
+            self._varied.begin(ids, episode, self.rules.course[ids])
         if self._lidar is not None:
-            self._lidar.begin(ids, self.rules.episode[ids])
+            self._lidar.begin(ids, episode, None if self._varied is None else self._varied.boxes(ids))
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
         """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn again.
@@ -254,12 +264,10 @@ class Race:
             setattr(self, name, checked_array(state, name.lstrip("_"), getattr(self, name).shape))
         self.rules.load_state_dict(state["referee"])
         self.randomization.load_state_dict(state["randomization"])
-        if self._pictures is not None:
-            self._pictures.seed(state["randomization"]["seed"])
-            self._pictures.begin(self._everyone, self.rules.episode, self.rules.course)
-        if self._lidar is not None:
-            self._lidar.seed(state["randomization"]["seed"])
-            self._lidar.begin(self._everyone, self.rules.episode)
+        for sight in (self._varied, self._lidar):
+            if sight is not None:
+                sight.seed(state["randomization"]["seed"])
+        self._begin_sight(self._everyone)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
         # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics

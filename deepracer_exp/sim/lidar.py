@@ -1,4 +1,4 @@
-"""The LIDAR of all cars at once: distances to upright walls, which from above are segments."""
+"""The LIDAR of all cars at once: distances to walls and boxes, whose sides are segments from above."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from .scenery import box_corners
 
 RAYS = 64
 ANGLES_RAD = np.linspace(-2.61799, 2.61799, RAYS)
@@ -40,13 +42,29 @@ def ring_walls(ring: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.hstack([ring[:-1], ring[1:]])
 
 
-def scan(walls: Walls, poses: NDArray[np.float64], group: NDArray[np.intp]) -> NDArray[np.float64]:
+def box_sides(boxes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the sides of boxes (N, boxes, 6 or more), see `camera.take_pictures`, as segments (N, 4 * boxes, 4).
+
+    Those of boxes that are not higher than the sensor are NaN, which no ray hits.
+    """
+    corners = box_corners(boxes.astype(np.float64))
+    corners[boxes[..., 5] <= MOUNT_Z_M] = np.nan
+    return np.concatenate([corners, np.roll(corners, -1, axis=-2)], axis=-1).reshape(len(boxes), -1, 4)
+
+
+def scan(
+    walls: Walls,
+    poses: NDArray[np.float64],
+    group: NDArray[np.intp],
+    beside: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """Return the distances along each of the rays, (N, RAYS), metres; infinite where nothing is hit.
 
     Args:
         walls: what reflects.
         poses: x and y in metres and direction in radians of each sensor, (N, 3).
         group: of the walls that each sensor sees, (N,).
+        beside: segments that each sees as well, (N, segments, 4); None: there are none.
     """
     out = np.empty((len(poses), RAYS))
     _scan(
@@ -54,6 +72,7 @@ def scan(walls: Walls, poses: NDArray[np.float64], group: NDArray[np.intp]) -> N
         group,
         walls.segments_m,
         walls.first,
+        np.empty((len(poses), 0, 4)) if beside is None else beside,
         np.cos(ANGLES_RAD),
         np.sin(ANGLES_RAD),
         out,
@@ -62,11 +81,10 @@ def scan(walls: Walls, poses: NDArray[np.float64], group: NDArray[np.intp]) -> N
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _scan(poses, group, segments, first, cosines, sines, out):  # type: ignore[no-untyped-def]
-    """Intersect every ray with every segment; without branches the rays of a segment are computed together."""
+def _scan(poses, group, segments, first, beside, cosines, sines, out):  # type: ignore[no-untyped-def]
+    """Intersect every ray with every segment."""
     rays = len(cosines)
     ray_x, ray_y = np.empty(rays), np.empty(rays)
-    end = 1.0 + 1e-9  # rounding opens no gap between two walls
     for car in range(len(poses)):
         x, y, direction = poses[car]
         cos, sin = np.cos(direction), np.sin(direction)
@@ -75,17 +93,22 @@ def _scan(poses, group, segments, first, cosines, sines, out):  # type: ignore[n
             ray_x[ray] = cos * cosines[ray] - sin * sines[ray]
             ray_y[ray] = sin * cosines[ray] + cos * sines[ray]
             nearest[ray] = np.inf
-        for index in range(first[group[car]], first[group[car] + 1]):
-            from_x, from_y = segments[index, 0] - x, segments[index, 1] - y
-            along_x, along_y = (
-                segments[index, 2] - segments[index, 0],
-                segments[index, 3] - segments[index, 1],
-            )
-            area = from_x * along_y - from_y * along_x
-            for ray in range(rays):
-                # from + share * along = distance * ray; parallel ones give no number that passes.
-                turn = ray_x[ray] * along_y - ray_y[ray] * along_x
-                distance = area / turn
-                share = (from_x * ray_y[ray] - from_y * ray_x[ray]) / turn
-                hit = (distance >= 0.0) & (share >= 1.0 - end) & (share <= end) & (distance < nearest[ray])
-                nearest[ray] = distance if hit else nearest[ray]
+        _hit(segments[first[group[car]] : first[group[car] + 1]], x, y, ray_x, ray_y, nearest)
+        _hit(beside[car], x, y, ray_x, ray_y, nearest)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _hit(segments, x, y, ray_x, ray_y, nearest):  # type: ignore[no-untyped-def]
+    """Shorten rays to the segments they hit; without branches the rays of a segment are computed together."""
+    end = 1.0 + 1e-9  # rounding opens no gap between two walls
+    for index in range(len(segments)):
+        from_x, from_y = segments[index, 0] - x, segments[index, 1] - y
+        along_x, along_y = segments[index, 2] - segments[index, 0], segments[index, 3] - segments[index, 1]
+        area = from_x * along_y - from_y * along_x
+        for ray in range(len(nearest)):
+            # from + share * along = distance * ray; parallel ones give no number that passes.
+            turn = ray_x[ray] * along_y - ray_y[ray] * along_x
+            distance = area / turn
+            share = (from_x * ray_y[ray] - from_y * ray_x[ray]) / turn
+            hit = (distance >= 0.0) & (share >= 1.0 - end) & (share <= end) & (distance < nearest[ray])
+            nearest[ray] = distance if hit else nearest[ray]

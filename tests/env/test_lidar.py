@@ -12,7 +12,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.lidar import readings
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
+from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M, MOUNT_Z_M
+from deepracer_exp.sim.scenery import box_corners
 
 LIDAR, STILL, FAR = "observation=lidar", "observation.lidar.noise_m=0", "observation.lidar.reach_m=12"
 PLAIN = compose_experiment([LIDAR])[0].observation.lidar
@@ -39,6 +40,29 @@ def test_it_looks_back_and_sideways_at_the_walls_around_the_field(race_of):
         assert read == pytest.approx(min(shapely.Point(eye).distance(wall), 12.0), abs=1e-5)
     back = race_of(LIDAR, STILL, FAR, "observation.lidar.yaw_deg=0")
     assert np.abs(back.lidar - race.lidar).max() > 0.5
+
+
+@pytest.mark.parametrize("sensors", [LIDAR, "observation=camera_lidar"])
+def test_each_car_sees_the_boxes_of_its_own_episode(race_of, sensors):
+    varied = (sensors, STILL, FAR, "randomization=sim2real", "randomization.pictures.objects=[30,30]")
+    race = race_of(*varied, "randomization.observation_dropout=[0,0]", n_cars=3)
+    drive(race, 2)
+    race.reset(np.array([1]))
+    now, boxes = race._batch.read(), race._varied.boxes(np.arange(3)).astype(float)
+    ring = shapely.box(*race.setup.track.road.bounds).buffer(
+        race.setup.track.floor.walls_beyond_m, join_style="mitre"
+    )
+    for car in range(3):
+        high = shapely.polygons(box_corners(boxes[car][boxes[car, :, 5] > MOUNT_Z_M]))
+        outlines = shapely.union_all([ring.exterior, *shapely.boundary(high)])
+        x, y, yaw = (float(values[car]) for values in (now.x_m, now.y_m, now.yaw_rad))
+        eye = np.array([x + MOUNT_X_M * np.cos(yaw), y + MOUNT_X_M * np.sin(yaw)])
+        angles = yaw + np.pi + ANGLES_RAD
+        ends = eye + 30 * np.column_stack([np.cos(angles), np.sin(angles)])
+        hits = shapely.intersection([shapely.LineString([eye, end]) for end in ends], outlines)
+        read = np.minimum(shapely.distance(shapely.Point(eye), hits), 12.0)
+        assert race.lidar[car] == pytest.approx(read, abs=1e-5)
+        assert (read < shapely.distance(shapely.Point(eye), ring.exterior)).any()
 
 
 def test_where_a_world_has_no_walls_it_sees_nothing(race_of):
@@ -103,9 +127,12 @@ def test_a_cars_noise_depends_on_its_number_and_not_on_the_batch(race_of):
         assert np.array_equal(ours[3:], theirs)
 
 
-@pytest.mark.parametrize("steps", [6, 7])
-def test_a_race_put_back_reads_on_as_the_original(race_of, steps):
-    options = (LIDAR, FAR, "randomization.observation_dropout=[0.3,0.3]")
+@pytest.mark.parametrize(
+    ("steps", "varied"),
+    [(6, "randomization.observation_dropout=[0.3,0.3]"), (7, "randomization=sim2real")],
+)
+def test_a_race_put_back_reads_on_as_the_original(race_of, steps, varied):
+    options = (LIDAR, FAR, varied)
     race, other = race_of(*options, n_cars=4), race_of(*options, n_cars=4)
     drive(race, steps)
     other.load_state_dict(race.state_dict())

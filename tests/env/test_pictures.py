@@ -192,7 +192,7 @@ def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
 @pytest.mark.parametrize("track", ["reinvent_base", "Spain_track", "2022_summit_speedway_cw"])
 def test_objects_stand_beside_the_road_between_the_walls_and_apart(race_of, track):
     race = race_of(*VARIED, f"track={track}", "randomization.pictures.objects=[9,9]", n_cars=8)
-    boxes = race._pictures._varied.boxes(np.arange(8))
+    boxes = race._varied.boxes(np.arange(8))
     course = race.setup.track
     walls = shapely.Polygon(wall_ring(course))
     for car in boxes:
@@ -205,7 +205,7 @@ def test_objects_stand_beside_the_road_between_the_walls_and_apart(race_of, trac
         assert len(shapely.STRtree(areas).query(areas, "intersects")[0]) == len(areas)
     assert len(np.unique(boxes[:, :, 0])) > 20
     race.reset(np.array([1]))
-    again = race._pictures._varied.boxes(np.arange(8))
+    again = race._varied.boxes(np.arange(8))
     assert not np.array_equal(again[1], boxes[1])
     assert np.array_equal(again[[0, 2]], boxes[[0, 2]])
 

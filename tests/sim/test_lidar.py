@@ -1,10 +1,10 @@
-"""The LIDAR's rays against walls whose distances are known."""
+"""The LIDAR's rays against walls and boxes whose distances are known."""
 
 import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.sim.lidar import ANGLES_RAD, RAYS, join_walls, ring_walls, scan
+from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_Z_M, RAYS, box_sides, join_walls, ring_walls, scan
 
 ROOM = ring_walls(np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.5], [0.0, 2.5], [0.0, 0.0]]))
 FIRST = np.zeros(1, np.intp)
@@ -57,3 +57,21 @@ def test_each_sensor_sees_the_walls_of_its_own_group():
     assert np.isinf(nothing).all()
     assert here == pytest.approx(there)
     assert here[RAYS // 2] == pytest.approx(3.0 / np.cos(ANGLES_RAD[RAYS // 2]))
+
+
+def test_a_box_is_read_where_it_stands_and_hides_the_wall_behind_it():
+    ray = 50
+    to_box = 0.8 + ANGLES_RAD[ray]
+    # Turned towards the sensor, its near side 1.1 m away and 0.2 m wide; as high as the sensor, it is not seen.
+    boxes = np.array([[[1.3 * np.cos(to_box), 1.3 * np.sin(to_box), to_box, 0.4, 0.2, MOUNT_Z_M + 0.01]]])
+    boxes = np.concatenate([boxes, np.where(np.arange(6) == 5, MOUNT_Z_M, boxes)])
+    poses = np.tile([0.0, 0.0, 0.8], (2, 1))
+    walls, group = join_walls([ROOM - [2, 1, 2, 1]]), np.zeros(2, np.intp)
+    empty = scan(walls, poses, group)
+    seen, low = scan(walls, poses, group, box_sides(boxes))
+    off = ANGLES_RAD - ANGLES_RAD[ray]
+    struck = (np.cos(off) > 0) & (np.abs(np.tan(off)) * 1.1 <= 0.1)
+    assert struck.sum() == 3
+    assert (seen[struck] < empty[0, struck]).all()
+    assert seen == pytest.approx(np.where(struck, 1.1 / np.cos(off), empty[0]), abs=1e-9)
+    assert np.array_equal(low, empty[1])
