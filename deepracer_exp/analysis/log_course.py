@@ -111,11 +111,21 @@ def _recognised(logged: str, sample: pd.DataFrame) -> str | None:
         steps_m = np.linalg.norm(np.diff(world_rows(name)[:, :2], axis=0), axis=1)
         if abs(steps_m.sum() - length_m) > _LENGTH_NEAR * length_m:
             continue
-        track = world_track(name)
-        off_m = np.abs(track.project(points).offset_m)
-        if np.mean(off_m < track.width_max_m / 2 + _BESIDE_M) >= _INSIDE:
+        if _inside(world_track(name), points):
             return name
     return None
+
+
+def _inside(track: Track, points: NDArray[np.float64]) -> bool:
+    off_m = np.abs(track.project(points).offset_m)
+    return bool(np.mean(off_m < track.width_max_m / 2 + _BESIDE_M) >= _INSIDE)
+
+
+def was_driven_on(track: Track, steps: pd.DataFrame) -> bool:
+    """Return whether logged lengths and positions are those of a course."""
+    length_m = float(steps["track_len"].median())
+    near = abs(track.length_m - length_m) <= _LENGTH_NEAR * length_m
+    return near and _inside(track, steps[["X", "Y"]].to_numpy(np.float64))
 
 
 def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
@@ -143,7 +153,10 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
     borders = [np.interp(at, own, axis) for axis in (*course.inner.T, *course.outer.T)]
     rows = np.column_stack([course.points_at(at), *borders])
     rows = np.vstack([rows, rows[:1]]) if course.closed else rows
-    return Track.from_route(rows, course.name, title=course.title, floor=course.floor)
+    rows = rows[::-1] if course.reversed else rows
+    return Track.from_route(
+        rows, course.name, title=course.title, reversed=course.reversed, floor=course.floor
+    )
 
 
 def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:

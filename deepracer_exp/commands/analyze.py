@@ -1,14 +1,26 @@
-"""`deepracer-exp analyze`: how a training went, from its logs."""
+"""`deepracer-exp analyze` and `compare`: how a training went, from its logs, and how far from them a simulation is."""
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count, reading
 from deepracer_exp.files import LOG_BYTES, open_user_file
-from deepracer_exp.runs.files import REPORT
+from deepracer_exp.runs.files import REPORT, is_run
 
-from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
+from .arguments import (
+    Stores,
+    add_command,
+    add_overrides,
+    add_run,
+    complete_runs,
+    is_override,
+    read_stores,
+    runs_and_overrides,
+)
+from .output import table_console, warnings_on_stderr
+from .startup import check_policy
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
@@ -25,10 +37,17 @@ _ANALYZE_EPILOG = """\
 
 The page needs no network: findings in words first, then figures and tables, then what could not be read and why.
 """
+_COMPARE_EPILOG = """\
+  deepracer-exp compare RUN ~/Downloads/evaluation.tar.gz   our laps beside those of the service's evaluation
+  deepracer-exp compare RUN logs/ checkpoint=last --open    another checkpoint; open the page
+
+LOGS is a folder, an archive or a file of any layout, as `deepracer-exp analyze` takes. The policy races on the log's
+track, in its direction, from the same starts, as many laps in a row. `deepracer-exp runs compare` compares runs.
+"""
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
+    """Add the commands."""
     parser = add_command(
         commands,
         "analyze",
@@ -68,6 +87,25 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="page to write (default: report.html of a run, else NAME-analysis.html)",
     )
 
+    parser = add_command(
+        commands,
+        "compare",
+        _compare,
+        help="put simulated laps of a policy beside the service's log of it",
+        description="Race a run's best policy as the laps of a log were driven, print lap times, line, actions and "
+        "where they part, and write a page of figures.",
+        epilog=_COMPARE_EPILOG,
+        entry="evaluate",
+    )
+    add_run(parser, "checkpoint=NAME | runs_dir=DIR | tracking.uri=URI", many=True)
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--track", metavar="NAME | ROUTE", help="one of several tracks, or the route (.npy) of an unknown one"
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", help="page to write (default: NAME-comparison.html)"
+    )
+
 
 def _analyze(args: argparse.Namespace) -> int:
     target_s = None if args.target is None else _seconds(args.target)
@@ -80,8 +118,7 @@ def _analyze(args: argparse.Namespace) -> int:
         raise BadInput(f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one")
     place = _place(logs[0], stores)
     beside = [_place(what, stores) for what in args.compare if not is_override(what)]
-    if args.output is not None and not Path(args.output).absolute().parent.is_dir():
-        raise BadInput(f"--output {args.output}: its folder does not exist; accepted: a file in a folder")
+    _check_output(args.output)
     reward = None
     if args.reward is not None:
         from deepracer_exp.rewards.source import named_reward_source
@@ -123,12 +160,100 @@ def _analyze(args: argparse.Namespace) -> int:
         print(f"     {sentence}")
     if view.problems:
         print(f"\n  {count(len(view.problems), 'problem')} while reading, the first: {view.problems[0]}")
-    print(f"\n  page  {out}")
-    if args.open:
+    _end(out, args.open)
+    return 0
+
+
+def _compare(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.evaluation import checked_checkpoint_name
+    from deepracer_exp.config.own_class import allow_given
+
+    given, overrides = runs_and_overrides(args)
+    stores = read_stores(allow_given(overrides), ["checkpoint"])
+    if len(given) != 2:
+        raise BadInput(
+            f"{' '.join(given) or 'RUN LOGS'}: {len(given)} given; accepted: a run, and logs of the service"
+        )
+    name, logs = given
+    _check_output(args.output)
+    chosen = stores.values.get("checkpoint")
+    try:
+        chosen = chosen and checked_checkpoint_name(chosen)
+    except ValueError as error:
+        raise BadInput(f"checkpoint={chosen}: {error}") from None
+    place = _logs(logs)
+    if place is None or is_run(place):
+        why = "no such file or folder" if place is None else "is a run"
+        runs = shlex.join(["deepracer-exp", "runs", "compare", name, logs])
+        raise BadInput(f"{logs}: {why}; accepted: logs of the service; {runs} compares runs")
+    check_policy(name, str(stores.runs_dir), stores.uri, chosen)
+
+    from deepracer_exp.analysis.against_log import prepare_races
+    from deepracer_exp.deepracer.recording_reader import read_recording
+
+    view = prepare_races(read_recording(place), args.track)
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from deepracer_exp.analysis.log_report import write_against_log
+    from deepracer_exp.evaluation.against_log import race_against_log
+    from deepracer_exp.runs.resolve import resolve
+
+    run = resolve(name, stores.runs_dir, stores.uri)
+    with warnings_on_stderr():
+        both = race_against_log(run, chosen, view, args.track, Console(stderr=True, highlight=False))
+    out = Path(args.output) if args.output else _page("comparison", view.name)
+    try:
+        write_against_log(out, run.path.name, both, view)
+    except OSError as error:
+        raise BadInput(
+            f"--output {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
+        ) from error
+
+    console, texts = table_console(), both.texts
+    table = Table(box=None, pad_edge=False)
+    for number, head in enumerate(texts.heads):
+        table.add_column(head, justify="right" if number else "left")
+    for row in texts.rows:
+        table.add_row(*row)
+    console.print(f"log        {view.name}: {both.logged.words}", soft_wrap=True)
+    console.print(f"simulated  {run.path.name}: {both.simulated.words}\n", soft_wrap=True)
+    console.print(table)
+    console.print()
+    for sentence in both.sentences:
+        console.print(sentence, soft_wrap=not console.is_terminal)
+    _end(out, args.open)
+    return 0
+
+
+def _check_output(output: str | None) -> None:
+    if output is not None and not Path(output).absolute().parent.is_dir():
+        raise BadInput(f"--output {output}: its folder does not exist; accepted: a file in a folder")
+
+
+def _end(page: Path, is_opened: bool) -> None:
+    """Print where the page is, and open it."""
+    print(f"\n  page  {page}")
+    if is_opened:
         import webbrowser
 
-        webbrowser.open(out.resolve().as_uri())
-    return 0
+        webbrowser.open(page.resolve().as_uri())
+
+
+def _logs(what: str) -> Path | None:
+    """Return an existing file or folder, None if there is none.
+
+    Raises:
+        BadInput: it cannot be read.
+    """
+    with reading(what, "logs of the service, or a run"):
+        path = Path(what).expanduser()
+        if not path.exists():
+            return None
+        if not path.is_dir():
+            open_user_file(path, "logs of the service, or a run", LOG_BYTES).close()
+        return path
 
 
 def _place(what: str, stores: Stores) -> Path:
@@ -137,12 +262,9 @@ def _place(what: str, stores: Stores) -> Path:
     Raises:
         BadInput: there is none, or the name of a run is ambiguous.
     """
-    with reading(what, "logs of the service, or a run"):
-        path = Path(what).expanduser()
-        if path.exists():
-            if not path.is_dir():
-                open_user_file(path, "logs of the service, or a run", LOG_BYTES).close()
-            return path
+    path = _logs(what)
+    if path is not None:
+        return path
     from deepracer_exp.runs.resolve import resolve
 
     try:
@@ -191,8 +313,12 @@ def _default_out(place: Path, name: str) -> Path:
 
     if is_own_run(place):
         return place / REPORT
+    return _page("analysis", name)
+
+
+def _page(kind: str, name: str) -> Path:
     safe = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name).strip("-.")
-    return Path(f"{safe[:80] or 'log'}-analysis.html")
+    return Path(f"{safe[:80] or 'log'}-{kind}.html")
 
 
 def _seconds(text: str) -> float:

@@ -25,7 +25,7 @@ _OLD_FLAGS = {
     "--checkpoint": "checkpoint={}",
     "--out": "--output {}",
 }
-_OLD_COMMANDS = ("compare", "lineage", "promote", "clean")
+_OLD_COMMANDS = ("lineage", "promote", "clean")
 
 
 def refuse_old_spellings(arguments: Sequence[str]) -> None:

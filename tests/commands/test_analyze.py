@@ -1,4 +1,4 @@
-"""`deepracer-exp analyze`, and the page at the end of a training."""
+"""`deepracer-exp analyze` and `compare`, and the page at the end of a training."""
 
 import re
 import shutil
@@ -36,6 +36,19 @@ def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_
     assert len(printed) >= 3
     assert all(" ".join(line.split()) in text for line in printed)
     assert 'id="figure-reward_terms"' in (run_dir / "report.html").read_text()
+
+
+def test_simulated_laps_stand_beside_those_of_logs(run_dir, call, tmp_path):
+    assert call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws")).code == 0
+    ended = call("compare", str(run_dir), "from aws", "checkpoint=last")
+    assert ended.code == 0, ended.stderr
+    page = Html((tmp_path / "from-aws-comparison.html").read_text(encoding="utf-8"))
+    assert {"figure-lines_compared", "figure-along_the_track", "figure-actions_compared"} <= set(page.ids)
+    assert "of the training, which explores" in ended.stdout
+    text, lines = page.text, ended.stdout.splitlines()
+    for line in (*lines[4:8], lines[-3]):
+        assert " ".join(line.split()) in text
+    assert not page.loads
 
 
 @pytest.mark.parametrize("what", ["{name}", "tiny/{name}", "{begin}", "best:tiny"])

@@ -40,7 +40,7 @@ class ActionClasses:
     """The actions of a recording as classes, sorted from right to left and from slow to fast."""
 
     rows: pd.DataFrame
-    """`COLUMNS` of the training's driven rows."""
+    """`COLUMNS` of the driven rows."""
     number: NDArray[np.intp]
     """Class of each row (n,); -1 where no action is logged."""
     names: tuple[str, ...]
@@ -52,7 +52,11 @@ class ActionClasses:
 
 def action_classes(view: LogView) -> ActionClasses | None:
     """Sort the training's actions into classes; None if none is logged."""
-    rows = view.driven(*COLUMNS)
+    return classify(view.driven(*COLUMNS))
+
+
+def classify(rows: pd.DataFrame) -> ActionClasses | None:
+    """Sort the actions of rows with `COLUMNS` into classes; None if none is logged."""
     steer, speed = rows["steer"].to_numpy(np.float64), rows["throttle"].to_numpy(np.float64)
     known = np.isfinite(steer) & np.isfinite(speed)
     if not known.any():

@@ -1,0 +1,306 @@
+"""Simulated laps of a policy beside the laps of a log: the numbers of both, and where on the track they part."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from deepracer_exp.deepracer.recording import STEP_COLUMNS, TRAINING, Recording
+from deepracer_exp.errors import BadInput, count
+from deepracer_exp.tracks.track import Track
+
+from .charts.actions import COLUMNS, ActionClasses, classify
+from .log_course import waypoint_positions
+from .log_tables import NONE, Table
+from .log_view import DISCOUNT, PREPARE, LogView, prepare
+from .sectors import sector_at, sectors_of
+from .statistics import Values
+from .tables import add_derived, episode_table, first_rows
+
+PLACES = np.arange(100) / 100
+"""Lap positions at which laps are compared."""
+STRETCH = 10
+"""Places of the stretch where they part."""
+MOST_TRAINING_LAPS = 10
+"""Laps of a training that stand for a log without an evaluation: its policy still explores."""
+_MISTAKES = ("off_track", "crashed", "reversed", "immobilized")
+_SMOOTHED = 5
+"""Control steps in the mean of speed and steering along a lap: the service's steps are uneven."""
+_NEAR = 0.03
+"""Share of the lap beyond which the nearest step says nothing about a place."""
+_SAME_ACTION = 0.02
+"""Degrees and m/s by which the same action may differ between log and simulation: text logs are rounded."""
+_SAME = 0.005
+"""m and m/s below which line and speed count as the same."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Laps:
+    """Attempted laps on one course."""
+
+    steps: pd.DataFrame
+    """`recording.STEP_COLUMNS` and `tables.DERIVED_COLUMNS`, lap by lap."""
+    episodes: pd.DataFrame
+    """One row a lap, `tables.EPISODE_COLUMNS`."""
+    words: str
+    """Which laps they are."""
+    chosen: bool = False
+    """Whether they were chosen because they are complete."""
+
+    @cached_property
+    def number(self) -> NDArray[np.intp]:
+        """Lap of each row of `steps`."""
+        return np.cumsum(first_rows(self.steps)) - 1
+
+    @cached_property
+    def driven(self) -> pd.DataFrame:
+        """Return the rows that follow an action."""
+        return self.steps[(self.steps["episode_status"] != PREPARE).to_numpy()]
+
+    def along(self, column: str, closed: bool) -> Values:
+        """Return the mean of a column over `_SMOOTHED` steps at `PLACES`, (laps, places); NaN where a lap did not pass.
+
+        Args:
+            column: of `steps`.
+            closed: whether the course is.
+        """
+        found = np.full((len(self.episodes), len(PLACES)), np.nan)
+        for lap, rows in self.steps.groupby(self.number):
+            values = rows[column].rolling(_SMOOTHED, center=True, min_periods=1).mean().to_numpy(np.float64)
+            known = np.isfinite(values)
+            if not known.any():
+                continue
+            at = rows["lap_position"].to_numpy(np.float64)[known]
+            apart = np.abs(PLACES[:, None] - at).min(axis=1)
+            if closed:
+                apart = np.minimum(apart, np.abs(np.abs(PLACES[:, None] - at) - 1.0).min(axis=1))
+            order = np.argsort(at, kind="stable")
+            passed = np.interp(PLACES, at[order], values[known][order], period=1.0 if closed else None)
+            found[lap] = np.where(apart <= _NEAR, passed, np.nan)
+        return found
+
+    def measures(self) -> dict[str, float]:
+        """Return the numbers that are compared, by their names with units; NaN where there is none."""
+        laps, rows = self.episodes, self.driven
+        tried = max(int(laps["ended"].sum()), 1)
+        time_s = float(laps["time_s"].sum())
+        status = self.steps["episode_status"].astype(str)
+        mistake = status.isin(_MISTAKES).to_numpy()
+        began = mistake & ~np.r_[False, mistake[:-1]]
+        turned_deg = rows["steer"].diff().abs()[np.diff(self.number[rows.index], prepend=-1) == 0]
+        return {
+            "complete laps, %": np.nan if self.chosen else 100.0 * float(laps["complete"].sum()) / tried,
+            "best lap, s": float(laps["lap_time_s"].min()),
+            "median lap, s": float(laps["lap_time_s"].median()),
+            "mean speed, m/s": float(laps["dist_m"].sum()) / time_s if time_s else np.nan,
+            "off the track or stuck, per lap": np.nan if self.chosen else float(began.sum()) / tried,
+            "mean distance from the centre line, m": float(rows["offset_m"].abs().mean()),
+            "mean steering change per step, °": float(turned_deg.mean()),
+        }
+
+
+def laps_on(course: Track, steps: pd.DataFrame, words: str, chosen: bool = False) -> Laps:
+    """Return laps on a course.
+
+    Args:
+        course: what was driven on.
+        steps: `recording.STEP_COLUMNS`, rows of each lap contiguous and in the order of time.
+        words: which laps they are.
+        chosen: whether they were chosen because they are complete.
+    """
+    rows = steps[list(STEP_COLUMNS)].reset_index(drop=True)
+    first = first_rows(rows)
+    rows = add_derived(rows, first, course, DISCOUNT)
+    return Laps(steps=rows, episodes=episode_table(rows, first), words=words, chosen=chosen)
+
+
+def prepare_races(recording: Recording, track: str | None = None) -> LogView:
+    """Prepare the evaluations and races of a log, or if there are none its training.
+
+    Raises:
+        BadInput: as for `prepare`.
+    """
+    raced = (recording.steps["stream"] != TRAINING).to_numpy()
+    return prepare(replace(recording, steps=recording.steps[raced]) if raced.any() else recording, track)
+
+
+def logged_laps(view: LogView, course: Track) -> Laps:
+    """Return the laps of a log that a simulation is compared with: of its races, else the best of its training.
+
+    Args:
+        view: as `prepare_races` returns it.
+        course: that it was driven on.
+
+    Raises:
+        BadInput: a training without a complete lap.
+    """
+    laps = view.episodes
+    if not view.trained:
+        streams = [str(name) for name in laps["stream"].unique()]
+        named = f"{', '.join(streams[:2])}{' ...' * (len(streams) > 2)}"
+        words = f"{count(len(laps), 'lap')} of {count(len(streams), 'evaluation')}"
+        return laps_on(course, view.steps, f"{words} ({named})")
+    best = laps["lap_time_s"].dropna().nsmallest(MOST_TRAINING_LAPS).index
+    if not len(best):
+        raise BadInput(
+            f"{view.name}: has no evaluation, and its training no complete lap; accepted: logs with laps to compare"
+        )
+    words = f"the fastest {len(best)} of {count(int(laps['complete'].sum()), 'complete lap')}"
+    chosen = np.isin(view.episode_index, best)
+    words += " of the training, which explores: the log has no evaluation"
+    return laps_on(course, view.steps[chosen], words, chosen=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """A part of the track."""
+
+    begin: int
+    """Per cent of the track from waypoint 0."""
+    end: int
+    """Likewise; at most 100 also behind the start line."""
+    first_waypoint: int
+    last_waypoint: int
+    sector: str
+    offset_m: float
+    """How much further left the simulated line is, mean."""
+    speed_mps: float
+    """How much faster the simulated car is, mean."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AgainstLog:
+    """Simulated laps and logged ones on the same course."""
+
+    course: Track
+    logged: Laps
+    simulated: Laps
+
+    @cached_property
+    def curves(self) -> dict[str, tuple[Values, Values]]:
+        """Logged and simulated values at `PLACES`, (laps, places), by column."""
+        return {
+            name: (
+                self.logged.along(name, self.course.closed),
+                self.simulated.along(name, self.course.closed),
+            )
+            for name in ("offset_m", "track_speed_mps", "steer")
+        }
+
+    def difference(self, column: str) -> Values:
+        """Return how much more the simulated median is, (places,); NaN where one side did not pass."""
+        logged, simulated = (quantile(curves, 0.5) for curves in self.curves[column])
+        return simulated - logged
+
+    @cached_property
+    def actions(self) -> ActionClasses | None:
+        """Actions of both, logged ones first; in ranges if the two lists of actions are not the same."""
+        rows = pd.concat([laps.driven[list(COLUMNS)] for laps in (self.logged, self.simulated)])
+        spans = rows.groupby("action")[["steer", "throttle"]].agg(np.ptp)
+        same = bool((spans <= _SAME_ACTION).all(axis=None))
+        return classify(rows if same else rows.assign(action=np.nan))
+
+    @property
+    def action_shares(self) -> tuple[Values, Values]:
+        """Shares of each class of `actions` in per cent, logged and simulated; of none without actions."""
+        if self.actions is None:
+            return np.zeros(0), np.zeros(0)
+        n, m = len(self.logged.driven), len(self.actions.names)
+        counts = [
+            np.bincount(part[part >= 0], minlength=m)
+            for part in (self.actions.number[:n], self.actions.number[n:])
+        ]
+        logged, simulated = (100.0 * one / max(one.sum(), 1) for one in counts)
+        return logged, simulated
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The numbers: `name`, `logged`, `simulated`, `difference`; differences of shares are in percentage points."""
+        logged, simulated = self.logged.measures(), self.simulated.measures()
+        rows = [(name, logged[name], simulated[name]) for name in logged]
+        if self.actions is not None:
+            names = [f"action {name}, %" for name in self.actions.names]
+            rows += list(zip(names, *self.action_shares, strict=True))
+        table = pd.DataFrame(rows, columns=["name", "logged", "simulated"])
+        return table.assign(difference=table["simulated"] - table["logged"])
+
+    @property
+    def texts(self) -> Table:
+        """The table as texts."""
+        rows = []
+        for name, *values in self.table.itertuples(index=False):
+            digits = 1 if name.endswith("%") else 2
+            forms = (f".{digits}f", f".{digits}f", f"+.{digits}f")
+            texts = (
+                format(value, form) if np.isfinite(value) else NONE
+                for value, form in zip(values, forms, strict=True)
+            )
+            rows.append((name, *texts))
+        return Table(("", "log", "simulated", "difference"), tuple(rows), 1)
+
+    @cached_property
+    def stretch(self) -> Stretch | None:
+        """Where line or speed differ most, None where nothing can be compared.
+
+        The line counts in halves of the road's width, the speed in means of the logged one; the larger of the two
+        counts.
+        """
+        offset_m, speed_mps = self.difference("offset_m"), self.difference("track_speed_mps")
+        mean_mps = np.nanmean(self.curves["track_speed_mps"][0]) if np.isfinite(speed_mps).any() else 1.0
+        apart = np.fmax(np.abs(offset_m) / (self.course.width_m / 2), np.abs(speed_mps) / mean_mps)
+        begins = len(PLACES) if self.course.closed else len(PLACES) - STRETCH + 1
+        windows = (np.arange(begins)[:, None] + np.arange(STRETCH)) % len(PLACES)
+        whole = np.isfinite(apart[windows]).all(axis=1)
+        if not whole.any():
+            return None
+        at = int(np.where(whole, np.nan_to_num(apart)[windows].mean(axis=1), -1.0).argmax())
+        begin, end = at / len(PLACES), (at + STRETCH) / len(PLACES)
+        waypoint_at = waypoint_positions(self.course)[: len(self.course.waypoints) - self.course.closed]
+        inside = np.flatnonzero(((waypoint_at - begin) % 1.0) <= end - begin)
+        inside = inside[np.argsort((waypoint_at[inside] - begin) % 1.0)]
+        sectors = sectors_of(self.course)
+        middle = np.array([(begin + end) / 2 % 1.0])
+        return Stretch(
+            begin=round(100 * begin),
+            end=round(100 * end) if end <= 1 else round(100 * end) - 100,
+            first_waypoint=int(inside[0]) if len(inside) else 0,
+            last_waypoint=int(inside[-1]) if len(inside) else 0,
+            sector=sectors[int(sector_at(sectors, middle)[0])].name,
+            offset_m=float(offset_m[windows[at]].mean()),
+            speed_mps=float(speed_mps[windows[at]].mean()),
+        )
+
+    @property
+    def sentences(self) -> list[str]:
+        """What it comes to: lap times, line, and where they part."""
+        logged, simulated = (laps.episodes["lap_time_s"] for laps in (self.logged, self.simulated))
+        if not len(simulated.dropna()):
+            found = ["The simulated car completes no lap."]
+        elif not len(logged.dropna()):
+            found = ["The logged car completes no lap."]
+        else:
+            found = [
+                f"The simulated lap takes {simulated.median():.2f} s, the logged one {logged.median():.2f} s: "
+                f"{simulated.median() - logged.median():+.2f} s (medians)."
+            ]
+        offset_m, speed_mps = (np.abs(self.difference(name)) for name in ("offset_m", "track_speed_mps"))
+        one = self.stretch
+        if one is None:
+            return [*found, "They have no stretch of the track in common that is long enough to compare."]
+        if max(np.nanmax(offset_m), np.nanmax(speed_mps)) < _SAME:
+            return [*found, "Line and speed are the same all along the track, to 1 cm and 0.01 m/s."]
+        return [
+            *found,
+            f"The lines are {np.nanmean(offset_m):.2f} m apart on average, the speeds {np.nanmean(speed_mps):.2f} m/s.",
+            f"They part most from {one.begin} to {one.end} % of the track (waypoints {one.first_waypoint} to "
+            f"{one.last_waypoint}, sector {one.sector}): there the simulated car is {abs(one.offset_m):.2f} m further "
+            f"{'left' if one.offset_m > 0 else 'right'} and {abs(one.speed_mps):.2f} m/s "
+            f"{'faster' if one.speed_mps > 0 else 'slower'}.",
+        ]
+
+
+def quantile(curves: Values, share: float) -> Values:
+    """Return a quantile over laps, (places,); NaN where no lap passed."""
+    return pd.DataFrame(curves).quantile(share).to_numpy()

@@ -1,0 +1,127 @@
+"""Laps raced as those of a log: from its starts, in its direction, on its track."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps, prepare_races
+from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.against_log import course_driven, race_as_logged
+from deepracer_exp.export.aws_logs import TRACE_HEADER
+from deepracer_exp.tracks.track import Track
+
+CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
+
+
+def started(course: Track, races: list[tuple[float, int]]) -> pd.DataFrame:
+    """Return a log of which only the starts are known: where each race starts, and its laps."""
+    rows = []
+    for start, laps in races:
+        x, y = course.points_at(np.array([start]))[0]
+        for lap in range(laps):
+            # A lap that follows without a stop counts its steps on.
+            numbers = (1, 2) if lap == 0 else (2 + lap,)
+            episode = rows[-1]["episode"] + 1 if rows else 0
+            rows += [{"episode": episode, "steps": number, "X": x, "Y": y} for number in numbers]
+    return pd.DataFrame(rows).assign(stream="evaluation", progress=0.0, tstamp=np.arange(len(rows)) / 15)
+
+
+def written(steps: pd.DataFrame, folder: Path) -> Path:
+    """Write steps as the service writes those of an evaluation."""
+    table = steps.assign(
+        action=[f"[{a} {b}]" for a, b in zip(steps["steer"], steps["throttle"], strict=True)]
+    )
+    file = folder / "evaluation-simtrace" / "0-iteration.csv"
+    file.parent.mkdir(parents=True)
+    table[TRACE_HEADER.split(",")].to_csv(file, index=False)
+    return folder
+
+
+@pytest.mark.parametrize("direction", ["forward", "reversed"])
+def test_a_policy_beside_its_own_log_differs_in_nothing(experiment, driver, tmp_path, direction):
+    (config,) = experiment.tracks.values()
+    config = dataclasses.replace(config, direction=direction)
+    track = Track.from_config(config)
+    first = race_as_logged(experiment, driver(), config, track, started(track, [(0.0, 2), (0.25, 1)]))
+    view = prepare_races(read_recording(written(first, tmp_path / "log")))
+
+    config, found = course_driven(view, experiment)
+    assert (config.direction, found.reversed) == (direction, direction == "reversed")
+    logged = logged_laps(view, found)
+    again = race_as_logged(experiment, driver(), config, found, logged.steps)
+    assert len(again) == len(first)
+    for name in ("X", "Y", "yaw", "steer", "throttle", "progress", "tstamp"):
+        np.testing.assert_allclose(again[name], first[name], atol=1e-6)
+
+    both = AgainstLog(course=found, logged=logged, simulated=laps_on(found, again, "again"))
+    numbers = both.table.set_index("name")
+    assert np.abs(numbers["difference"]).max() < 1e-6
+    assert numbers.loc["complete laps, %", "logged"] == 100.0
+    # The second of the first race is a flying lap, the third starts a quarter of the lap further.
+    assert logged.episodes["lap_time_s"].round(2).nunique() == 2
+    assert logged.episodes["lap_time_s"].idxmin() == 1
+    assert both.sentences[1].startswith("Line and speed are the same all along the track")
+
+    faster = race_as_logged(experiment, driver(0.3), config, found, logged.steps)
+    both = AgainstLog(course=found, logged=logged, simulated=laps_on(found, faster, "faster"))
+    gain_s = faster["tstamp"].max() - first["tstamp"].max()
+    assert both.table.set_index("name").loc["mean speed, m/s", "difference"] > 0.1
+    assert gain_s < -0.5
+    assert both.sentences[-1].endswith("faster.")
+
+
+def test_a_car_that_leaves_the_track_is_put_back_and_its_mistakes_are_counted(experiment, driver):
+    (config,) = experiment.tracks.values()
+    track = Track.from_config(config)
+    steps = race_as_logged(experiment, driver(gain=0.0), config, track, started(track, [(0.0, 1)]))
+    laps = laps_on(track, steps, "straight on")
+    put_back = laps.measures()["off the track or stuck, per lap"]
+    assert put_back >= 3
+    moved_s = len(steps) / 15
+    # Two seconds each time, as in the service.
+    assert laps.episodes["time_s"].sum() == pytest.approx(moved_s + 2 * put_back, abs=0.5)
+
+
+def test_a_log_of_another_track_is_refused(experiment, driver, tmp_path):
+    (config,) = experiment.tracks.values()
+    track = Track.from_config(config)
+    steps = race_as_logged(experiment, driver(), config, track, started(track, [(0.0, 1)]))
+    view = prepare_races(
+        read_recording(written(steps.assign(X=2 * steps["X"], track_len=31.4), tmp_path / "log"))
+    )
+    with pytest.raises(BadInput, match=r"none of the service's worlds .* accepted: --track"):
+        course_driven(view, experiment)
+    with pytest.raises(BadInput, match="--track Oval_track: is not where the car of log drove"):
+        course_driven(view, experiment, "Oval_track")
+
+
+@pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")
+def test_the_races_of_the_console_are_driven_as_often_and_from_the_same_starts(experiment, driver):
+    view = prepare_races(read_recording(CONSOLE / "logs" / "leaderboard"))
+    config, track = course_driven(view, experiment)
+    assert (config.name, config.direction) == ("reinvent_base", "forward")
+    logged = logged_laps(view, track)
+    assert logged.words.startswith("6 laps of 2 evaluations (leaderboard-2022")
+    numbers = logged.measures()
+    assert (round(numbers["best lap, s"], 2), round(numbers["median lap, s"], 2)) == (15.6, 16.23)
+    steps = race_as_logged(experiment, driver(), config, track, logged.steps)
+    begun = steps[steps["steps"] == 1]
+    assert len(begun) == 2  # each race has three laps in a row
+    assert steps["episode"].nunique() == 6
+    standing = logged.steps[logged.steps["steps"] == 1]
+    np.testing.assert_allclose(begun[["X", "Y"]], standing[["X", "Y"]], atol=0.01)
+    alike = AgainstLog(course=track, logged=logged, simulated=logged)
+    assert np.abs(alike.table["difference"]).max() == 0.0
+
+
+@pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")
+def test_a_training_without_an_evaluation_stands_with_its_fastest_laps(experiment):
+    view = prepare_races(read_recording(CONSOLE / "sim-trace" / "training"))
+    logged = logged_laps(view, course_driven(view, experiment)[1])
+    assert "the fastest 10 of 47 complete laps of the training" in logged.words
+    assert round(logged.episodes["lap_time_s"].min(), 2) == 14.13
+    assert np.isnan(logged.measures()["complete laps, %"])
