@@ -76,6 +76,7 @@ CASES = {
     ("export", "unknown", "format=onnx"): "unknown: no such run",
     ("export", "runs/a/run", "format=onnx"): "checkpoint",
     ("export", "runs/a/run", "format=onx"): "format",
+    ("export", "alone", "format=car"): "observation: the car has no features",
     ("export", "runs/a/own", "format=onnx"): "network.target=my_network:Net: named by a stored run",
     ("analyze", "unknown"): "unknown: no such file or folder, and no run",
     ("analyze", "pipe"): "pipe: is a pipe",
@@ -149,6 +150,7 @@ def refused(tmp_path_factory, call_at):
     runs, recorded = folder / "runs" / "a", folder / "recorded" / "a"
     write_run(runs / "run", config)
     write_run(runs / "own", config | {"network": {"target": "my_network:Net", "kwargs": {}}}, "000001")
+    write_run(folder / "alone", config, "000001")
     spent = config["budget"]["env_steps"]
     write_run(runs / "ended", config, status="finished", reason="budget reached: env_steps", env_steps=spent)
     write_run(recorded / "stopped", config, status="stopped early", reason="converged", env_steps=9)

@@ -45,12 +45,12 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "export",
         _export,
         help="write a trained policy, its training files or its logs for other programs",
-        description="Write a run's policy as ONNX, the files that AWS's console and deepracer-for-cloud train from, or "
-        "its logs in the format of these two.",
+        description="Write a run's policy as ONNX or for a physical car, the files that AWS's console and "
+        "deepracer-for-cloud train from, or its logs in the format of these two.",
         epilog=_EXPORT_EPILOG,
         entry="export",
     )
-    add_run(parser, "format=onnx|aws|aws-logs | KEY=VALUE")
+    add_run(parser, "format=onnx|car|aws|aws-logs | KEY=VALUE")
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
@@ -78,6 +78,7 @@ _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=onnx                      the network as one file, checked against itself
   deepracer-exp export RUN format=onnx checkpoint=last -o policy.onnx
   deepracer-exp export champion format=onnx                 the checkpoint with that alias (deepracer-exp runs promote)
+  deepracer-exp export RUN format=car -o my_model.tar.gz    for the console of a physical car, which calls it my_model
   deepracer-exp export RUN format=aws -o custom_files       reward_function.py, model_metadata.json and
                                                             hyperparameters.json
   deepracer-exp export RUN format=aws-logs                  trace, metrics and logs of the training, as in an archive
@@ -94,8 +95,12 @@ def _export(args: argparse.Namespace) -> int:
     run, overrides = run_and_overrides(args)
     config, _ = compose_export([*overrides, override_line("run", run)])
     args.debug = config.debug
-    if config.format == "onnx":
-        check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+    if config.format in ("onnx", "car"):
+        experiment = check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+        if config.format == "car":
+            from deepracer_exp.export.car_archive import check_car
+
+            check_car(experiment)
     else:
         resolve(config.run, Path(config.runs_dir), config.tracking.uri)
 

@@ -45,8 +45,8 @@ def check_teacher(experiment: "Experiment") -> None:
         check_policy(experiment.teacher, experiment.runs_dir, getattr(experiment.tracking, "uri", None), None)
 
 
-def check_policy(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> None:
-    """Find a run as `check_run` does, and import the classes of the user's own that its policy needs.
+def check_policy(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> "Experiment":
+    """Return the experiment of a run that `check_run` finds; import the classes of the user's own its policy needs.
 
     Raises:
         BadInput: as `check_run`, or a class is not named again or cannot be imported.
@@ -54,7 +54,9 @@ def check_policy(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: 
     from deepracer_exp.config.own_class import OF_POLICY
     from deepracer_exp.config.parse import import_own_classes
 
-    import_own_classes(check_run(run, runs_dir, tracking_uri, checkpoint).experiment, OF_POLICY)
+    experiment = check_run(run, runs_dir, tracking_uri, checkpoint).experiment
+    import_own_classes(experiment, OF_POLICY)
+    return experiment
 
 
 def check_run(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> "StoredRun":

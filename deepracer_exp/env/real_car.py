@@ -6,8 +6,6 @@ from .action_space import ContinuousActions, build_action_space
 
 CAR_PICTURE = (160, 120)
 """Width and height of what the car's software shows a model."""
-CAR_LIDAR_REACH_M = 0.5
-"""Distance beyond which the car's software cuts the readings of its LIDAR."""
 
 
 def car_refusals(experiment: Experiment) -> list[str]:
@@ -45,9 +43,9 @@ def car_refusals(experiment: Experiment) -> list[str]:
             refusals.append(
                 "observation.lidar.kind=discretized: the car cannot load it; accepted: plain, sectors"
             )
-        elif lidar.furthest_m != CAR_LIDAR_REACH_M:
+        if abs(lidar.yaw_deg) != 180:
             refusals.append(
-                f"observation.lidar.reach_m: {lidar.furthest_m:g} m; accepted: 0.5, where the car cuts its readings"
+                f"observation.lidar.yaw_deg: {lidar.yaw_deg:g}; accepted: 180, as the service's car carries it"
             )
     actions = build_action_space(experiment.action_space)
     if isinstance(actions, ContinuousActions) and not (actions.low < actions.high).all():

@@ -29,7 +29,7 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tupl
         actions: its action space.
         reward: text of the reward function, with its constants filled in.
     """
-    metadata = replace(metadata_of(actions), **_sensors(experiment.observation))
+    metadata = replace(metadata_of(actions), **sensor_keys(experiment.observation))
     learning, changed = _hyperparameters(experiment)
     texts = {
         "reward_function.py": reward,
@@ -39,7 +39,7 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tupl
     return texts, [*_action_notes(metadata), *changed]
 
 
-def _sensors(observation: ObservationConfig) -> dict[str, Any]:
+def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
     """Return the keys of a model's metadata for what is observed; the service's models all have a camera."""
     stereo = observation.camera is not None and observation.camera.stereo_m > 0
     camera, lidar = "STEREO_CAMERAS" if stereo else "FRONT_FACING_CAMERA", observation.lidar

@@ -1,4 +1,4 @@
-"""The command `export`: write a policy as ONNX, or a run's files or logs in the layouts of AWS."""
+"""The command `export`: write a policy as ONNX or for a car, or a run's files or logs in the layouts of AWS."""
 
 import json
 import logging
@@ -27,6 +27,7 @@ from deepracer_exp.validation.console import console_findings
 
 from .aws_files import aws_files, write_texts
 from .aws_logs import write_aws_logs
+from .car_archive import ENDING, car_archive, describe_actions, name_on_car
 
 POLICY, COMMAND = "policy", "command"
 CHECKED, CHECKED_PICTURES = 1000, 100
@@ -47,6 +48,10 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
     if config.format == "onnx":
         checkpoint = run.choose_checkpoint(config.checkpoint)
         return _onnx(run, checkpoint, Path(output or exports / "policy.onnx"), out)
+    if config.format == "car":
+        checkpoint = run.choose_checkpoint(config.checkpoint)
+        name = name_on_car(run.path.name) + ENDING
+        return _car(run, checkpoint, Path(output or exports / name), out)
     if config.format == "aws-logs":
         return _aws_logs(run, Path(output or exports / "aws-logs"), config.layout, out)
     return _aws(run, Path(output or exports / "aws"), out)
@@ -90,6 +95,35 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
         f"  checked      largest difference to the network {difference:.1e} on {checked:,} observations"
     )
     return path
+
+
+def _car(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
+    if not path.name.endswith(ENDING) or path.is_dir():
+        raise BadInput(
+            f"--output {path}: accepted: a file whose name ends in {ENDING}, as the car's console wants it"
+        )
+    stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
+    actions = build_action_space(run.experiment.action_space)
+    archive = car_archive(stored.networks, run.experiment, actions)
+    _write(path, archive.content)
+    out.print(f"{path}", soft_wrap=True)
+    out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
+    out.print(f"  model        {name_on_car(path.name)} on the car, {len(archive.content) / 1e6:.1f} MB")
+    out.print(f"  reads        {', '.join(archive.metadata.sensor)}")
+    for note in archive.notes:
+        out.print(f"  {note}", soft_wrap=True)
+    out.print("  What the car makes of the actions, with its maximum speed at 100 %:")
+    for line in describe_actions(archive.metadata):
+        out.print(f"  {line}", soft_wrap=True)
+    return path
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, content)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _aws_logs(run: StoredRun, folder: Path, layout: str, out: Console) -> Path:
@@ -193,11 +227,7 @@ def write_onnx(
             f"the ONNX file differs from the network by {difference:.3g} on {len(observations[0])} observations; "
             f"at most {TOLERANCE:g} is rounding"
         )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write(path, content)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from error
+    _write(path, content)
     return difference
 
 

@@ -23,7 +23,8 @@ def sees():
         ({"width": 80, "height": 60}, None, ["80x60"]),
         ({"color": "rgb"}, None, ["rgb"]),
         ({"width": 80, "height": 60, "frames": 3}, None, ["80x60", "frames=3"]),
-        ({}, {"reach_m": None}, ["1 m"]),
+        ({}, {"reach_m": None}, []),  # an archive's lidar_config sets the reach
+        ({}, {"yaw_deg": 0.0}, ["accepted: 180"]),
         (None, {"kind": "discretized"}, ["discretized"]),
         ({}, None, []),
         ({"stereo_m": 0.06}, None, []),

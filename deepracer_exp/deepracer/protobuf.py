@@ -1,0 +1,64 @@
+"""The wire format of protobuf, as far as files of TensorFlow need it (protobuf.dev, Encoding)."""
+
+from collections.abc import Iterator
+
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+
+
+def varint(value: int) -> bytes:
+    """Return a whole number, negative ones in two's complement of 64 bits."""
+    value &= 2**64 - 1
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def field(number: int, value: int | str | bytes) -> bytes:
+    """Return a field of a message: a number, or a text, bytes or a message with their length."""
+    if isinstance(value, int):
+        return varint(number << 3 | VARINT) + varint(value)
+    raw = value.encode() if isinstance(value, str) else value
+    return varint(number << 3 | BYTES) + varint(len(raw)) + raw
+
+
+def read_varint(raw: memoryview, at: int) -> tuple[int, int]:
+    """Return the number at a place, and the place after it.
+
+    Raises:
+        ValueError: there is none.
+    """
+    value = 0
+    for shift in range(0, 70, 7):
+        if at >= len(raw):
+            raise ValueError("ends early")
+        byte = raw[at]
+        at += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, at
+    raise ValueError("holds a number of more than ten bytes")
+
+
+def read_fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Yield number and value of each field: a number, or the bytes of anything else.
+
+    Raises:
+        ValueError: it is not a message.
+    """
+    at = 0
+    while at < len(message):
+        tag, at = read_varint(message, at)
+        number, kind = tag >> 3, tag & 7
+        if kind == VARINT:
+            value, at = read_varint(message, at)
+            yield number, value
+            continue
+        if kind not in (FIXED64, BYTES, FIXED32):
+            raise ValueError("is not a protobuf message")
+        size, at = read_varint(message, at) if kind == BYTES else (8 if kind == FIXED64 else 4, at)
+        if size > len(message) - at:
+            raise ValueError("ends early")
+        yield number, message[at : at + size]
+        at += size

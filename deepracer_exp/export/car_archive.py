@@ -1,0 +1,230 @@
+"""A policy as the archive that the software of a physical car loads: model_metadata.json and a frozen graph.
+
+Source of what the car reads, refuses and misreads: deepracer-custom-car 2.1.9.9, which in these points is AWS's own
+(model_loader_node.py, model_optimizer_node.py, deepracer_navigation_node.py, sensor_fusion_node.cpp, and models.py of
+its web server).
+"""
+
+import gzip
+import io
+import json
+import tarfile
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.driving import LidarConfig, ObservationConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import CNNConfig
+from deepracer_exp.deepracer.car_controls import full_scale, steering_share, throttle
+from deepracer_exp.deepracer.graph_def import HEAD, POLICY_NETWORK, policy_graph, read_weights
+from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, model_metadata_text
+from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, metadata_of
+from deepracer_exp.env.real_car import car_refusals
+from deepracer_exp.errors import BadInput, RunFailed
+
+from .aws_files import sensor_keys
+
+if TYPE_CHECKING:
+    from deepracer_exp.agents.actor_critic import ActorCritic
+
+ENDING = ".tar.gz"
+"""The car's console takes no file with another one."""
+METADATA, GRAPH = "model_metadata.json", "agent/model.pb"
+
+Tensors = Mapping[str, NDArray[np.float32]]
+
+
+class Rescaling(NamedTuple):
+    """Of the outputs [steering, speed]: factor x output, clipped to -1..1, + shift; (2,) each."""
+
+    factor: NDArray[np.float64]
+    shift: NDArray[np.float64]
+
+
+class CarArchive(NamedTuple):
+    """What is uploaded to a car."""
+
+    content: bytes
+    metadata: ModelMetadata
+    notes: list[str]
+    """On each thing that was changed, or that the car will do otherwise."""
+
+
+def check_car(experiment: Experiment) -> None:
+    """Refuse what the car could not load or would show the policy otherwise.
+
+    Raises:
+        BadInput: naming the key and what would be accepted.
+    """
+    for refusal in car_refusals(experiment):
+        raise BadInput(refusal)
+    if experiment.observation.camera is None:
+        raise BadInput(
+            "observation.camera: null; a model of the service has a camera; accepted: observation=camera, stereo, "
+            "camera_lidar"
+        )
+
+
+def car_archive(networks: "ActorCritic", experiment: Experiment, actions: ActionSpace) -> CarArchive:
+    """Return the archive of a policy; the same policy gives the same bytes.
+
+    Raises:
+        BadInput: the car would refuse or misread it.
+        RunFailed: the graph does not hold the network's weights.
+    """
+    from deepracer_exp.agents.service_weights import to_service
+
+    observation, network = experiment.observation, experiment.network
+    check_car(experiment)
+    metadata, rescaling = car_actions(actions)
+    metadata = replace(metadata, **sensor_keys(observation))
+    notes = _notes(metadata.sensor)
+    tensors: Tensors = to_service(networks, metadata.sensor)
+    bounds = None
+    if rescaling is not None:
+        factor, shift = rescaling
+        tensors = _rescaled(tensors, rescaling)
+        bounds = (shift - factor).astype(np.float32), (shift + factor).astype(np.float32)
+        lock_deg = full_scale(metadata).steering_deg
+        notes.append(
+            f"steering from {actions.low[0]:g} to {actions.high[0]:g} degrees is written as -{lock_deg:g} to "
+            f"{lock_deg:g}, and the outputs are rescaled to give the same angles: the car divides by the high end alone"
+        )
+    assert isinstance(network, CNNConfig)  # or to_service had refused it
+    graph = policy_graph(tensors, _shapes(observation, metadata.sensor), network.strides, bounds)
+    _check_weights(graph, tensors)
+    text = _metadata_text(metadata, observation.lidar)
+    return CarArchive(_packed({METADATA: text.encode(), GRAPH: graph}), metadata, notes)
+
+
+def car_actions(actions: ActionSpace) -> tuple[ModelMetadata, Rescaling | None]:
+    """Return an action space in a form that the car scales as it is meant, and what the outputs need for it.
+
+    The car divides steering by the high end alone, so that nothing but a range from -x to x comes out right.
+    """
+    metadata = metadata_of(actions)
+    if not isinstance(actions, ContinuousActions) or actions.low[0] == -actions.high[0]:
+        return metadata, None
+    lock_deg = max(abs(actions.low[0]), abs(actions.high[0]))
+    low, high = np.array([-lock_deg, actions.low[1]]), np.array([lock_deg, actions.high[1]])
+    factor = (actions.high - actions.low) / (high - low)
+    shift = (actions.high + actions.low - high - low) / (high - low)
+    return replace(metadata, low=Action(*low.tolist()), high=Action(*high.tolist())), Rescaling(factor, shift)
+
+
+def _rescaled(tensors: Tensors, rescaling: Rescaling) -> Tensors:
+    """Return the tensors with the factor and the shift in the last layer."""
+    kernel, bias = (tensors[f"{HEAD}/policy_mean/{name}"] for name in ("kernel", "bias"))
+    return {
+        **tensors,
+        f"{HEAD}/policy_mean/kernel": (kernel * rescaling.factor).astype(np.float32),
+        f"{HEAD}/policy_mean/bias": (bias * rescaling.factor + rescaling.shift).astype(np.float32),
+    }
+
+
+def _shapes(observation: ObservationConfig, sensors: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the graph's inputs by sensor."""
+    assert observation.camera is not None
+    channels, height, width = observation.camera.shape
+    shapes: list[tuple[int, ...]] = [(height, width, channels)]
+    if observation.lidar is not None:
+        shapes.append((observation.lidar.size,))
+    return dict(zip(sensors, shapes, strict=True))
+
+
+def _check_weights(graph: bytes, tensors: Tensors) -> None:
+    """Compare what the graph holds with the weights of the policy.
+
+    Raises:
+        RunFailed: they differ.
+    """
+    written = read_weights(GRAPH, graph)
+    policy = {
+        name: value
+        for name, value in tensors.items()
+        if name.startswith(f"{POLICY_NETWORK}/") and name.endswith(("/kernel", "/bias"))
+    }
+    if policy.keys() != written.keys() or not all(
+        np.array_equal(policy[name], written[name]) for name in policy
+    ):
+        raise RunFailed(f"{GRAPH}: its weights are not the network's")
+
+
+def _metadata_text(metadata: ModelMetadata, lidar: LidarConfig | None) -> str:
+    values = json.loads(model_metadata_text(metadata))
+    values.pop("lidar_config", None)
+    if lidar is not None:
+        from deepracer_exp.sim.lidar import ANGLES_RAD, NEAREST_M, RAYS
+
+        # The car needs all of them, other than the simulator, and numbers with a fraction where it has such.
+        angle_deg = round(float(np.degrees(ANGLES_RAD[-1])), 1)
+        values["lidar_config"] = {
+            "num_values": RAYS,
+            "min_angle": -angle_deg,
+            "max_angle": angle_deg,
+            "min_distance": NEAREST_M,
+            "max_distance": float(lidar.furthest_m),
+            "clipping_distance": float(lidar.furthest_m),
+            "num_sectors": lidar.size,
+        }
+    return json.dumps(values, indent=2) + "\n"
+
+
+def _packed(files: Mapping[str, bytes]) -> bytes:
+    """Return a .tar.gz with nothing in it that differs between two exports."""
+    out = io.BytesIO()
+    with (
+        # Weights hardly shrink, however long it takes.
+        gzip.GzipFile(filename="", mode="wb", fileobj=out, mtime=0, compresslevel=1) as packed,
+        tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as archive,
+    ):
+        for name, content in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    return out.getvalue()
+
+
+def _notes(sensors: tuple[str, ...]) -> list[str]:
+    notes = []
+    if "STEREO_CAMERAS" in sensors:
+        notes.append(
+            "STEREO_CAMERAS: the car reads the two pictures right with OpenVINO 2021, as AWS's own software does; with "
+            "TensorFlow Lite or OpenVINO 2024 (deepracer-custom-car) it mixes up their pixels"
+        )
+    if len(sensors) > 1:
+        notes.append(
+            f"{' and '.join(sensors)}: deepracer-custom-car with OpenVINO 2024 takes the two in random order, "
+            "and fails to load the model in one of them; a restart draws another"
+        )
+    if "LIDAR" in sensors:
+        notes.append(
+            "lidar_config: with it the car's distances reach as far as those of the training; the service's archives "
+            "have none, with which the car's end at 0.5 m"
+        )
+    return notes
+
+
+def describe_actions(metadata: ModelMetadata) -> list[str]:
+    """Return a line on what the car makes of each action, of a continuous space of its ends and middle."""
+    scale = full_scale(metadata)
+    if metadata.low is not None and metadata.high is not None:
+        ends = np.array([metadata.low, metadata.high])
+        rows, names = np.stack([ends[0], ends.mean(axis=0), ends[1]]), ["lowest", "middle", "highest"]
+    else:
+        rows, names = np.array(metadata.actions), [str(number) for number in range(len(metadata.actions))]
+    locks = steering_share(rows[:, 0], scale.steering_deg)
+    throttles = throttle(rows[:, 1], scale.speed_mps)
+    return [
+        f"{name:>8} {steering_deg:+7.1f} deg {lock:+7.0%} of full lock {speed_mps:7.2f} m/s {power:5.0%} throttle"
+        for name, (steering_deg, speed_mps), lock, power in zip(names, rows, locks, throttles, strict=True)
+    ]
+
+
+def name_on_car(file_name: str) -> str:
+    """Return the name that the car gives to the model in an archive."""
+    return file_name.split(".")[0].replace(" ", "_")
