@@ -141,3 +141,17 @@ def readings(config: LidarConfig, distances_m: NDArray[np.float64]) -> Readings:
     step = np.where(nearest < furthest_m, np.floor(nearest * (values / furthest_m)), values)
     seen: Readings = (step[..., None] == np.arange(values)).astype(np.float32)
     return seen.reshape(len(seen), -1)
+
+
+def reach_of_rays(config: LidarConfig, seen: Readings) -> NDArray[np.float64]:
+    """Return how far each ray got, metres, (n, RAYS), from what the policy sees, (n, size); NaN: nothing was there.
+
+    With sectors all rays of one end where the step of its nearest thing does.
+    """
+    furthest_m = config.furthest_m
+    if config.kind == "plain":
+        return np.where(seen < furthest_m, seen, np.nan).astype(np.float64)
+    sectors, values = config.sector_shape
+    steps = seen.reshape(len(seen), sectors, values)
+    ends_m = np.where(steps.any(axis=2), (steps.argmax(axis=2) + 1) * (furthest_m / values), np.nan)
+    return np.repeat(ends_m, RAYS // sectors, axis=1)

@@ -14,13 +14,15 @@ from tensordict import TensorDict
 from torch import nn
 
 from deepracer_exp.analysis.charts.run_pictures import SPEED
-from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.config.driving import CameraConfig, LidarConfig, ObservationConfig
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
+from deepracer_exp.env.lidar import reach_of_rays
 from deepracer_exp.errors import RunFailed, count
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 
 from .evaluator import Evaluator
 from .film import Lap, drive_best_lap, write_film
@@ -31,6 +33,7 @@ WIDTH, HEIGHT = 1280, 720
 _EYE = (480, 360)
 """Room for what the cameras see, and as much below it for where the policy looks."""
 _PAGE, _RULE, _INK, _FAINT, _CHOSEN, _BAR = "#14171a", "#343a42", "#f2f4f6", "#98a1ac", "#f5a623", "#5b87b8"
+_RAY = (255, 255, 255, 80)
 _BOARD_HEIGHT, _ACTIONS_HEIGHT = 84, 216
 _FINER = 2
 
@@ -39,8 +42,8 @@ class Frames:
     """Draws the frames of a lap.
 
     On the left what the cameras see, enlarged without smoothing, and below it the same under its saliency, each frame
-    scaled to its own highest value; on the right the view from above and what the policy decides. Without a camera the
-    right side is as wide as the frame.
+    scaled to its own highest value; on the right the view from above, with the rays of a LIDAR that hit something, and
+    what the policy decides. Without a camera the right side is as wide as the frame.
     """
 
     def __init__(
@@ -49,7 +52,8 @@ class Frames:
         acted: TensorDict,
         policy: nn.Module,
         actions: ActionSpace,
-        camera: CameraConfig | None,
+        observation: ObservationConfig,
+        front_point_m: float,
     ) -> None:
         """Draw what stays the same.
 
@@ -58,16 +62,19 @@ class Frames:
             acted: what the policy read and wrote in these, [n].
             policy: that drove.
             actions: what it chooses from.
-            camera: what it sees through; None: it reads features.
+            observation: what it sees through.
+            front_point_m: of the car, ahead of its origin.
         """
-        self._lap, self._acted, self._policy, self._camera = lap, acted, policy, camera
-        self._left = 0 if camera is None else _EYE[0]
+        self._lap, self._acted, self._policy, self._camera = lap, acted, policy, observation.camera
+        self._left = 0 if self._camera is None else _EYE[0]
         self._decision: _Probabilities | _Distribution = (
             _Probabilities(actions, acted["logits"].softmax(-1).numpy(), WIDTH - self._left)
             if isinstance(actions, DiscreteActions)
             else _Distribution(actions.low, actions.high, WIDTH - self._left)
         )
-        self._map = _Map(lap, (WIDTH - self._left, HEIGHT - _BOARD_HEIGHT - _ACTIONS_HEIGHT))
+        lidar, room = observation.lidar, (WIDTH - self._left, HEIGHT - _BOARD_HEIGHT - _ACTIONS_HEIGHT)
+        seen = None if lidar is None else rays(lap, acted["lidar"].numpy(), lidar, front_point_m)
+        self._map = _Map(lap, room, seen)
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
         for at in range(len(self._lap)):
@@ -128,18 +135,36 @@ def _board(lap: Lap, at: int, width: int) -> Image.Image:
     return image
 
 
-class _Map:
-    """The track from above with the driven line, coloured by speed, and the car."""
+def rays(
+    lap: Lap, seen: NDArray[np.float32], lidar: LidarConfig, front_point_m: float
+) -> NDArray[np.float64]:
+    """Return the sensor and then the end of each ray at each step, metres, (n, 1 + RAYS, 2).
 
-    def __init__(self, lap: Lap, size: tuple[int, int]) -> None:
+    A scan that is read once more is drawn where it was made, a step before.
+    """
+    made = np.arange(len(lap))
+    made[1:] -= (seen[1:] == seen[:-1]).all(axis=1)
+    yaw_rad = lap.yaw_rad[made]
+    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1)
+    sensor = np.stack([lap.x_m, lap.y_m], axis=1)[made] + (MOUNT_X_M - front_point_m) * ahead
+    angles = yaw_rad[:, None] + np.radians(lidar.yaw_deg) + ANGLES_RAD
+    reached = reach_of_rays(lidar, seen)[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return np.concatenate([sensor[:, None], sensor[:, None] + reached], axis=1)
+
+
+class _Map:
+    """The track from above with the driven line, coloured by speed, the car and what its LIDAR reads."""
+
+    def __init__(self, lap: Lap, size: tuple[int, int], rays: NDArray[np.float64] | None) -> None:
         low, high = extent(lap.track)
         scale = float(np.min(np.array(size) / (high - low)))
         road = draw_track(lap.track, _FINER * scale)
         self._canvas = Image.new("RGB", (_FINER * size[0], _FINER * size[1]), lap.track.floor.ground_color)
         left, top = ((self._canvas.width - road.width) // 2, (self._canvas.height - road.height) // 2)
         self._canvas.paste(road, (left, top))
-        self._x = left + (lap.x_m - low[0]) * _FINER * scale
-        self._y = top + road.height - (lap.y_m - low[1]) * _FINER * scale
+        corner, step = np.array([left, top + road.height]), _FINER * scale * np.array([1, -1])
+        self._x, self._y = (corner + (np.stack([lap.x_m, lap.y_m], axis=1) - low) * step).T
+        self._rays = None if rays is None else corner + (rays - low) * step
         self._yaw_rad = lap.yaw_rad
         # The few steps after a standing start would take half of the colours.
         slow, fast = float(np.percentile(lap.speed_mps, 5)), float(lap.speed_mps.max())
@@ -155,6 +180,13 @@ class _Map:
             pen.line(ends, fill=self._colors[step], width=4 * _FINER)
         self._drawn = at
         now = self._canvas.copy()
+        if self._rays is not None:
+            pen = ImageDraw.Draw(now, "RGBA")
+            sensor, *ends = self._rays[at].tolist()
+            for x, y in ends:
+                if x == x:  # not NaN
+                    pen.line((*sensor, x, y), fill=_RAY, width=_FINER)
+                    pen.ellipse((x - 5, y - 5, x + 5, y + 5), fill=_CHOSEN)
         ahead = np.array([np.cos(self._yaw_rad[at]), -np.sin(self._yaw_rad[at])])
         left = np.array([ahead[1], -ahead[0]])
         corners = ((4, 0), (-19, 8), (-14, 0), (-19, -8))  # an arrow, pixels ahead and to the left
@@ -267,6 +299,7 @@ def film_run(config: EvaluateConfig, file: Path | None, out: Console, err: Conso
             file.parent.mkdir(exist_ok=True)
         except OSError as error:
             raise RunFailed(f"{file.parent}: cannot be made: {error.strerror or error}") from error
-    frames = Frames(lap, acted, policy, evaluator.race.setup.actions, run.experiment.observation.camera)
-    write_film(file, frames, len(lap), (WIDTH, HEIGHT), evaluator.race.setup.car.control_hz, err)
+    setup = evaluator.race.setup
+    frames = Frames(lap, acted, policy, setup.actions, setup.observation, setup.car.front_point_m)
+    write_film(file, frames, len(lap), (WIDTH, HEIGHT), setup.car.control_hz, err)
     out.print(f"  film  {file}", soft_wrap=True, highlight=False)

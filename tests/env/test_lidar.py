@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 import deepracer_exp.env.gym_env  # noqa: F401 - registers DeepRacer-v0
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.lidar import readings
+from deepracer_exp.env.lidar import reach_of_rays, readings
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M, MOUNT_Z_M
@@ -103,6 +103,19 @@ def test_a_discretized_sector_marks_the_step_of_its_nearest_ray(sectors, values,
     marked = nearest[some[:, 0], some[:, 1]]
     assert ((low <= marked + 1e-12) & (marked < high + 1e-12)).all()
     assert config.size == sectors * values
+
+
+def test_rays_reach_to_what_is_seen_or_to_the_end_of_its_step():
+    distances = np.random.default_rng(0).uniform(0.2, 3.0, (30, 64))
+    reached = reach_of_rays(PLAIN, readings(PLAIN, distances))
+    assert reached == pytest.approx(np.where(distances < 1.0, distances, np.nan), nan_ok=True)
+    config = dataclasses.replace(PLAIN, kind="discretized", sectors=16, values_per_sector=5, reach_m=2.0)
+    nearest = np.repeat(distances.reshape(30, 16, 4).min(axis=2), 4, axis=1)
+    reached = reach_of_rays(config, readings(config, distances))
+    assert np.array_equal(np.isnan(reached), nearest >= 2.0)
+    beyond = (reached - nearest)[nearest < 2.0]
+    assert (beyond >= 0).all()
+    assert (beyond <= 0.4).all()
 
 
 def test_two_of_three_steps_bring_a_new_scan(race_of):

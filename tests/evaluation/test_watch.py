@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from imageio_ffmpeg import read_frames
 from rich.console import Console
@@ -24,8 +25,10 @@ from deepracer_exp.evaluation.film import drive_best_lap, write_film
 from deepracer_exp.evaluation.live import LivePage
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
-from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames
+from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames, rays
 from deepracer_exp.runs.resolve import StoredRun
+from deepracer_exp.sim.lidar import MOUNT_X_M
+from deepracer_exp.sim.scenery import wall_ring
 
 STEREO = CameraConfig(width=80, height=60, color="rgb", frames=2, stereo_m=0.06, field_of_view_deg=65)
 MONO = CameraConfig(width=80, height=60, color="grey", frames=2, stereo_m=0, field_of_view_deg=65)
@@ -73,8 +76,14 @@ def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
 
 @pytest.mark.parametrize(
     "overrides",
-    [("observation=camera_small",), ("observation=camera_small", "action_space=continuous"), ()],
-    ids=["pictures", "continuous", "features"],
+    [
+        ("observation=camera_small",),
+        ("observation=camera_small", "action_space=continuous"),
+        (),
+        ("observation=lidar", "observation.lidar.kind=discretized", "observation.lidar.reach_m=12"),
+        ("observation=camera_lidar",),
+    ],
+    ids=["pictures", "continuous", "features", "lidar", "pictures and lidar"],
 )
 def test_a_film_has_a_frame_a_step_and_shows_another_picture_in_each(circle, protocol, overrides):
     experiment = compose_experiment([f"track.file={circle}", *overrides])[0]
@@ -84,12 +93,32 @@ def test_a_film_has_a_frame_a_step_and_shows_another_picture_in_each(circle, pro
     networks = build_actor_critic(experiment.network, observed, actions.n, torch.Generator().manual_seed(0))
     lap, acted = drive_best_lap(evaluator, networks.policy)
     assert len(lap) == len(acted) == 7  # the prepare step and six more
-    frames = list(Frames(lap, acted, networks.policy, actions, experiment.observation.camera))
+    frames = list(Frames(lap, acted, networks.policy, actions, experiment.observation, 0.14))
     assert {frame.shape for frame in frames} == {(HEIGHT, WIDTH, 3)}
     assert all((one != other).any() for one, other in itertools.pairwise(frames))
     if experiment.observation.camera is not None:
-        shown = frames[4][0:360:6, 0:480:6]
-        assert (shown[8:] == acted["pixels"][4, 0].numpy()[8:, :, None]).all(), "smoothed, or of another step"
+        enlarged = 480 // experiment.observation.camera.width
+        shown = frames[4][0:360:enlarged, 0:480:enlarged]
+        assert (shown[20:] == acted["pixels"][4, 0].numpy()[20:, :, None]).all(), (
+            "smoothed, or of another step"
+        )
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 180])
+def test_the_rays_of_a_film_end_at_the_walls(protocol, yaw_deg):
+    own = (f"observation.lidar.{one}" for one in ("noise_m=0", "reach_m=12", f"yaw_deg={yaw_deg}"))
+    experiment = compose_experiment(["observation=lidar", *own])[0]
+    evaluator = Evaluator(experiment, protocol("three_trials", trials=1, time_s=1), threads=1)
+    lidar, front_m = experiment.observation.lidar, experiment.car.front_point_m
+    networks = build_actor_critic(
+        experiment.network, observation_shape(experiment.observation), 15, torch.Generator().manual_seed(0)
+    )
+    lap, acted = drive_best_lap(evaluator, networks.policy)
+    sensor, ends = np.split(rays(lap, acted["lidar"].numpy(), lidar, front_m), [1], axis=1)
+    wall = shapely.LineString(wall_ring(lap.track))
+    assert shapely.distance(wall, shapely.points(ends)) == pytest.approx(0, abs=1e-3)
+    front = np.array([lap.x_m[0], lap.y_m[0]])
+    assert np.linalg.norm(sensor[0, 0] - front) == pytest.approx(front_m - MOUNT_X_M)
 
 
 def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
