@@ -230,6 +230,9 @@ Objects = Annotated[int, Field(ge=0, le=50)]
 ObjectRange = Annotated[tuple[Objects, ...], _TWO, _ORDERED]
 Height = Annotated[float, Field(ge=-0.1, le=0.5, allow_inf_nan=False)]
 HeightRange = Annotated[tuple[Height, ...], _TWO, _ORDERED]
+# From -1/3 on, the picture's corners would show what lies nearer to its middle once more.
+Distortion = Annotated[float, Field(ge=-0.3, le=0.3, allow_inf_nan=False)]
+DistortionRange = Annotated[tuple[Distortion, ...], _TWO, _ORDERED]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +263,8 @@ class PictureRandomizationConfig:
     """How much darker spots of dirt on the lens are at their middle."""
     objects: ObjectRange = (0, 0)
     """How many boxes stand beside the road; whole numbers."""
+    lens_k1: DistortionRange = (0.0, 0.0)
+    """Radial distortion: how much farther out the corners look than through a pinhole, as a share."""
 
 
 @dataclass(frozen=True, kw_only=True)

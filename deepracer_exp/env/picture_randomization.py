@@ -16,9 +16,11 @@ from .randomization import CarStreams, Ids, Purpose
 
 QUANTITIES = tuple(field.name for field in fields(PictureRandomizationConfig))
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
+_LENS = _COLUMN["lens_k1"]
 _OFF = np.array([1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES])
 _FIRST_QUANTITIES, _FIRST_MATERIALS = 10, 8
-"""What came later is drawn after all else, so that it changes no draw of runs that do without."""
+"""What came later is drawn after all else, so that it changes no draw of runs that do without; the lens, which came
+after the objects, whose draws are of no fixed number, has streams of its own."""
 _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""
@@ -74,6 +76,7 @@ class PictureRandomization:
     def seed(self, seed: int) -> None:
         """Start all streams from `seed`."""
         self._streams = CarStreams(seed, self._cars, Purpose.PICTURE)
+        self._lens_streams = CarStreams(seed, self._cars, Purpose.LENS)
 
     def begin(self, ids: Ids, episodes: NDArray[np.int64], course: NDArray[np.intp]) -> None:
         """Draw for new episodes of the cars `ids` on tracks `course`; episodes are numbered per car from 0."""
@@ -85,8 +88,9 @@ class PictureRandomization:
             stream.standard_normal(out=normal[:_FIRST_MATERIALS])
             sign, x, y, size = stream.random(4)
             self._noise_at[car] = stream.integers(_NOISE_NUMBERS)
-            stream.random(out=draws[_FIRST_QUANTITIES:])
+            stream.random(out=draws[_FIRST_QUANTITIES:_LENS])
             stream.standard_normal(out=normal[_FIRST_MATERIALS:])
+            draws[_LENS] = self._lens_streams.at(car, episode).random()
             values = self._low[car] + self._span[car] * draws
             self._values[car] = values
             self._color_factor[car] = 1.0 + values[_COLUMN["color_noise"]] * normal
@@ -120,6 +124,8 @@ class PictureRandomization:
         out[:, 2] += self._of("height_m", ids)
         out[:, 3] += np.radians(self._of("pitch_deg", ids))
         out[:, 4] /= self._of("field_of_view_scale", ids)
+        # Wide enough for what the corners show.
+        out[:, 4] /= 1 + np.maximum(self._of("lens_k1", ids), 0)
         return out
 
     def colors(self, ids: Ids, colors: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -137,10 +143,13 @@ class PictureRandomization:
         return self._boxes[ids] if self._boxes.size else None
 
     def disturb(self, ids: Ids, pictures: NDArray[np.uint8], steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Add dirt, light, blur and noise to pictures (n, channels, height, width).
+        """Add the lens's distortion, dirt, light, blur and noise to pictures (n, channels, height, width).
 
         Those of `steps` control steps after the start of the episode, (n,). Dirt is written into them.
         """
+        k1 = self._of("lens_k1", ids)
+        if k1.any():
+            pictures = _distort(pictures, k1)
         dirt = self._of("dirt", ids)
         if dirt.any():
             _soil(pictures, self._dirt[ids], dirt)
@@ -167,6 +176,43 @@ def _places(track: Track) -> Floats:
         free_m = np.minimum(free_m, np.where(beyond, 0.0, shapely.distance(shapely.LineString(ring), points)))
     places = np.column_stack([x, y, free_m - _CLEARANCE_M])
     return places[places[:, 2] > 0.5 * np.hypot(*_OBJECT_LOW_M[:2])]
+
+
+@njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
+    """Return pictures as lenses of a radial distortion show them.
+
+    A pixel at distance r from the middle, in half diagonals, shows what a pinhole shows at r (1 + k1 r^2). Pictures of
+    a positive k1 were taken by one with 1 / (1 + k1) of the focal length, so that the corners stay the corners.
+    """
+    count, channels, height, width = pictures.shape
+    out = pictures.copy()
+    middle_x, middle_y = 0.5 * width, 0.5 * height
+    per_square = 1.0 / (middle_x * middle_x + middle_y * middle_y)
+    for at in range(count):
+        k1 = k1s[at]
+        if k1 == 0.0:
+            continue
+        shrunk = 1.0 / (1.0 + max(k1, 0.0))
+        for row in range(height):
+            y = row + 0.5 - middle_y
+            for column in range(width):
+                x = column + 0.5 - middle_x
+                scale = shrunk * (1.0 + k1 * (x * x + y * y) * per_square)
+                from_x = min(max(middle_x + scale * x - 0.5, 0.0), width - 1.0)
+                from_y = min(max(middle_y + scale * y - 0.5, 0.0), height - 1.0)
+                left, top = min(int(from_x), width - 2), min(int(from_y), height - 2)
+                across, down = np.float32(from_x - left), np.float32(from_y - top)
+                for channel in range(channels):
+                    some = pictures[at, channel]
+                    above = some[top, left] + across * (
+                        np.float32(some[top, left + 1]) - np.float32(some[top, left])
+                    )
+                    below = some[top + 1, left] + across * (
+                        np.float32(some[top + 1, left + 1]) - np.float32(some[top + 1, left])
+                    )
+                    out[at, channel, row, column] = np.uint8(above + down * (below - above) + np.float32(0.5))
+    return out
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)

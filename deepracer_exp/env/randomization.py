@@ -35,6 +35,7 @@ class Purpose(IntEnum):
     EPISODE = 2
     PICTURE = 3
     LIDAR = 4
+    LENS = 5
 
 
 class CarStreams:

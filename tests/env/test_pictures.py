@@ -173,13 +173,14 @@ def test_a_cars_pictures_depend_on_its_number_and_not_on_the_batch(race_of):
         ("height_m", 0.0, 0.1, lambda a, b: np.abs(b - a).mean() > 3),
         ("pitch_deg", 0.0, 10.0, lambda a, b: horizon(b) < horizon(a) - 5),
         ("field_of_view_scale", 0.5, 2.0, lambda a, b: np.abs(b - a).mean() > 3),
+        ("lens_k1", 0.0, 0.3, lambda a, b: np.abs(b - a).mean() > 3),
     ],
 )
 def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
     """Pictures at the start, with only this one at its lowest and highest value."""
     off = "{brightness_scale: [1,1], contrast_scale: [1,1], gamma_scale: [1,1], color_noise: [0,0], light: [0,0], "
     off += "blur: [0,0], pixel_noise: [0,0], height_m: [0,0], pitch_deg: [0,0], field_of_view_scale: [1,1], "
-    off += "dirt: [0,0], objects: [0,0]}"
+    off += "dirt: [0,0], objects: [0,0], lens_k1: [0,0]}"
     pictures = []
     for value in (low, high):
         on = f"randomization.pictures.{quantity}=[{value},{value}]"
@@ -187,6 +188,66 @@ def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
             race_of(SMALL, f"randomization.pictures={off}".replace(": ", ":"), on).pixels[0, 0].astype(float)
         )
     assert law(*pictures)
+
+
+NOTHING = (
+    "{brightness_scale:[1,1],contrast_scale:[1,1],gamma_scale:[1,1],color_noise:[0,0],light:[0,0],blur:[0,0],"
+    "pixel_noise:[0,0],height_m:[0,0],pitch_deg:[0,0],field_of_view_scale:[1,1]}"
+)
+
+
+def by_lens(k1: float, width: int = 160, height: int = 120) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel looks: columns and rows from the middle of a pinhole's picture."""
+    y, x = np.mgrid[:height, :width] + 0.5 - np.array([height / 2, width / 2])[:, None, None]
+    scale = 1 + k1 * (x**2 + y**2) / (width**2 + height**2) * 4
+    return x * scale, y * scale
+
+
+@pytest.mark.parametrize("k1", [-0.3, 0.3])
+def test_a_lens_shows_what_a_pinhole_shows_at_the_formulas_place(race_of, k1):
+    bent = race_of(
+        "observation=camera",
+        f"randomization.pictures={NOTHING}",
+        f"+randomization.pictures.lens_k1=[{k1},{k1}]",
+    )
+    pinhole = race_of("observation=camera", "observation.camera.width=640", "observation.camera.height=480")
+    large = pinhole.pixels[0, 0].astype(float)
+
+    def difference(k1: float) -> float:
+        x, y = by_lens(k1)
+        within = (np.abs(x) < 79) & (np.abs(y) < 59)
+        at = (4 * (y + 60)).astype(int).clip(0, 479), (4 * (x + 80)).astype(int).clip(0, 639)
+        return float(np.abs(large[at] - bent.pixels[0, 0])[within].mean())
+
+    assert difference(k1) < 0.3 * difference(0.0)
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.2])
+def test_a_straight_line_off_the_middle_bends_by_the_formulas_amount(race_of, k1):
+    race = race_of(
+        "observation=camera",
+        f"randomization.pictures={NOTHING}",
+        f"+randomization.pictures.lens_k1=[{k1},{k1}]",
+    )
+    lens, everyone = race._pictures._lenses[0], np.arange(1)
+    focal = race._varied.mounts(everyone, lens.mount)[0, 4] / lens.mount[4]
+    brightness = np.clip(100 + 20 * (np.arange(160) - 79.5 - 50 * focal), 0, 200)
+    line = np.tile(brightness, (1, 1, 120, 1)).round().astype(np.uint8)  # its middle 50 pixels to the right
+    bent = race._varied.disturb(everyone, line, np.zeros(1, np.int64))[0, 0].astype(float)
+    columns = [np.interp(100, row[:159], np.arange(159) - 79.5) for row in bent]
+    x, _ = by_lens(k1)
+    expected = [np.interp(50, row, np.arange(160) - 79.5) for row in x]
+    assert np.ptp(expected) > 2.5
+    assert columns == pytest.approx(expected, abs=0.15)
+
+
+def test_a_lens_changes_no_other_draw(race_of):
+    plain, bent = (
+        race_of(*VARIED, f"randomization.pictures.lens_k1=[{k1},{k1}]", n_cars=4) for k1 in (0, 0.1)
+    )
+    assert np.array_equal(plain._varied._values[:, :-1], bent._varied._values[:, :-1])
+    for name in ("_boxes", "_dirt", "_spot", "_color_factor", "_noise_at"):
+        assert np.array_equal(getattr(plain._varied, name), getattr(bent._varied, name))
 
 
 @pytest.mark.parametrize("track", ["reinvent_base", "Spain_track", "2022_summit_speedway_cw"])
@@ -216,10 +277,6 @@ def horizon(picture: np.ndarray) -> float:
 
 def test_pictures_without_randomization_are_those_with_ranges_that_change_nothing(race_of):
     plain = race_of(SMALL)
-    nothing = race_of(
-        SMALL,
-        "randomization.pictures={brightness_scale:[1,1],contrast_scale:[1,1],gamma_scale:[1,1],color_noise:[0,0],"
-        "light:[0,0],blur:[0,0],pixel_noise:[0,0],height_m:[0,0],pitch_deg:[0,0],field_of_view_scale:[1,1]}",
-    )
+    nothing = race_of(SMALL, f"randomization.pictures={NOTHING}")
     for ours, theirs in zip(drive(plain, 5), drive(nothing, 5), strict=True):
         assert np.array_equal(ours, theirs)
