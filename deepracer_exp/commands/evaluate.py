@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
   deepracer-exp evaluate RUN evaluation=summit              three_trials, four_minutes, summit or aws_virtual
+  deepracer-exp evaluate RUN evaluation=real_car            as the physical car sees and acts
   deepracer-exp evaluate RUN checkpoint=last evaluation.trials=20
   deepracer-exp evaluate RUN evaluation.tracks=[Oval_track,Bowtie_track]
   deepracer-exp evaluate RUN evaluation.held_out=null       on the usual conditions only
@@ -123,7 +124,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.video is not None:
         _check_film("--video", Path(args.video))
         _choose_graphics()
-    check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+    check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation)
 
     from rich.console import Console
 
@@ -164,7 +165,7 @@ def _watch(args: argparse.Namespace) -> int:
     config, _ = compose_evaluation([*overrides, override_line("run", run)])
     args.debug = config.debug
     if not args.live:
-        check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+        check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation)
 
         from rich.console import Console
 
@@ -247,7 +248,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
     config, _ = compose_evaluation([*overrides, override_line("run", run)])
     own_trials = not any(group_of(given) == "evaluation" for given in overrides)
     args.debug = config.debug
-    check_policy(config.run, config.runs_dir, config.tracking.uri, None)
+    check_policy(config.run, config.runs_dir, config.tracking.uri, None, config.evaluation)
 
     from rich.console import Console
 

@@ -11,6 +11,7 @@ from deepracer_exp.runs.files import read_config
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from deepracer_exp.config.evaluation import EvaluationConfig
     from deepracer_exp.config.experiment import Experiment
     from deepracer_exp.config.sweep import SweepRequest
     from deepracer_exp.runs.resolve import StoredRun
@@ -27,6 +28,10 @@ def check_files(experiment: "Experiment") -> None:
 
     load_reward_source(experiment.reward)
     build_action_space(experiment.action_space)
+    if experiment.evaluation.real_car is not None:
+        from deepracer_exp.env.real_car import require_car
+
+        require_car(experiment)
     files = [track for track in experiment.tracks.values() if track.file is not None]
     if files:
         from deepracer_exp.tracks.track import Track
@@ -45,17 +50,28 @@ def check_teacher(experiment: "Experiment") -> None:
         check_policy(experiment.teacher, experiment.runs_dir, getattr(experiment.tracking, "uri", None), None)
 
 
-def check_policy(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> "Experiment":
+def check_policy(
+    run: str,
+    runs_dir: str,
+    tracking_uri: str | None,
+    checkpoint: str | None,
+    evaluation: "EvaluationConfig | None" = None,
+) -> "Experiment":
     """Return the experiment of a run that `check_run` finds; import the classes of the user's own its policy needs.
 
     Raises:
-        BadInput: as `check_run`, or a class is not named again or cannot be imported.
+        BadInput: as `check_run`, or a class is not named again or cannot be imported, or `evaluation` is that of the
+            physical car and it could not run the policy.
     """
     from deepracer_exp.config.own_class import OF_POLICY
     from deepracer_exp.config.parse import import_own_classes
 
     experiment = check_run(run, runs_dir, tracking_uri, checkpoint).experiment
     import_own_classes(experiment, OF_POLICY)
+    if evaluation is not None and evaluation.real_car is not None:
+        from deepracer_exp.env.real_car import require_car
+
+        require_car(experiment)
     return experiment
 
 

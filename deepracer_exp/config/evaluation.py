@@ -36,6 +36,43 @@ class PenaltyConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CarPictureConfig:
+    """The car's way from its camera's 640x480 to what a model sees."""
+
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None
+    """Of the frames between the car's programs; null: they are not compressed, as in AWS's software."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarTimingConfig:
+    """When the car sees and acts."""
+
+    frames_per_s: Annotated[float, Field(ge=5, le=60, allow_inf_nan=False)]
+    """The car acts once a frame."""
+    latency_s: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
+    """From the exposure of a frame to the turn of the wheels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarControlsConfig:
+    """What the car makes of actions, see `deepracer.car_controls`."""
+
+    full_lock_deg: Annotated[float, Field(gt=0, le=30, allow_inf_nan=False)]
+    """Angle of the wheels at full lock."""
+    full_throttle_mps: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] | None
+    """Speed at full throttle; null: that of the fastest action."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealCarConfig:
+    """The physical car's own ways; each part may be null, then it is the simulator's."""
+
+    picture: CarPictureConfig | None
+    timing: CarTimingConfig | None
+    controls: CarControlsConfig | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
     """What a trial is, how many there are, and on which tracks and conditions."""
 
@@ -62,6 +99,8 @@ class EvaluationConfig:
     """Sample actions as in training; false: the most probable action, of a continuous policy the mean."""
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     """Seed of the conditions: the same for every checkpoint, so that they can be compared."""
+    real_car: RealCarConfig | None = None
+    """How the car sees and acts; null: as the simulator does."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.config.evaluation import CarPictureConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.sim.camera import Lens, take_pictures
@@ -15,6 +16,7 @@ from deepracer_exp.tracks.track import Track
 
 from .picture_randomization import PictureRandomization
 from .randomization import Ids
+from .real_car import FRAME_SCALE, car_pictures
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
@@ -37,6 +39,7 @@ class Pictures:
         car: CarConfig,
         tracks: Sequence[Track],
         varied: PictureRandomization | None,
+        of_car: CarPictureConfig | None = None,
     ) -> None:
         """Build the scenery.
 
@@ -45,15 +48,17 @@ class Pictures:
             car: where the camera sits.
             tracks: of each course one.
             varied: what each episode's pictures differ in, drawn before they are taken; None: nothing.
+            of_car: how the physical car makes pictures; None: each pixel is the mean of what it sees.
         """
+        self._of_car, finer = of_car, 1 if of_car is None else FRAME_SCALE
         self._varied = varied
         self.shape = config.shape
         self._now = config.shape[0] // config.frames  # channels of one moment
         sides_m = (0.5 * config.stereo_m, -0.5 * config.stereo_m) if config.stereo_m else (0.0,)
         self._lenses = [
             Lens(
-                width=config.width,
-                height=config.height,
+                width=finer * config.width,
+                height=finer * config.height,
                 field_of_view_rad=np.radians(config.field_of_view_deg),
                 x_m=car.camera_x_m,
                 y_m=side_m,
@@ -126,7 +131,8 @@ class Pictures:
         for lens in self._lenses:
             out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)
             mounts = None if varied is None else varied.mounts(ids, lens.mount)
-            shots.append(take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes))
+            shot = take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes)
+            shots.append(shot if self._of_car is None else car_pictures(shot, self._of_car.jpeg_quality))
         now = shots[0] if len(shots) == 1 else np.concatenate(shots, axis=1)
         return now if varied is None else varied.disturb(ids, now, steps)
 

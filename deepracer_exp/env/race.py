@@ -17,6 +17,7 @@ from .observation import Features
 from .picture_randomization import PictureRandomization
 from .pictures import Pictures
 from .randomization import Randomization
+from .real_car import Servos
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
@@ -100,6 +101,7 @@ class Race:
             self.cars.tolist(),
             self._batch,
             self._features.names,
+            setup.late_steps,
         )
         self._everyone = np.arange(n_cars)
         self._return = np.zeros(n_cars)
@@ -107,6 +109,7 @@ class Race:
         self._commanded_mps = np.zeros(n_cars)
         self.observation = np.zeros((n_cars, self._features.size), np.float32)
         camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
+        real_car = setup.real_car
         pictures = [one.pictures for one in randomizations or [setup.randomization] * n_cars]
         lidar = setup.observation.lidar
         seen = camera is not None or lidar is not None
@@ -115,7 +118,13 @@ class Race:
             if seen and any(one is not None for one in pictures)
             else None
         )
-        self._pictures = None if camera is None else Pictures(camera, setup.car, tracks, self._varied)
+        of_car = None if real_car is None else real_car.picture
+        self._pictures = None if camera is None else Pictures(camera, setup.car, tracks, self._varied, of_car)
+        self._servos = (
+            None
+            if real_car is None or real_car.controls is None
+            else Servos(real_car.controls, setup.actions, n_cars)
+        )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         self._lidar = None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s)
         self.lidar = np.zeros((n_cars, lidar.size if lidar is not None else 0), np.float32)
@@ -170,6 +179,8 @@ class Race:
             self._batch.set_floor_friction(ids, self._floors[course])
         for kept in (self._return, self._steering_deg, self._commanded_mps):
             kept[ids] = 0
+        if self._servos is not None:
+            self._servos.center(ids)
         self._begin(ids)
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
@@ -197,6 +208,8 @@ class Race:
         pose = self.rules.put_back(ids, percent)
         for commanded in (self._steering_deg, self._commanded_mps):
             commanded[ids] = 0
+        if self._servos is not None:
+            self._servos.center(ids)
         self.randomization.forget_commands(ids, self.rules.steps[ids])
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
@@ -316,6 +329,8 @@ class Race:
     def _drive(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
         self._steering_deg = np.where(running, steering_deg, 0.0)
         self._commanded_mps = np.where(running, speed_mps, 0.0)
+        if self._servos is not None:
+            steering_deg, speed_mps = self._servos.follow(steering_deg, speed_mps)
         sent_deg, sent_mps, moving = self.randomization.disturb_commands(
             steering_deg, speed_mps, self.rules.steps
         )

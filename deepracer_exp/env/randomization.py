@@ -111,10 +111,12 @@ class Randomization:
         cars: Sequence[int],
         batch: CarBatch,
         features: Sequence[str],
+        late_steps: tuple[int, int] = (0, 0),
     ):
         """Apply what is constant over all episodes; call `seed` and then `begin` next.
 
         Each car has its own ranges and its number over all processes; `features` names the observation's entries.
+        Steering and speed commands reach all cars so many `late_steps` later than what is drawn.
         """
         ranges = np.array([[getattr(config, name) for name in QUANTITIES] for config in configs], np.float64)
         self._cars = list(cars)
@@ -142,7 +144,8 @@ class Randomization:
         self._sag_steps = _SAG_S / batch.car.control_period_s
         self._measured = np.array([name not in _KNOWN for name in features], np.float64)
         self._first_noise: Floats = np.zeros((len(self._cars), len(features)))
-        slots = int(ranges[:, _COLUMN["action_delay_steps"], 1].max()) + 1
+        self._late_steps = late_steps
+        slots = int(ranges[:, _COLUMN["action_delay_steps"], 1].max()) + max(late_steps) + 1
         self._commands: Floats = np.zeros((slots, len(self._cars), 2))
         self._no_command_until = np.ones(len(self._cars), np.int64)
 
@@ -214,12 +217,16 @@ class Randomization:
             Steering, speed, and False for cars that no command has reached yet, each (N,).
         """
         moving = steps > 1
-        if "action_delay_steps" in self._on:
-            late = steps - self._of("action_delay_steps").astype(np.int64)
-            slots = len(self._commands)
+        slots = len(self._commands)
+        if slots > 1:
+            sent = steps - self._of("action_delay_steps").astype(np.int64)
+            steering_at, speed_at = (sent - late for late in self._late_steps)
             self._commands[steps % slots, self._rows] = np.stack([steering_deg, speed_mps], axis=1)
-            steering_deg, speed_mps = self._commands[late % slots, self._rows].T
-            moving = late > self._no_command_until
+            steering_deg = self._commands[steering_at % slots, self._rows, 0]
+            # Those of before have nothing to say, and speed may come first.
+            steering_deg = np.where(steering_at > self._no_command_until, steering_deg, 0.0)
+            speed_mps = self._commands[speed_at % slots, self._rows, 1]
+            moving = speed_at > self._no_command_until
         if "battery_sag" in self._on:
             driven = np.clip((steps - 2) / self._sag_steps, 0.0, 1.0)
             speed_mps = speed_mps * (1 - self._of("battery_sag") * driven)

@@ -1,11 +1,28 @@
-"""The physical car: what it can run."""
+"""The physical car: what it can run, and how it sees and acts."""
 
+import io
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from deepracer_exp.config.evaluation import CarControlsConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.deepracer.car_controls import full_scale, servo_value, steering_share, throttle
+from deepracer_exp.errors import BadInput
 
-from .action_space import ContinuousActions, build_action_space
+from .action_space import ActionSpace, Commands, ContinuousActions, build_action_space, metadata_of
+
+if TYPE_CHECKING:
+    from .setup import RaceSetup
 
 CAR_PICTURE = (160, 120)
 """Width and height of what the car's software shows a model."""
+FRAME_SCALE = 4
+"""Its camera's frames are so many times as wide and high."""
 
 
 def car_refusals(experiment: Experiment) -> list[str]:
@@ -53,3 +70,95 @@ def car_refusals(experiment: Experiment) -> list[str]:
             "action_space: a range of one value; accepted: low < high, else the car does not load the model"
         )
     return refusals
+
+
+def require_car(experiment: Experiment) -> None:
+    """Refuse a policy that the car could not run, with the first of `car_refusals`.
+
+    Raises:
+        BadInput: it could not.
+    """
+    for refusal in car_refusals(experiment):
+        raise BadInput(f"evaluation.real_car: the car cannot run this policy: {refusal}")
+
+
+def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":
+    """Return a race in which cars see and act as the physical car does.
+
+    Its physics steps are not longer than before, and the episode's rules hold for the same times.
+    """
+    setup = replace(setup, real_car=real_car)
+    if real_car.timing is None:
+        return setup
+    car, episode, frames_per_s = setup.car, setup.episode, real_car.timing.frames_per_s
+    ratio = frames_per_s / car.control_hz
+    # The car's own delays are shares of a control period, so whole periods are left to the queue of commands.
+    own_s = (car.steering_delay_s, car.speed_delay_s)
+    whole, rest = zip(*(divmod(s + real_car.timing.latency_s, 1 / frames_per_s) for s in own_s), strict=True)
+    return replace(
+        setup,
+        car=replace(
+            car,
+            control_hz=frames_per_s,
+            substeps=max(1, math.ceil(car.substeps / ratio)),
+            steering_delay_s=rest[0],
+            speed_delay_s=rest[1],
+        ),
+        late_steps=(int(whole[0]), int(whole[1])),
+        episode=replace(
+            episode,
+            max_steps=round(episode.max_steps * ratio),
+            immobilized_steps=round(episode.immobilized_steps * ratio),
+            immobilized_m=episode.immobilized_m / ratio,
+            reversed_steps=round(episode.reversed_steps * ratio),
+        ),
+    )
+
+
+class Servos:
+    """Steering servo and motor of N cars: what they make of commands.
+
+    The speed is taken to be proportional to the throttle; nothing is published on how the car's motor answers it.
+    """
+
+    def __init__(self, config: CarControlsConfig, actions: ActionSpace, n_cars: int) -> None:
+        """Start centred."""
+        self._scale = full_scale(metadata_of(actions))
+        self._full_lock_deg = config.full_lock_deg
+        self._full_throttle_mps = config.full_throttle_mps or self._scale.speed_mps
+        self._steering = np.zeros(n_cars)
+
+    def center(self, ids: NDArray[np.intp]) -> None:
+        """Centre the steering of the cars `ids`."""
+        self._steering[ids] = 0.0
+
+    def follow(self, steering_deg: NDArray[np.float64], speed_mps: NDArray[np.float64]) -> Commands:
+        """Return the angles and speeds that commands lead to, each (N,)."""
+        requested = steering_share(steering_deg, self._scale.steering_deg)
+        self._steering = servo_value(requested, self._steering)
+        speed_share = throttle(speed_mps, self._scale.speed_mps)
+        return self._full_lock_deg * self._steering, self._full_throttle_mps * speed_share
+
+
+def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray[np.uint8]:
+    """Return what the car shows a model of its camera's frames.
+
+    The car compresses in colour and turns grey last, here it is the other way round: JPEG stores brightness on its own,
+    with the same weights of red, green and blue, so that the difference is rounding.
+
+    Args:
+        frames: grey, (n, channels, FRAME_SCALE * height, FRAME_SCALE * width).
+        jpeg_quality: None: not compressed.
+
+    Returns:
+        (n, channels, height, width).
+    """
+    # cv::resize, bilinear: between pixels 1 and 2 of each 4 by 4; the others are not looked at.
+    rows = frames[..., 1::FRAME_SCALE, :].astype(np.uint16) + frames[..., 2::FRAME_SCALE, :]
+    small = ((rows[..., 1::FRAME_SCALE] + rows[..., 2::FRAME_SCALE] + 2) >> 2).astype(np.uint8)
+    if jpeg_quality is not None:
+        for picture in small.reshape(-1, *small.shape[-2:]):
+            file = io.BytesIO()
+            Image.fromarray(picture).save(file, "JPEG", quality=jpeg_quality)
+            picture[:] = np.asarray(Image.open(file))
+    return small

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
+from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.errors import BadInput
@@ -88,6 +89,9 @@ class RaceSetup:
     reward: RewardSource
     reward_time_limit_s: float
     seed: int
+    real_car: RealCarConfig | None = None
+    late_steps: tuple[int, int] = (0, 0)
+    """Control steps by which steering and speed commands reach every car late."""
 
     @property
     def track(self) -> Track:

@@ -24,6 +24,7 @@ from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
 from .evaluator import Evaluator
+from .real_car import compare, explain_controls, figures, losses_table
 from .result import CONFIDENCE, USUAL, Evaluation
 
 if TYPE_CHECKING:
@@ -73,9 +74,13 @@ def _lay_out(rows: Sequence[_Row], left_out: Sequence[str]) -> Table:
 
 
 def write_evaluation(
-    folder: Path, evaluation: Evaluation, config: EvaluationConfig, stored: StoredPolicy
+    folder: Path,
+    evaluation: Evaluation,
+    config: EvaluationConfig,
+    stored: StoredPolicy,
+    car: Mapping[str, Evaluation] | None = None,
 ) -> Path:
-    """Write `evaluations/<time>.json` into a run's folder and return it.
+    """Write `evaluations/<time>.json` into a run's folder and return it; `car`: what `real_car.compare` returns.
 
     Raises:
         RunFailed: the file cannot be written.
@@ -87,6 +92,8 @@ def write_evaluation(
         "evaluation": asdict(config),
         **evaluation.as_dict(),
     }
+    if car is not None:
+        content["real_car"] = figures(car)
     target = folder / EVALUATIONS
     try:
         target.mkdir(exist_ok=True)
@@ -145,9 +152,17 @@ def evaluate_run(
         highlight=False,
     )
     evaluation = evaluator(stored.networks.policy, film.recorder if film is not None else None)
-    file = write_evaluation(run.path, evaluation, config.evaluation, stored)
+    car = None
+    if config.evaluation.real_car is not None:
+        car = compare(run.experiment, config.evaluation, stored.networks.policy, evaluation)
+    file = write_evaluation(run.path, evaluation, config.evaluation, stored, car)
     known = trained_on(run.experiment, config.evaluation, evaluation)
     out.print(results_table(evaluation, config.evaluation, known, out))
+    if car is not None:
+        out.print()
+        out.print(losses_table(car))
+        for line in explain_controls(run.experiment, config.evaluation):
+            out.print(f"  {line}", soft_wrap=True, highlight=False)
     out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
     if film is not None:
         film.write(evaluation, err)

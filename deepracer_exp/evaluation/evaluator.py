@@ -19,6 +19,7 @@ from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import build_parts
 from deepracer_exp.env.race import Race
+from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource
@@ -71,7 +72,8 @@ class Evaluator:
             threads: physics threads; 0 means one per core.
 
         Raises:
-            BadInput: a track, a condition or a file is unknown or malformed.
+            BadInput: a track, a condition or a file is unknown or malformed, or the protocol is that of the car and
+                it could not run such a policy.
         """
         self.config = config
         courses = _courses(tracks_of(experiment, config))
@@ -97,6 +99,9 @@ class Evaluator:
             reward_time_limit_s=experiment.reward.time_limit_s,
             seed=config.seed,
         )
+        if config.real_car is not None:
+            require_car(experiment)
+            setup = as_the_car(setup, config.real_car)
         own = [conditions[trial.condition] for trial in self.trials]
         self.race = Race(setup, len(self.trials), threads, randomizations=own)
         self._course = np.array([trial.course for trial in self.trials])

@@ -1,0 +1,149 @@
+"""What is lost between the simulator and the physical car? For a camera policy trained with and without `sim2real`.
+
+    python -m benchmarks.real_car [--seeds 5] [--folder FOLDER] [--json FILE] [OVERRIDE...]
+
+For each seed a policy that sees features is trained for TEACHER_STEPS with `randomization=sim2real`. From it two
+policies learn that see what the car sees (`observation=camera network=shallow`), ITERATIONS of `algorithm=distill`
+each: one in the simulator as it is, one with `randomization=sim2real`. Their last policies then drive laps from STARTS
+starts spread evenly over the lap under `evaluation=real_car`: as in the simulator, with each of the car's ways alone,
+and with all of them.
+
+`lap_share` is the share of complete laps, `completion` the mean share of the lap that was driven, `lap_time_s` the mean
+of the complete laps. Intervals are those of the mean over seeds (95 %, t); `gain` is with less without, seed by seed.
+
+FOLDER keeps runs and results, so that a second call continues the first; overrides are those of the two policies.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.real_car import compare, figures
+from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.resolve import resolve
+
+from .command import train
+from .report import benchmark_parser, mean_and_interval, number, percent, table, write_json
+
+TEACHER_STEPS, ITERATIONS, STARTS = 300_000, 10, 20
+WAYS: dict[str, list[str]] = {"without": [], "with": ["randomization=sim2real"]}
+FIGURES = ("lap_share", "completion", "lap_time_s")
+_EVERY = ["stopping=none", "checkpoints.every=null", "tracking=off", "report=false"]
+
+Figures = dict[str, dict[str, Any]]
+
+
+def trained(folder: Path, name: str, overrides: Sequence[str]) -> Path:
+    """Return the finished run `name` in a folder; train it if there is none."""
+    for summary in sorted(folder.glob(f"runs/{name}/*/summary.json")):
+        if json.loads(summary.read_text(encoding="utf-8"))["status"] == "finished":
+            return summary.parent
+    began = time.monotonic()
+    run = train([f"name={name}", *_EVERY, *overrides], folder)
+    print(f"{folder.name}: {name} trained in {time.monotonic() - began:.0f} s", flush=True)
+    return run
+
+
+def drive(run: Path) -> Figures:
+    """Let a run's last policy drive as in the simulator and as on the car."""
+    stored = resolve(str(run), run.parent, None)
+    policy = read_checkpoint(stored.experiment, stored.checkpoints, "last").networks.policy
+    trials = f"evaluation.trials={STARTS}"
+    config = compose_evaluation(["run=any", "evaluation=real_car", trials])[0].evaluation
+    of_car = Evaluator(stored.experiment, config)(policy)
+    return figures(compare(stored.experiment, config, policy, of_car))
+
+
+def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figures]:
+    """Train and drive with one seed, as far as the folder does not have it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    own = f"seed={seed}"
+    driven = {}
+    for way, randomization in WAYS.items():
+        result = folder / f"{way}.json"
+        if not result.exists():
+            length = f"budget.env_steps={TEACHER_STEPS}"
+            teacher = trained(folder, "teacher", [own, length, "randomization=sim2real"])
+            student = [
+                *("observation=camera", "network=shallow", "network.critic=features", "algorithm=distill"),
+                *(f"algorithm.teacher_iterations={ITERATIONS}", f"budget.iterations={ITERATIONS}"),
+                *("budget.env_steps=null", f"teacher={teacher.resolve()}", own),
+            ]
+            run = trained(folder, way, [*student, *randomization, *overrides])
+            began = time.monotonic()
+            result.write_text(json.dumps(drive(run), indent=2) + "\n", encoding="utf-8")
+            print(f"{folder.name}: {way} driven in {time.monotonic() - began:.0f} s", flush=True)
+        driven[way] = json.loads(result.read_text(encoding="utf-8"))
+    return driven
+
+
+def summarize(seeds: Sequence[dict[str, Figures]]) -> dict[str, Any]:
+    """Return mean and interval of each figure by what is as on the car, with, without, and the gain."""
+    found: dict[str, Any] = {}
+    for name in seeds[0]["with"]:
+        found[name] = {}
+        for figure in FIGURES:
+            pairs = [{way: seed[way][name][figure] for way in WAYS} for seed in seeds]
+            gains = [None if None in pair.values() else pair["with"] - pair["without"] for pair in pairs]
+            found[name][figure] = {
+                **{way: mean_and_interval([pair[way] for pair in pairs]) for way in WAYS},
+                "gain": mean_and_interval(gains),
+            }
+    return found
+
+
+def shown(figure: dict[str, Any], share: bool) -> str:
+    """Return a mean with its interval for a table."""
+    texts = [
+        percent(value) if share else number(value, 2)
+        for value in (figure["mean"], *(figure["interval"] or ()))
+    ]
+    return texts[0] + (f" ({texts[1]} to {texts[2]})" if len(texts) > 1 else "")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
+    parser = benchmark_parser("real_car", __doc__)
+    parser.add_argument("--seeds", type=int, default=5, help="trainings of each, with the seeds 0, 1, ...")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("real_car"), help="of the runs (default: real_car)"
+    )
+    options = parser.parse_args(arguments)
+    seeds = [
+        measure(options.folder / f"seed{seed}", seed, options.overrides) for seed in range(options.seeds)
+    ]
+    found = summarize(seeds)
+    head = ["as on the car"]
+    head += [f"{what}, trained {way}" for what in ("complete laps", "lap (s)") for way in WAYS]
+    rows = [
+        (
+            {"simulator": "nothing", "car": "all"}.get(name, name),
+            *(
+                shown(one[figure][way], figure == "lap_share")
+                for figure in ("lap_share", "lap_time_s")
+                for way in WAYS
+            ),
+        )
+        for name, one in found.items()
+    ]
+    print()
+    print(table(head, rows))
+    write_json(
+        options.json,
+        {
+            "figures": found,
+            "seeds": seeds,
+            "teacher_steps": TEACHER_STEPS,
+            "iterations": ITERATIONS,
+            "starts": STARTS,
+            "overrides": options.overrides,
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()
