@@ -1,0 +1,56 @@
+"""Protocols of the physical car: with each of its ways alone, and with all of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from deepracer_exp.config.evaluation import RealCarConfig
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.real_car import CAR, SIMULATOR, compare, figures, protocols
+
+
+class BrightSide(torch.nn.Module):
+    """Steers to the brighter side of the picture."""
+
+    def forward(self, seen):
+        left, right = seen["pixels"].float().chunk(2, dim=-1)
+        steering = ((left.mean((1, 2, 3)) - right.mean((1, 2, 3))) / 20).clamp(-1, 1)
+        return seen.set("action", torch.stack([steering, torch.zeros_like(steering)], -1))
+
+
+@pytest.fixture(scope="module")
+def config():
+    lines = ["run=x", "evaluation=real_car", "evaluation.trials=1", "evaluation.time_s=1"]
+    return compose_evaluation(lines)[0].evaluation
+
+
+@pytest.fixture(scope="module")
+def sees():
+    return compose_experiment(["observation=camera", "action_space=continuous"])[0]
+
+
+def test_each_part_is_driven_alone_and_no_part_is_the_simulator_bit_for_bit(sees, config):
+    policy = BrightSide()
+    found = compare(sees, config, policy, Evaluator(sees, config, threads=1)(policy))
+    assert list(found) == [SIMULATOR, "picture", "timing", "controls", CAR]
+    attempts = {name: one.groups[0].attempts for name, one in found.items()}
+    assert len(set(attempts.values())) == len(attempts)  # each part makes a difference
+    nothing = replace(config, real_car=RealCarConfig(picture=None, timing=None, controls=None))
+    assert Evaluator(sees, nothing, threads=1)(policy).groups[0].attempts == attempts[SIMULATOR]
+    assert all(np.isfinite(one["completion"]) for one in figures(found).values())
+
+
+def test_parts_that_are_off_are_not_driven(config):
+    timing = replace(config, real_car=replace(config.real_car, picture=None, controls=None))
+    assert list(protocols(timing)) == [SIMULATOR]
+    two = replace(config, real_car=replace(config.real_car, picture=None))
+    assert list(protocols(two)) == [SIMULATOR, "timing", "controls"]
+
+
+def test_a_policy_of_features_is_refused(config):
+    with pytest.raises(BadInput, match="the car has no features"):
+        Evaluator(compose_experiment([])[0], config)
