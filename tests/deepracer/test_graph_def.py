@@ -1,6 +1,8 @@
 """Frozen graphs: what is written is read back, and nothing else is believed."""
 
 import tracemalloc
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -10,13 +12,13 @@ from deepracer_exp.deepracer.graph_def import (
     INPUTS,
     POLICY,
     POLICY_NETWORK,
-    _Fields,
     policy_graph,
     read_weights,
 )
-from deepracer_exp.deepracer.protobuf import field
+from deepracer_exp.deepracer.protobuf import field, read_fields
 from deepracer_exp.errors import BadInput
 
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference" / "aws_checkpoint" / "model"
 SENSORS = {"STEREO_CAMERAS": (20, 24, 2), "LIDAR": (6,)}
 
 
@@ -45,14 +47,22 @@ def graph(**options) -> bytes:
     return policy_graph(weights(**options), SENSORS, (2, 1, 1))
 
 
-def nodes(content: bytes) -> list[tuple[str, str, list[str]]]:
-    """Return name, operation and inputs of each node."""
-    found, fields = [], _Fields()
-    for number, node in fields.of(memoryview(content)):
+class Node(NamedTuple):
+    name: str
+    op: str
+    inputs: list[str]
+    attributes: dict[str, bytes]
+
+
+def nodes(content: bytes) -> list[Node]:
+    found = []
+    for number, node in read_fields(memoryview(content)):
         if number == 1:
-            parts = [(kind, bytes(value).decode()) for kind, value in fields.of(node) if kind <= 3]
-            name, op, *inputs = (text for _, text in parts)
-            found.append((name, op, inputs))
+            parts = list(read_fields(node))
+            name, op, *inputs = (bytes(value).decode() for kind, value in parts if kind <= 3)
+            entries = [dict(read_fields(value)) for kind, value in parts if kind == 5]
+            attributes = {bytes(each[1]).decode(): bytes(each.get(2, b"")) for each in entries}
+            found.append(Node(name, op, inputs, attributes))
     return found
 
 
@@ -66,7 +76,7 @@ def test_weights_are_read_back_as_they_were_written(continuous):
 
 def test_nodes_have_the_services_names_and_follow_their_inputs():
     known: dict[str, str] = {}
-    for name, op, inputs in nodes(graph()):
+    for name, op, inputs, _ in nodes(graph()):
         assert name not in known
         assert set(inputs) <= known.keys()
         known[name] = op
@@ -78,11 +88,11 @@ def test_nodes_have_the_services_names_and_follow_their_inputs():
     assert known[f"{camera}/BatchnormActivationDropout_5_activation"] == "Relu"
     assert list(known)[-1] == POLICY
     assert known[POLICY] == "Softmax"
-    assert nodes(graph(continuous=True))[-1][1] == "Identity"
+    assert nodes(graph(continuous=True))[-1].op == "Identity"
 
 
 def test_layers_are_in_the_order_of_their_numbers_and_sensors_in_that_of_their_names():
-    inputs = {name: given for name, _, given in nodes(graph())}
+    inputs = {node.name: node.inputs for node in nodes(graph())}
     assert inputs[f"{POLICY_NETWORK}/merger"][0].startswith(f"{POLICY_NETWORK}/LIDAR/")
     middleware = f"{POLICY_NETWORK}/middleware_fc_embedder"
     before = f"{middleware}/BatchnormActivationDropout_9_activation"
@@ -108,7 +118,7 @@ def test_a_layer_of_each_pixel_and_one_of_all_pixels_are_told_apart():
 
 def _reshapes(tensors):
     content = policy_graph(tensors, SENSORS, (2, 1, 1))
-    names = [name for name, op, _ in nodes(content) if op == "Reshape"]
+    names = [node.name for node in nodes(content) if node.op == "Reshape"]
     sizes = []
     for name in names:
         after = content.split(f"{name}/shape".encode())[1]
@@ -179,3 +189,36 @@ def test_a_tensor_of_one_element_may_be_listed_as_tensorflow_lists_it():
     listed = field(8, field(1, 1) + field(2, field(2, field(1, 1))) + field(5, value.tobytes()))
     node = field(1, "a/bias") + field(2, "Const") + field(5, field(1, "value") + field(2, listed))
     assert read_weights("model.pb", field(1, node)) == {"a/bias": value}
+
+
+@pytest.mark.skipif(not REFERENCE.is_dir(), reason=f"no checkpoint at {REFERENCE}")
+def test_every_node_is_one_of_the_services_own_graph():
+    (meta,) = REFERENCE.glob("*.meta")
+    (content,) = (value for number, value in read_fields(memoryview(meta.read_bytes())) if number == 2)
+    theirs = {node.name: node for node in nodes(content)}
+    middleware, camera = f"{POLICY_NETWORK}/middleware_fc_embedder", f"{POLICY_NETWORK}/FRONT_FACING_CAMERA"
+    tensors = {}
+    for name, shape in {
+        f"{camera}/Conv2d_0": (8, 8, 1, 32),
+        f"{camera}/Conv2d_2": (4, 4, 32, 64),
+        f"{camera}/Conv2d_4": (3, 3, 64, 64),
+        f"{middleware}/Dense_0": (11264, 512),
+        f"{HEAD}/policy_fc": (512, 9),
+    }.items():
+        tensors |= {
+            f"{name}/kernel": np.zeros(shape, np.float32),
+            f"{name}/bias": np.zeros(shape[-1:], np.float32),
+        }
+    written = nodes(policy_graph(tensors, {"FRONT_FACING_CAMERA": (120, 160, 1)}, (4, 2, 1)))
+    assert len(written) > 30
+    for name, op, inputs, attributes in written:
+        like = theirs[name]
+        if op == "Const":  # frozen
+            assert like.op == {"y": "Const", "shape": "Pack"}.get(name.rsplit("/")[-1], "VariableV2")
+            continue
+        inputs_there = like.inputs
+        if name == f"{HEAD}/policy_fc/MatMul":  # without the factor of 1 on gradients
+            inputs_there = [f"{middleware}/BatchnormActivationDropout_1_activation", *inputs_there[1:]]
+        of_training = ("_class", "_output_shapes")
+        assert (op, inputs) == (like.op, inputs_there)
+        assert attributes == {key: value for key, value in like.attributes.items() if key not in of_training}
