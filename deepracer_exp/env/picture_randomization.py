@@ -187,31 +187,40 @@ def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
     """
     count, channels, height, width = pictures.shape
     out = pictures.copy()
-    middle_x, middle_y = 0.5 * width, 0.5 * height
-    per_square = 1.0 / (middle_x * middle_x + middle_y * middle_y)
+    middle_x, middle_y = np.float32(0.5 * width - 0.5), np.float32(0.5 * height - 0.5)
+    # There is always a pixel to the right and one below.
+    last_x, last_y = np.float32(width - 1.001), np.float32(height - 1.001)
+    places = np.empty(width, np.int32)
+    across, down = np.empty(width, np.float32), np.empty(width, np.float32)
     for at in range(count):
-        k1 = k1s[at]
-        if k1 == 0.0:
+        if k1s[at] == 0.0:
             continue
-        shrunk = 1.0 / (1.0 + max(k1, 0.0))
+        shrunk = np.float32(1.0 / (1.0 + max(k1s[at], 0.0)))
+        per_square = np.float32(shrunk * k1s[at] * 4.0 / (width * width + height * height))
         for row in range(height):
-            y = row + 0.5 - middle_y
+            y = np.float32(row) - middle_y
             for column in range(width):
-                x = column + 0.5 - middle_x
-                scale = shrunk * (1.0 + k1 * (x * x + y * y) * per_square)
-                from_x = min(max(middle_x + scale * x - 0.5, 0.0), width - 1.0)
-                from_y = min(max(middle_y + scale * y - 0.5, 0.0), height - 1.0)
-                left, top = min(int(from_x), width - 2), min(int(from_y), height - 2)
-                across, down = np.float32(from_x - left), np.float32(from_y - top)
-                for channel in range(channels):
-                    some = pictures[at, channel]
-                    above = some[top, left] + across * (
-                        np.float32(some[top, left + 1]) - np.float32(some[top, left])
+                x = np.float32(column) - middle_x
+                scale = shrunk + per_square * (x * x + y * y)
+                from_x = min(max(middle_x + scale * x, np.float32(0)), last_x)
+                from_y = min(max(middle_y + scale * y, np.float32(0)), last_y)
+                left, top = np.int32(from_x), np.int32(from_y)
+                across[column], down[column] = from_x - np.float32(left), from_y - np.float32(top)
+                places[column] = top * np.int32(width) + left
+            # Apart from the loop above, which is then computed for several columns together.
+            for channel in range(channels):
+                flat = pictures[at, channel].reshape(-1)
+                for column in range(width):
+                    place = np.uint64(places[column])
+                    above = np.float32(flat[place])
+                    above_right = np.float32(flat[place + np.uint64(1)])
+                    below = np.float32(flat[place + np.uint64(width)])
+                    below_right = np.float32(flat[place + np.uint64(width + 1)])
+                    above += across[column] * (above_right - above)
+                    below += across[column] * (below_right - below)
+                    out[at, channel, row, column] = np.uint8(
+                        above + down[column] * (below - above) + np.float32(0.5)
                     )
-                    below = some[top + 1, left] + across * (
-                        np.float32(some[top + 1, left + 1]) - np.float32(some[top + 1, left])
-                    )
-                    out[at, channel, row, column] = np.uint8(above + down * (below - above) + np.float32(0.5))
     return out
 
 
