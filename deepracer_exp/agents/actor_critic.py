@@ -81,7 +81,10 @@ class ActorCritic(nn.Module):
 
 
 def build_actor_critic(
-    network: NetworkConfig, observed: ObservationShape, action_count: int | None, generator: torch.Generator
+    network: NetworkConfig,
+    observed: ObservationShape,
+    action_count: int | None,
+    generator: torch.Generator | None,
 ) -> ActorCritic:
     """Build the networks with weights drawn from `generator`.
 
@@ -91,7 +94,8 @@ def build_actor_critic(
             height and width of `pixels`; the number of a LIDAR's readings follows as an argument of its own.
         observed: What there is to read.
         action_count: Number of discrete actions, or None for the two continuous ones.
-        generator: Source of the initial weights; the global random state has no part in them.
+        generator: Source of the initial weights; the global random state has no part in them. None: they will be
+            replaced.
 
     Raises:
         BadInput: a class of the user's own cannot be used.
@@ -115,7 +119,11 @@ def build_actor_critic(
 
 
 def _mlp(
-    network: MLPConfig, observation_size: int, outputs: int, continuous: bool, generator: torch.Generator
+    network: MLPConfig,
+    observation_size: int,
+    outputs: int,
+    continuous: bool,
+    generator: torch.Generator | None,
 ) -> ActorCritic:
     activation = _ACTIVATIONS[network.activation]
 
@@ -235,7 +243,7 @@ def _cnn(
     observed: ObservationShape,
     outputs: int,
     continuous: bool,
-    generator: torch.Generator,
+    generator: torch.Generator | None,
 ) -> ActorCritic:
     keys = list(observed.seen)
 
@@ -293,8 +301,10 @@ class _Gaussian(nn.Sequential):
         return parameters
 
 
-def _initialize(layers: nn.Module, head_gain: float, generator: torch.Generator) -> nn.Module:
+def _initialize(layers: nn.Module, head_gain: float, generator: torch.Generator | None) -> nn.Module:
     """Draw orthogonal weights and zero the biases; the last layer gets its own gain."""
+    if generator is None:
+        return layers
     linear = [module for module in layers.modules() if isinstance(module, nn.Linear | nn.Conv2d)]
     for layer in linear:
         gain = head_gain if layer is linear[-1] else _HIDDEN_GAIN

@@ -26,6 +26,7 @@ VALUE, POLICY = f"{ONLINE}/network_0", f"{ONLINE}/network_1"
 """Scopes of the two networks; the graph's inputs are in the first."""
 VALUE_HEAD = f"{VALUE}/v_values_head_0/output"
 POLICY_HEAD = f"{POLICY}/ppo_head_0"
+_LOG_STD = f"{POLICY_HEAD}/policy_log_std"
 _RESCALER = "gradients_from_head_0-0_rescalers"
 """A factor on gradients that the service keeps among the weights of each network; always 1."""
 _LOG_STD_RANGE = (-20.0, 3.0)
@@ -40,6 +41,13 @@ class _Layer(NamedTuple):
     module: nn.Linear | nn.Conv2d
     inputs: npt.NDArray[np.int64] | None = None
     """Our number of each of the service's inputs; None: the same."""
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the service's tensors by name."""
+        outputs, inputs, *places = self.module.weight.shape
+        places = [] if "/Dense_" in self.name else places
+        return {f"{self.name}/kernel": (*places, inputs, outputs), f"{self.name}/bias": (outputs,)}
 
     def to_service(self) -> tuple[Array, Array]:
         weight = self.module.weight.detach().numpy()
@@ -61,8 +69,10 @@ class _Layer(NamedTuple):
             weight[self.inputs] = kernel
             weight = weight.T
         with torch.no_grad():
-            self.module.weight.copy_(torch.from_numpy(np.ascontiguousarray(weight)))
-            self.module.bias.copy_(torch.from_numpy(bias))  # type: ignore[union-attr]
+            self.module.weight.copy_(
+                torch.from_numpy(weight.copy())
+            )  # of a file's bytes it could not be written
+            self.module.bias.copy_(torch.from_numpy(bias.copy()))  # type: ignore[union-attr]
 
 
 def to_service(networks: ActorCritic, sensors: Sequence[str]) -> dict[str, Array]:
@@ -89,57 +99,61 @@ def to_service(networks: ActorCritic, sensors: Sequence[str]) -> dict[str, Array
         tensors[f"{scope}/{_RESCALER}"] = np.ones((), np.float32)
     if scale is not None:
         log_std = scale.state_independent_scale.detach().numpy()
-        tensors[f"{POLICY_HEAD}/policy_log_std"] = log_std.reshape(1, -1).copy()
+        tensors[_LOG_STD] = log_std.reshape(1, -1).copy()
     return dict(sorted(tensors.items()))
 
 
 def from_service(
     tensors: Mapping[str, Array], networks: ActorCritic, sensors: Sequence[str], where: str
-) -> list[str]:
-    """Give networks the parameters of the service's tensors.
+) -> None:
+    """Give networks the parameters of the service's tensors; arguments and errors as of `match_service`."""
+    layers, scale = _layers(networks, sensors)
+    found, _ = match_service(tensors, networks, sensors, where)
+    with torch.no_grad():
+        for layer in layers:
+            if f"{layer.name}/kernel" in found:
+                layer.from_service(found[f"{layer.name}/kernel"], found[f"{layer.name}/bias"])
+        if scale is not None and _LOG_STD in found:
+            clipped = np.clip(found[_LOG_STD][0], *_LOG_STD_RANGE)
+            scale.state_independent_scale.copy_(torch.from_numpy(clipped))
+
+
+def match_service(
+    tensors: Mapping[str, Array], networks: ActorCritic, sensors: Sequence[str], where: str
+) -> tuple[dict[str, Array], list[str]]:
+    """Find the tensor of each parameter.
 
     Tensors are matched by name, else by order and shape among the layers of their scope: newer versions of the service
     number layers differently.
 
     Args:
         tensors: by name; of any agent (`agent`, `agent_0`), online or global.
-        networks: with separate trunks, both of which see what the service's do.
+        networks: with separate trunks, both of which see what the service's do; also on the device `meta`.
         sensors: as for `to_service`.
         where: file of the tensors, for messages.
 
     Returns:
-        What there was no tensor for: scopes or names of what a frozen graph does not hold (the value network, the
-        standard deviation), which stays as it is.
+        The tensors by the names of `to_service`; and what there is none for: scopes or names of what a frozen graph
+        does not hold (the value network, the standard deviation).
 
     Raises:
         BadInput: a tensor is missing, has another shape, is not finite, or is none of these networks'.
     """
     layers, scale = _layers(networks, sensors)
-    targets: dict[str, tuple[int, ...]] = {}
-    for layer in layers:
-        kernel, bias = layer.to_service()
-        targets |= {f"{layer.name}/kernel": kernel.shape, f"{layer.name}/bias": bias.shape}
-    log_std = f"{POLICY_HEAD}/policy_log_std"
+    targets = {name: shape for layer in layers for name, shape in layer.shapes.items()}
     if scale is not None:
-        targets[log_std] = (1, *scale.scale_shape)
+        targets[_LOG_STD] = (1, *scale.scale_shape)
     found = _match(tensors, targets, where)
     missing = [name for name in targets if name not in found]
     absent = [VALUE] if all(_scope(name) != VALUE for name in found) else []
-    absent += [log_std] * (log_std in missing)
+    absent += [_LOG_STD] * (_LOG_STD in missing)
     for name in missing:
-        if name != log_std and _scope(name) not in absent:
+        if name != _LOG_STD and _scope(name) not in absent:
             raise BadInput(f"{where}: has no tensor {name} of shape {list(targets[name])}")
     for name, value in found.items():
         if not np.isfinite(value).all():
             raise BadInput(f"{where}: {name}: is not finite; choose another checkpoint")
-    for layer in layers:
-        if _scope(layer.name) not in absent:
-            layer.from_service(found[f"{layer.name}/kernel"], found[f"{layer.name}/bias"])
-    if scale is not None and log_std in found:
-        with torch.no_grad():
-            clipped = np.clip(found[log_std][0], *_LOG_STD_RANGE)
-            scale.state_independent_scale.copy_(torch.from_numpy(clipped))
-    return absent
+    return found, absent
 
 
 def _match(

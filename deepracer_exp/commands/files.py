@@ -25,17 +25,20 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         commands,
         "import",
         _import,
-        help="turn a DeepRacer model's files into options",
+        help="turn a DeepRacer model into a run, or its files into options",
         description=(
             "Turn reward_function.py, model_metadata.json and hyperparameters.json, whichever of them are there, into "
             "options: files in ./conf, to train with and to edit. Every command offers the options in ./conf of the "
             "current folder beside the project's own. To train with such files once: deepracer-exp train "
-            "custom_files=DIR."
+            "custom_files=DIR. Where the path holds a trained model of the AWS console, deepracer-for-cloud or "
+            "deepracer-on-aws, with the weights of its policy, it becomes a run as well."
         ),
+        epilog=_IMPORT_EPILOG,
     )
     parser.add_argument(
-        "folder", metavar="DIR", help="deepracer-for-cloud's custom_files, or a model's folder"
+        "path", metavar="PATH", help="deepracer-for-cloud's custom_files, a model's folder or its archive"
     )
+    add_overrides(parser)
     parser.add_argument(
         "--name", required=True, help="name of the options, as in: deepracer-exp train experiment=NAME"
     )
@@ -50,27 +53,58 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=_EXPORT_EPILOG,
         entry="export",
     )
-    add_run(parser, "format=onnx|car|aws|aws-logs | KEY=VALUE")
+    add_run(parser, "format=onnx|car|aws|aws-model|aws-logs | KEY=VALUE")
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
     _add_tracks(commands)
 
 
+_IMPORT_EPILOG = """\
+  deepracer-exp import ~/deepracer-for-cloud/custom_files --name mine
+  deepracer-exp import model.tar.gz --name mine             its best checkpoint, as a run of the experiment mine
+  deepracer-exp import model.tar.gz --name mine checkpoint=last track=Oval_track
+"""
+
+
 def _import(args: argparse.Namespace) -> int:
+    from deepracer_exp.deepracer.model_archive import holds_model
+
+    if holds_model(args.path):
+        return _import_model(args)
+    if args.overrides:
+        raise BadInput(f"{args.overrides[0]}: {args.path} holds no model; accepted for one: KEY=VALUE")
+
     from deepracer_exp.config.compose import compose_experiment
     from deepracer_exp.config.custom_files import KEY, import_files, read_custom_files
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.rewards.source import load_reward_source
 
-    files = read_custom_files(args.folder)
-    experiment, composition = compose_experiment([override_line(KEY, args.folder)])
+    files = read_custom_files(args.path)
+    experiment, composition = compose_experiment([override_line(KEY, args.path)])
     load_reward_source(experiment.reward)
     written = import_files(files, args.name, composition.mapping)
     print_notes(composition.notes)
     for path in written:
         print(path)
     print(f"\n  train it  deepracer-exp train experiment={args.name}")
+    return 0
+
+
+def _import_model(args: argparse.Namespace) -> int:
+    import shlex
+
+    from deepracer_exp.training.import_model import import_model
+
+    imported = import_model(args.path, args.name, args.overrides)
+    print_notes(imported.notes)
+    for path in (*imported.options, imported.folder):
+        print(path)
+    run = shlex.quote(imported.folder.name)
+    print(f"\n  race it            deepracer-exp evaluate {run}")
+    print(f"  train it further   deepracer-exp clone {run}")
+    if imported.has_logs:
+        print(f"  its training       deepracer-exp analyze {shlex.quote(args.path)}")
     return 0
 
 
@@ -81,6 +115,8 @@ _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=car -o my_model.tar.gz    for the console of a physical car, which calls it my_model
   deepracer-exp export RUN format=aws -o custom_files       reward_function.py, model_metadata.json and
                                                             hyperparameters.json
+  deepracer-exp export RUN format=aws-model -o my_model     these and the weights: a pretrained model for
+                                                            deepracer-for-cloud and deepracer-on-aws
   deepracer-exp export RUN format=aws-logs                  trace, metrics and logs of the training, as in an archive
                                                             of the AWS console (deepracer-utils reads it)
   deepracer-exp export RUN format=aws-logs layout=deepracer-for-cloud
@@ -95,7 +131,7 @@ def _export(args: argparse.Namespace) -> int:
     run, overrides = run_and_overrides(args)
     config, _ = compose_export([*overrides, override_line("run", run)])
     args.debug = config.debug
-    if config.format in ("onnx", "car"):
+    if config.format in ("onnx", "car", "aws-model"):
         experiment = check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
         if config.format == "car":
             from deepracer_exp.export.car_archive import check_car

@@ -3,7 +3,7 @@
 import contextlib
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,13 @@ import yaml
 
 from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperparameters
-from deepracer_exp.deepracer.model_metadata import LIDARS, Action, ModelMetadata, read_model_metadata
+from deepracer_exp.deepracer.model_metadata import (
+    LIDARS,
+    NEURAL_NETWORKS,
+    Action,
+    ModelMetadata,
+    read_model_metadata,
+)
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 
@@ -161,6 +167,27 @@ def sensor_overrides(metadata: ModelMetadata) -> list[str]:
     return lines
 
 
+_NETWORKS = dict(zip(NEURAL_NETWORKS, ("shallow", "medium", "deep"), strict=True))
+_STEREO: Mapping[str, Any] = {
+    "filters": [32, 64, 64, 128, 128],
+    "kernels": [3, 3, 3, 3, 3],
+    "strides": [1, 2, 1, 2, 1],
+}
+"""Layers of the service's two deeper networks for two cameras (deepracer-simapp, `sensors/utils.py`)."""
+
+
+def services_network(metadata: ModelMetadata) -> tuple[str, dict[str, Any]]:
+    """Return the option of the network that the service builds for a model, and what it has instead of its values."""
+    name = _NETWORKS[metadata.neural_network]
+    return name, dict(_STEREO) if "STEREO_CAMERAS" in metadata.sensor and name != "shallow" else {}
+
+
+def network_overrides(metadata: ModelMetadata) -> list[str]:
+    """Return the overrides for the network that the service builds for a model."""
+    name, values = services_network(metadata)
+    return [f"network={name}", *(override_line(f"network.{key}", value) for key, value in values.items())]
+
+
 def read_custom_files(folder: str) -> CustomFiles:
     """Read the JSON files of a folder and find its reward function.
 
@@ -295,13 +322,21 @@ _GROUPS = {
 }
 
 
-def import_files(files: CustomFiles, name: str, mapping: Mapping[str, Any]) -> list[Path]:
+def import_files(
+    files: CustomFiles,
+    name: str,
+    mapping: Mapping[str, Any],
+    more: Sequence[str] = (),
+    source: str | None = None,
+) -> list[Path]:
     """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
 
     Args:
         files: the files of a folder.
         name: name of the new options.
         mapping: the experiment that the files describe, validated.
+        more: overrides that belong to the experiment, too.
+        source: where the files come from, if their folder is a temporary one.
 
     Returns:
         The files written, the experiment's last.
@@ -320,15 +355,25 @@ def import_files(files: CustomFiles, name: str, mapping: Mapping[str, Any]) -> l
         elif group == "algorithm":
             keys = [target.removeprefix("algorithm.") for target in (*TAKEN.values(), FRAMES)]
             values = {"defaults": ["ppo"]} | {key: values[key] for key in keys if key in values}
-        texts[Path("conf", group, f"{name}.yaml")] = _option(files.paths[file], values)
+        texts[Path("conf", group, f"{name}.yaml")] = _option(source or files.paths[file], values)
     experiment: dict[str, Any] = {
         "defaults": [{f"override /{group}": name} for group in imported.values()],
         "name": name,
     }
+    for override in map(parse_single, more):
+        group, _, key = override.key_or_group.partition(".")
+        if key:
+            *above, leaf = group, *key.split(".")
+            node = experiment
+            for part in above:
+                node = node.setdefault(part, {})
+            node[leaf] = override.value()
+        else:
+            experiment["defaults"].append({f"override /{group}": override.value()})
     if (iterations := files.learning.get("term_cond_max_episodes")) is not None:
-        experiment["budget"] = {"iterations": iterations}
+        experiment.setdefault("budget", {})["iterations"] = iterations
     texts[Path("conf/experiment", f"{name}.yaml")] = b"# @package _global_\n" + _option(
-        files.folder, experiment
+        source or files.folder, experiment
     )
     searched = conf_dirs()
     for path in texts:
@@ -366,10 +411,15 @@ def _write_all(texts: Mapping[Path, bytes]) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(text)
     except OSError as error:
-        for path in texts:
-            for remove in (path.unlink, path.parent.rmdir, path.parent.parent.rmdir):
-                with contextlib.suppress(OSError):  # not there, or a folder with other files
-                    remove()
+        remove_options(texts)
         raise BadInput(
             f"{error.filename}: cannot be written ({error.strerror}); your own options are written to ./conf"
         ) from error
+
+
+def remove_options(paths: Iterable[Path]) -> None:
+    """Remove option files, and the folders that are empty then."""
+    for path in paths:
+        for remove in (path.unlink, path.parent.rmdir, path.parent.parent.rmdir):
+            with contextlib.suppress(OSError):  # not there, or a folder with other files
+                remove()

@@ -133,9 +133,9 @@ class ExportConfig:
     run: Annotated[str, Field(min_length=1)]
     """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
     of a registered model."""
-    format: Literal["onnx", "car", "aws", "aws-logs"]
-    """The network as a file or as an archive for a car, the files that AWS trains from, or the run's logs as AWS
-    writes them."""
+    format: Literal["onnx", "car", "aws", "aws-model", "aws-logs"]
+    """The network as a file or as an archive for a car, the files that AWS trains from, with the weights as well, or
+    the run's logs as AWS writes them."""
     layout: Literal["console", "deepracer-for-cloud"]
     """The folder layout of `aws-logs`."""
     checkpoint: Annotated[str, AfterValidator(checked_checkpoint_name)] | None

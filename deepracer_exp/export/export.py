@@ -23,10 +23,12 @@ from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.resolve import StoredRun, resolve
+from deepracer_exp.runs.result import read_result
 from deepracer_exp.validation.console import console_findings
 
-from .aws_files import aws_files, write_texts
+from .aws_files import aws_files, write_texts, writing
 from .aws_logs import write_aws_logs
+from .aws_model import aws_model
 from .car_archive import ENDING, car_archive, describe_actions, name_on_car
 
 POLICY, COMMAND = "policy", "command"
@@ -54,6 +56,9 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
         return _car(run, checkpoint, Path(output or exports / name), out)
     if config.format == "aws-logs":
         return _aws_logs(run, Path(output or exports / "aws-logs"), config.layout, out)
+    if config.format == "aws-model":
+        checkpoint = run.choose_checkpoint(config.checkpoint)
+        return _aws_model(run, checkpoint, Path(output or exports / "aws-model"), out)
     return _aws(run, Path(output or exports / "aws"), out)
 
 
@@ -135,14 +140,34 @@ def _aws_logs(run: StoredRun, folder: Path, layout: str, out: Console) -> Path:
     return folder
 
 
-def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
+def _aws_model(run: StoredRun, checkpoint: str, folder: Path, out: Console) -> Path:
+    stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
+    result = read_result(run.path)
+    score = result.completion if result and result.iteration == stored.counters["iteration"] else None
+    files, notes = aws_model(run.experiment, stored, _reward(run), score)
+    with writing():
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+    for name in sorted(files):
+        out.print(f"{folder / name}", soft_wrap=True)
+    for note in notes:
+        out.print(f"  {note}", soft_wrap=True)
+    return folder
+
+
+def _reward(run: StoredRun) -> str:
     source = run.path / REWARD
     try:
-        reward = source.read_text(encoding="utf-8")
+        return source.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput(
             f"{source}: cannot be read: {error}; this is the reward the run was trained with"
         ) from error
+
+
+def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
+    reward = _reward(run)
     texts, notes = aws_files(run.experiment, build_action_space(run.experiment.action_space), reward)
     write_texts(texts, folder)
     for name in texts:

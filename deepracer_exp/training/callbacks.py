@@ -227,8 +227,8 @@ class ReportCallback(Callback):
         write_pictures(trainer.folder.path, trainer.setup.courses)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
-        """Write report.html, unless the run may be resumed."""
-        if trainer.experiment.report and result.status in (FINISHED, STOPPED_EARLY):
+        """Write report.html, unless the run may be resumed or did not learn: then there is nothing to report."""
+        if trainer.experiment.report and trainer.iteration and result.status in (FINISHED, STOPPED_EARLY):
             result.note = _write_page(trainer.folder.path, trainer.experiment.car)
 
 

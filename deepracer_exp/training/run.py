@@ -41,7 +41,7 @@ from deepracer_exp.runs.files import (
 from deepracer_exp.runs.fingerprint import refuse_changes
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
-from deepracer_exp.runs.result import INTERRUPTED
+from deepracer_exp.runs.result import FINISHED, INTERRUPTED
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
@@ -91,8 +91,34 @@ def run_training(
     console = console or Console(quiet=True)
     # From here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
-        trainer = _begin(experiment, composition, console, start, callbacks, run_name, tags)
+        setup = read_files(experiment)
+        memory = memory_of_pictures(experiment)
+        trainer = _begin(experiment, composition, setup, console, start, callbacks, run_name, tags)
+        if memory is not None:
+            logger.info(memory)
+            _printing(console)(memory)
         return _run(trainer, interruption)
+
+
+def store_run(
+    experiment: Experiment, composition: Composition, networks: ActorCritic, reason: str
+) -> TrainResult:
+    """Make a run of networks that were trained elsewhere, as if its training had ended before it began.
+
+    The reward function is not run.
+
+    Args:
+        experiment: validated.
+        composition: where it came from.
+        networks: are its checkpoint, best and last.
+        reason: where they came from, for the summary.
+
+    Raises:
+        BadInput: as for `run_training`; no folder is left.
+    """
+    setup = build_setup(experiment)
+    trainer = _begin(experiment, composition, setup, Console(quiet=True), (networks, None))
+    return trainer.end(FINISHED, reason, 0)
 
 
 def resume(
@@ -191,23 +217,23 @@ def memory_of_pictures(experiment: Experiment) -> str | None:
 def _begin(
     experiment: Experiment,
     composition: Composition,
+    setup: RaceSetup,
     console: Console,
-    start: tuple[ActorCritic, Lineage] | None,
-    callbacks: Sequence[Callback],
-    run_name: str | None,
-    tags: Mapping[str, str],
+    start: tuple[ActorCritic, Lineage | None] | None,
+    callbacks: Sequence[Callback] = (),
+    run_name: str | None = None,
+    tags: Mapping[str, str] = MappingProxyType({}),
 ) -> Trainer:
     """Create the folder of a new run and record it."""
-    setup = read_files(experiment)
-    memory = memory_of_pictures(experiment)
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
     teacher = find_teacher(experiment)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
     label = f"{names['track']}-{names['reward']}-seed{experiment.seed}"
-    if start is not None:
-        label += f"-clone{start[1].generation}"
+    lineage = None if start is None else start[1]
+    if lineage is not None:
+        label += f"-clone{lineage.generation}"
     folder = RunFolder.create(experiment.runs_dir, experiment.name, label)
     try:
         if teacher is not None:
@@ -215,7 +241,9 @@ def _begin(
         trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
             trainer.networks.load_state_dict(start[0].state_dict())
-            folder.write(LINEAGE, json.dumps(asdict(start[1]), indent=2) + "\n")
+            trainer.is_best = lineage is None  # there is no other
+        if lineage is not None:
+            folder.write(LINEAGE, json.dumps(asdict(lineage), indent=2) + "\n")
         for callback in every:
             callback.on_run_created(trainer)
         trainer.save()
@@ -231,9 +259,6 @@ def _begin(
         raise
     for note in composition.notes:
         logger.info(note)
-    if memory is not None:
-        logger.info(memory)
-        _printing(console)(memory)
     if teacher is not None:
         logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
     _track(tracker, trainer, composition, names, commit, run_name, tags)

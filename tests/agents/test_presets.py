@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -91,14 +92,19 @@ def test_attention_sums_each_column_by_weights_that_sum_to_one():
 
 
 @pytest.mark.parametrize(
-    ("name", "alone", "joined"), [("shallow", None, 512), ("medium", 64, 512), ("deep", 512, 256)]
+    ("name", "picture", "joined"),
+    [("shallow", 11 * 16 * 64, 512), ("medium", 25 * 35 * 64, 512), ("deep", 3 * 6 * 512, 256)],
 )
-def test_lidar_joins_the_picture_before_the_services_middleware(name, alone, joined):
+def test_lidar_joins_the_picture_before_the_services_middleware(name, picture, joined):
     net = SensorNet(load("network", name, CNNConfig), ObservationShape(11, (1, 120, 160), 64), 7)
-    readings = {"shallow": 32}.get(name, 256)
-    picture = 11 * 16 * 64 if alone is None else alone
-    assert isinstance(net.embedder, torch.nn.Identity) == (alone is None)
     first = next(layer for layer in net.perceptron if isinstance(layer, torch.nn.Linear))
-    assert (first.in_features, first.out_features) == (picture + readings, joined)
+    assert (first.in_features, first.out_features) == (picture + 256, joined)
     pixels, lidar = torch.zeros(2, 1, 120, 160, dtype=torch.uint8), torch.rand(2, 64)
     assert not torch.equal(*net(pixels, lidar))
+
+
+def test_a_lidar_joins_after_layers_that_see_pictures_alone_where_that_is_asked_for():
+    config = replace(load("network", "deep", CNNConfig), hidden=(64, 32), lidar_joins_after=1)
+    net = SensorNet(config, ObservationShape(11, (1, 120, 160), 64), 7)
+    first = next(layer for layer in net.perceptron if isinstance(layer, torch.nn.Linear))
+    assert (first.in_features, first.out_features) == (64 + 256, 32)

@@ -1,0 +1,290 @@
+"""A trained model as the AWS console, deepracer-for-cloud and deepracer-on-aws store it: a folder or an archive.
+
+Nothing of it is run or unpacked. Sizes are compared with limits before anything is read into memory.
+"""
+
+import json
+import math
+import os
+import re
+import stat
+import tarfile
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES
+
+from .graph_def import GRAPH_BYTES, read_weights
+from .log_archive import natural
+from .log_blocks import READ_ERRORS
+from .tf_checkpoint import DATA, DATA_BYTES, INDEX, INDEX_BYTES, read_index, read_tensors
+
+Tensors = Mapping[str, npt.NDArray[np.float32]]
+
+SMALL_FILES = ("model_metadata.json", "reward_function.py", "hyperparameters.json", "training_params.yaml")
+"""What is read of a model beside its weights, where it lies nearest to the model's own folder."""
+CHECKPOINTS = "deepracer_checkpoints.json"
+NEWEST = ".coach_checkpoint"
+"""Beside the checkpoints: the names of the best and the last, and of the newest."""
+_ACCEPTED = "a model's folder or archive (.tar.gz, .tar, .zip) with NAME.ckpt.index and its data file, or with model.pb"
+_MOST_FILES = 100_000
+_LOGS = re.compile(r"simtrace/.*\.csv$|\.log$")
+_HEADER_BYTES = 2**20
+"""Of a long name in an archive."""
+
+
+class StoredModel(NamedTuple):
+    """The weights of a model, and what lies beside them."""
+
+    tensors: Tensors
+    source: str
+    """The file of the weights, for messages."""
+    name: str
+    """Of the checkpoint, `11_Step-38428.ckpt`, or the frozen graph."""
+    is_graph: bool
+    """Whether it is a frozen graph, which has the policy alone."""
+    files: Mapping[str, bytes]
+    """Contents by their names in SMALL_FILES."""
+    has_logs: bool
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Files:
+    path: str
+    sizes: Mapping[str, int]
+    """Bytes of each file, by its path below the model's folder or archive."""
+    open: Callable[[str], IO[bytes]]
+
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Return a file's content.
+
+        Raises:
+            BadInput: it is larger than accepted, or incomplete.
+        """
+        size, where = self.sizes[name], f"{self.path}/{name}"
+        if size > most_bytes:
+            raise BadInput(f"{where}: has {size:,} bytes; such a file of a model has at most {most_bytes:,}")
+        with self.open(name) as file:
+            raw = file.read(size + 1)
+        if len(raw) != size:
+            raise BadInput(f"{where}: has {len(raw):,} bytes and not {size:,}; copy it again")
+        return raw
+
+
+def holds_model(path: str) -> bool:
+    """Return whether a path is a file, or a folder with weights in it."""
+    return Path(path).is_file() or any(_is_weights(name) for _, _, names in os.walk(path) for name in names)
+
+
+def read_model(path: str, checkpoint: str) -> StoredModel:
+    """Read the weights of a model and the files beside them.
+
+    Args:
+        path: of its folder or archive.
+        checkpoint: `best` or `last`, of `deepracer_checkpoints.json`.
+
+    Raises:
+        BadInput: there is no such file, it is corrupt or larger than a model, or holds none or several.
+    """
+    try:
+        with _opened(path) as files:
+            return _read(files, checkpoint)
+    except BadInput:
+        raise
+    except (*READ_ERRORS, zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise BadInput(f"{path}: cannot be read: {reason}; accepted: {_ACCEPTED}") from error
+
+
+def _read(files: _Files, checkpoint: str) -> StoredModel:
+    weights = [name for name in files.sizes if _is_weights(name)]
+    whole = [
+        name for name in weights if name.endswith(INDEX) and f"{name[: -len(INDEX)]}{DATA}" in files.sizes
+    ]
+    graphs = [name for name in weights if name.endswith(".pb")]
+    if not whole and not graphs:
+        lacking = f": {min(weights)} has no {DATA} beside it" if weights else ""
+        raise BadInput(f"{files.path}: holds no model{lacking}; accepted: {_ACCEPTED}")
+    chosen, note = _choose(files, whole or graphs, checkpoint)
+    where, stem = f"{files.path}/{chosen}", PurePosixPath(chosen).name.removesuffix(INDEX)
+    if whole:
+        index = read_index(files.read(chosen, INDEX_BYTES), where)
+        data = f"{chosen[: -len(INDEX)]}{DATA}"
+        tensors: Tensors
+        if files.sizes[data] != index.data_bytes:
+            raise BadInput(
+                f"{files.path}/{data}: has {files.sizes[data]:,} bytes; accepted: the {index.data_bytes:,} of its index"
+            )
+        tensors = read_tensors(index, files.read(data, DATA_BYTES), f"{files.path}/{data}")
+    else:
+        tensors = read_weights(where, files.read(chosen, GRAPH_BYTES))
+    found = {name: _nearest(files.sizes, name) for name in SMALL_FILES}
+    small = {name: files.read(at, SETTINGS_BYTES) for name, at in found.items() if at is not None}
+    has_logs = any(map(_LOGS.search, files.sizes))
+    return StoredModel(tensors, where, stem, not whole, small, has_logs, (note,) if note else ())
+
+
+def _is_weights(name: str) -> bool:
+    return name.endswith((INDEX, ".pb"))
+
+
+def _nearest(names: Mapping[str, int], wanted: str) -> str | None:
+    found = [name for name in names if PurePosixPath(name).name == wanted]
+    return min(found, key=lambda name: (name.count("/"), name), default=None)
+
+
+def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, str]:
+    """Return the file with the weights, and a note if it is not the one asked for."""
+    folders = {str(PurePosixPath(name).parent) for name in weights}
+    if len(folders) > 1:
+        raise BadInput(
+            f"{files.path}: holds models in {len(folders)} folders: {', '.join(sorted(folders)[:4])}; accepted: "
+            "the path of one of them"
+        )
+    (folder,) = folders
+    by_stem = {PurePosixPath(name).name.removesuffix(INDEX): name for name in sorted(weights, key=natural)}
+    if len(by_stem) == 1:
+        return weights[0], ""
+
+    def beside(name: str) -> str:
+        return name if folder == "." else f"{folder}/{name}"
+
+    listed: Any = {}
+    if beside(CHECKPOINTS) in files.sizes:
+        raw = files.read(beside(CHECKPOINTS), SETTINGS_BYTES)
+        try:
+            listed = {kind: value["name"] for kind, value in json.loads(raw).items() if value["name"]}
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise BadInput(
+                f"{files.path}/{beside(CHECKPOINTS)}: {error!r}; accepted: the names of best_checkpoint and "
+                "last_checkpoint"
+            ) from error
+    newest = (
+        files.read(beside(NEWEST), SETTINGS_BYTES).decode("utf-8", "replace")
+        if beside(NEWEST) in files.sizes
+        else ""
+    )
+    asked = str(listed.get(f"{checkpoint}_checkpoint", ""))
+    for name in (asked, str(listed.get("last_checkpoint", "")), newest.strip(), list(by_stem)[-1]):
+        # The frozen graph of 11_Step-38428.ckpt is model_11.pb.
+        for stem in (name, f"model_{name.partition('_')[0]}.pb"):
+            if stem in by_stem:
+                same = stem == asked or name == asked
+                what = f"the {checkpoint} checkpoint" + (f", {asked}," if asked else "")
+                return by_stem[stem], "" if same else f"{what} is not among the files: {stem} is used"
+    raise AssertionError("the newest is among them")
+
+
+@contextmanager
+def _opened(path: str) -> Iterator[_Files]:
+    found = Path(path).stat()
+    if stat.S_ISDIR(found.st_mode):
+        yield _folder(path)
+        return
+    if not stat.S_ISREG(found.st_mode):
+        raise BadInput(f"{path}: is neither a file nor a folder; accepted: {_ACCEPTED}")
+    if found.st_size > LOG_BYTES:
+        raise BadInput(f"{path}: is larger than {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}")
+    with Path(path).open("rb") as file:
+        head = file.read(512)
+    if head.startswith(b"PK"):
+        with zipfile.ZipFile(path) as packed:
+            yield _zip(path, packed)
+    elif head.startswith(b"\x1f\x8b") or head[257:262] == b"ustar":
+        with closing(tarfile.open(path, "r:gz" if head[0] == 0x1F else "r:", tarinfo=_Member)) as archive:
+            yield _tar(path, archive)
+    else:
+        raise BadInput(f"{path}: is no archive; accepted: {_ACCEPTED}")
+
+
+class _Listing:
+    """The files found so far; refuses what would lead out of a folder or not come to an end."""
+
+    def __init__(self, path: str, most_bytes: float = LOG_BYTES) -> None:
+        self.path, self._most_bytes = path, most_bytes
+        self.sizes: dict[str, int] = {}
+        self.given: dict[str, str] = {}
+        """Names as they stand in an archive."""
+        self._total = 0
+
+    def add(self, name: str, size: int) -> None:
+        parts = PurePosixPath(name.replace("\\", "/"))
+        if parts.is_absolute() or ".." in parts.parts or re.match(r"[A-Za-z]:", name):
+            raise BadInput(f"{self.path}: {name}: leads out of the archive; accepted: {_ACCEPTED}")
+        self._total += size
+        if len(self.sizes) >= _MOST_FILES or self._total > self._most_bytes:
+            raise BadInput(
+                f"{self.path}: holds more than {_MOST_FILES:,} files or {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}"
+            )
+        self.sizes[parts.as_posix()] = size
+        self.given[parts.as_posix()] = name
+
+    def files(self, opener: Callable[[str], IO[bytes]]) -> _Files:
+        """Return the files; `opener` takes the names as they were added."""
+        return _Files(self.path, self.sizes, lambda name: opener(self.given[name]))
+
+
+def _folder(path: str) -> _Files:
+    """List the files of a folder; links are not followed."""
+    listing = _Listing(path, math.inf)
+    for folder, _, names in os.walk(path):
+        for name in names:
+            file = Path(folder, name)
+            found = file.lstat()
+            if stat.S_ISREG(found.st_mode):
+                listing.add(file.relative_to(path).as_posix(), found.st_size)
+    return listing.files(lambda name: Path(path, name).open("rb"))
+
+
+def _zip(path: str, packed: zipfile.ZipFile) -> _Files:
+    listing = _Listing(path)
+    for member in packed.infolist():
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise _link(path, member.filename)
+        if not member.is_dir():
+            listing.add(member.filename, member.file_size)
+    return listing.files(packed.open)
+
+
+def _tar(path: str, archive: tarfile.TarFile) -> _Files:
+    listing = _Listing(path)
+    members: dict[str, tarfile.TarInfo] = {}
+    while (member := archive.next()) is not None:
+        if member.islnk() or member.issym():
+            raise _link(path, member.name)
+        if member.isfile():
+            listing.add(member.name, member.size)
+            members[member.name] = member  # the later one counts, as in unpacking
+        elif not member.isdir():
+            raise BadInput(f"{path}: {member.name}: is no file; accepted: {_ACCEPTED}")
+
+    def opened(name: str) -> IO[bytes]:
+        stream = archive.extractfile(members[name])
+        assert stream is not None
+        return stream
+
+    return listing.files(opened)
+
+
+def _link(path: str, name: str) -> BadInput:
+    return BadInput(f"{path}: {name}: is a link; accepted: archives of files alone")
+
+
+class _Member(tarfile.TarInfo):
+    """Refuses long names and attributes that tarfile would read into memory whatever their size."""
+
+    def _proc_member(self, archive: tarfile.TarFile) -> Any:
+        if self.type not in tarfile.SUPPORTED_TYPES or (
+            self.type not in tarfile.REGULAR_TYPES and self.size > _HEADER_BYTES
+        ):
+            raise BadInput(f"{archive.name!s}: a header of {self.size:,} bytes; accepted: {_ACCEPTED}")
+        return super()._proc_member(archive)  # type: ignore[misc]

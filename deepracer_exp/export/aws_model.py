@@ -1,0 +1,163 @@
+"""A policy as a pretrained model that deepracer-for-cloud clones and deepracer-on-aws imports."""
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+import yaml
+
+from deepracer_exp.agents.actor_critic import ActorCritic, SensorNet, build_actor_critic
+from deepracer_exp.agents.service_weights import to_service
+from deepracer_exp.config.compose import compose_option
+from deepracer_exp.config.custom_files import services_network
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import CNNConfig
+from deepracer_exp.deepracer.model_archive import CHECKPOINTS, NEWEST
+from deepracer_exp.deepracer.model_metadata import (
+    LIDARS,
+    NEURAL_NETWORKS,
+    ModelMetadata,
+    model_metadata_text,
+    read_model_metadata,
+)
+from deepracer_exp.deepracer.protobuf import field
+from deepracer_exp.deepracer.tf_checkpoint import DATA, INDEX, META, write_checkpoint
+from deepracer_exp.deepracer.worlds import find_world
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.checkpoints import StoredPolicy
+from deepracer_exp.tracks.track import Track
+
+from .aws_files import aws_files
+
+_PIXELS = 160, 120
+_LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
+_EMPTY_GRAPH = field(2, field(4, field(1, 27)))
+"""A MetaGraphDef whose graph has no nodes; the service wants the file and reads nothing of it when it restores."""
+
+
+def aws_model(
+    experiment: Experiment, stored: StoredPolicy, reward: str, score: float | None
+) -> tuple[dict[str, bytes], list[str]]:
+    """Return the contents of a model's files by name, and notes.
+
+    Args:
+        experiment: of the run.
+        stored: its checkpoint.
+        reward: text of the reward function, with its constants filled in.
+        score: mean progress of its evaluation in per cent, None if it was not evaluated.
+
+    Raises:
+        BadInput: the service has no such network or sensors.
+    """
+    texts, notes = aws_files(experiment, build_action_space(experiment.action_space), reward)
+    metadata = read_model_metadata("model_metadata.json", texts["model_metadata.json"].encode())
+    _refuse_other_sensors(experiment, metadata)
+    networks, note = _with_value(experiment, stored.networks)
+    tensors = to_service(networks, metadata.sensor)
+    metadata = replace(metadata, neural_network=_kind(experiment, metadata))
+    texts["model_metadata.json"] = model_metadata_text(metadata)
+    texts["training_params.yaml"], unknown = _training_params(experiment)
+    name = f"{stored.counters['iteration']}_Step-{stored.counters['env_steps']}.ckpt"
+    evaluated = {"name": name, "avg_eval_metric": score, "time_stamp": time.time()}
+    texts[f"model/{CHECKPOINTS}"] = json.dumps({"last_checkpoint": evaluated, "best_checkpoint": evaluated})
+    texts[f"model/{NEWEST}"] = name
+    # Where deepracer-for-cloud looks for it.
+    texts["model/model_metadata.json"] = texts["model_metadata.json"]
+    index, data = write_checkpoint(tensors)
+    files = {file: text.encode() for file, text in texts.items()}
+    files |= {
+        f"model/{name}{ending}": content
+        for ending, content in ((INDEX, index), (DATA, data), (META, _EMPTY_GRAPH))
+    }
+    return files, [*note, *unknown, *notes]
+
+
+def _refuse_other_sensors(experiment: Experiment, metadata: ModelMetadata) -> None:
+    camera, lidar = experiment.observation.camera, experiment.observation.lidar
+    if camera is None:
+        raise BadInput(
+            "observation: has no camera, and models of the service see through one; accepted: a run with "
+            "observation=camera, stereo or camera_lidar"
+        )
+    if (camera.width, camera.height) != _PIXELS:
+        raise BadInput(
+            f"observation.camera: {camera.width}x{camera.height}; accepted: {_PIXELS[0]}x{_PIXELS[1]}, which the "
+            "service's models see (observation=camera)"
+        )
+    if lidar is None:
+        return
+    services = replace(lidar, reach_m=None).furthest_m
+    if LIDARS[2] not in metadata.sensor and lidar.furthest_m != services:
+        raise BadInput(
+            f"observation.lidar.reach_m={lidar.furthest_m:g}: accepted: {services:g}, which the service's LIDAR "
+            "of this kind sees"
+        )
+    if abs(lidar.yaw_deg) != 180:
+        raise BadInput(
+            f"observation.lidar.yaw_deg={lidar.yaw_deg:g}: accepted: 180, as the service mounts it"
+        )
+
+
+def _kind(experiment: Experiment, metadata: ModelMetadata) -> str:
+    """Return the service's name of the network.
+
+    Raises:
+        BadInput: it has none.
+    """
+    network = experiment.network
+    assert isinstance(network, CNNConfig)
+    own = {
+        key: getattr(network, key) for key in _LAYERS if key != "lidar_hidden" or experiment.observation.lidar
+    }
+    options = []
+    for kind in NEURAL_NETWORKS:
+        option, values = services_network(replace(metadata, neural_network=kind))
+        services = vars(compose_option("network", option, CNNConfig)) | values
+        if all(list(value) == list(services[key]) for key, value in own.items()):
+            return kind
+        options.append(
+            f"network={option}" + "".join(f" network.{key}={value}" for key, value in values.items())
+        )
+    shown = ", ".join(f"{key}={list(value)}" for key, value in own.items())
+    raise BadInput(f"network: {shown}: the service builds no such network; accepted: {'; or '.join(options)}")
+
+
+def _with_value(experiment: Experiment, networks: ActorCritic) -> tuple[ActorCritic, list[str]]:
+    """Return networks both of which see pictures, and a note if the value network is a new one."""
+    network = experiment.network
+    if not isinstance(network, CNNConfig) or network.critic == "pictures":
+        return networks, []
+    fresh = build_actor_critic(
+        replace(network, critic="pictures"),
+        observation_shape(experiment.observation),
+        build_action_space(experiment.action_space).n,
+        torch.Generator().manual_seed(experiment.seed),
+    )
+    assert isinstance(fresh.value_head.module, SensorNet)
+    return ActorCritic(networks.policy_head, fresh.value_head), [
+        "value network: the run's sees features, which the service does not have, so that a new one is written: the "
+        "policy races as it does here, but a training on the service has to learn the values first"
+    ]
+
+
+def _training_params(experiment: Experiment) -> tuple[str, list[str]]:
+    """Return what deepracer-on-aws reads of a training's parameters, and a note if the track is not the service's."""
+    name, config = next(iter(experiment.tracks.items()))
+    world, notes = None if config.file else find_world(name), list[str]()
+    if world is None:
+        world = "reinvent_base"
+        notes = [f"training_params.yaml: WORLD_NAME={world}, because {name} is no track of the service"]
+    x, y = Track.from_config(config, config.direction == "reversed").waypoints.T
+    signed_area = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
+    values = {
+        "WORLD_NAME": world,
+        "RACE_TYPE": "TIME_TRIAL",
+        "TRACK_DIRECTION_CLOCKWISE": bool(signed_area < 0),
+        "BODY_SHELL_TYPE": "deepracer",
+        "CAR_COLOR": "White",
+    }
+    return yaml.safe_dump(values, sort_keys=False), notes

@@ -1,0 +1,190 @@
+"""A model that was trained with the service, as a run of our own."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
+from deepracer_exp.agents.service_weights import VALUE, from_service, match_service
+from deepracer_exp.config.compose import Composition, compose_experiment, compose_option
+from deepracer_exp.config.custom_files import (
+    KEY,
+    PLACES,
+    CustomFiles,
+    import_files,
+    network_overrides,
+    read_custom_files,
+    remove_options,
+    sensor_overrides,
+    services_network,
+)
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import CNNConfig
+from deepracer_exp.config.overrides import override_line
+from deepracer_exp.deepracer.model_archive import StoredModel, read_model
+from deepracer_exp.deepracer.model_metadata import NEURAL_NETWORKS, ModelMetadata
+from deepracer_exp.deepracer.worlds import find_world
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_yaml
+from deepracer_exp.rewards.source import load_reward_source
+
+from .run import store_run
+
+_CHECKPOINT = "checkpoint="
+_CHOSEN_HERE = tuple(f"model_metadata.json: {key}" for key in ("sensor", "neural_network", "lidar_config"))
+"""Remarks on keys that have no effect where only options are made of the files."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What a model became."""
+
+    folder: Path
+    """Of the run."""
+    options: list[Path]
+    """Files written to `./conf`."""
+    notes: list[str]
+    has_logs: bool
+
+
+def import_model(path: str, name: str, overrides: Sequence[str]) -> Imported:
+    """Make a run and options of a model of the service; nothing of it is run.
+
+    Args:
+        path: of its folder or archive.
+        name: of the experiment and the options.
+        overrides: of the experiment, and `checkpoint=best` or `last`, of the service's.
+
+    Raises:
+        BadInput: there is no model, it cannot be used here, or the run cannot be written; nothing is left.
+    """
+    given = [one.removeprefix(_CHECKPOINT) for one in overrides if one.startswith(_CHECKPOINT)]
+    changes = [one for one in overrides if not one.startswith(_CHECKPOINT)]
+    wanted = given[-1] if given else "best"
+    if wanted not in ("best", "last"):
+        raise BadInput(
+            f"checkpoint={wanted}: accepted: best, last (of the service's deepracer_checkpoints.json)"
+        )
+    model = read_model(path, wanted)
+    with tempfile.TemporaryDirectory() as aside:
+        for file in PLACES:
+            if file in model.files:
+                Path(aside, file).write_bytes(model.files[file])
+        try:
+            return _import(model, path, aside, name, changes)
+        except BadInput as error:
+            raise BadInput(str(error).replace(f"{KEY} {aside}", path).replace(aside, path)) from error
+
+
+def _import(model: StoredModel, path: str, aside: str, name: str, changes: Sequence[str]) -> Imported:
+    if "model_metadata.json" not in model.files:
+        raise BadInput(
+            f"{path}: holds no model_metadata.json, which says what the policy sees and does; put it beside the weights"
+        )
+    files = read_custom_files(aside)
+    assert files.metadata is not None
+    world = _world(model, path)
+    seen = [*sensor_overrides(files.metadata), *([override_line("track", world)] if world else [])]
+    experiment, composition, networks, network, absent = _fit(model, files, seen, name, changes)
+    load_reward_source(experiment.reward)
+    options = import_files(files, name, composition.mapping, [*network, *seen], path)
+    try:
+        experiment, composition = compose_experiment([f"experiment={name}", *changes])
+        result = store_run(experiment, composition, networks, f"imported from {model.source}")
+    except BaseException:
+        remove_options(options)
+        raise
+    notes = [f"{model.source}: {', '.join([*seen, *network])}", *model.notes]
+    notes += [*_absent(absent), *_remarks(files, model, world)]
+    return Imported(result.folder, options, notes, model.has_logs)
+
+
+def _fit(
+    model: StoredModel, files: CustomFiles, seen: Sequence[str], name: str, changes: Sequence[str]
+) -> tuple[Experiment, Composition, ActorCritic, list[str], list[str]]:
+    """Return the experiment with the one of the service's networks that the weights are of, and what is absent."""
+    metadata, refused = files.metadata, None
+    assert metadata is not None
+    for kind in _kinds(metadata, model):
+        network = network_overrides(replace(metadata, neural_network=kind))
+        lines = [override_line(KEY, files.folder), *seen, *network, override_line("name", name), *changes]
+        experiment, composition = compose_experiment(lines)
+        if not isinstance(experiment.network, CNNConfig):
+            raise BadInput("network: the weights are of a network of the service; leave network= off")
+        shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
+        try:
+            with torch.device("meta"):  # of shapes alone: that of a model may be of gigabytes
+                networks = build_actor_critic(experiment.network, *shapes, None)
+            absent = match_service(model.tensors, networks, metadata.sensor, model.source)[1]
+        except BadInput as error:
+            refused = refused or error
+            continue
+        if absent:
+            generator = torch.Generator().manual_seed(experiment.seed)
+            networks = build_actor_critic(experiment.network, *shapes, generator)
+        else:
+            networks.to_empty(device="cpu")
+        from_service(model.tensors, networks, metadata.sensor, model.source)
+        return experiment, composition, networks, network, absent
+    assert refused is not None
+    raise refused
+
+
+def _kinds(metadata: ModelMetadata, model: StoredModel) -> Iterator[str]:
+    """Yield the network that the metadata names, then those with the model's convolutions."""
+    yield metadata.neural_network
+    held = sorted(
+        value.shape for name, value in model.tensors.items() if value.ndim == 4 and "/network_1/" in name
+    )
+    for kind in NEURAL_NETWORKS:
+        option, values = services_network(replace(metadata, neural_network=kind))
+        layers = vars(compose_option("network", option, CNNConfig)) | values
+        inputs = [2 if "STEREO_CAMERAS" in metadata.sensor else 1, *layers["filters"]]
+        built = zip(layers["kernels"], layers["kernels"], inputs, layers["filters"], strict=False)
+        if kind != metadata.neural_network and sorted(shape for shape in built if shape[0] > 1) == held:
+            yield kind
+
+
+def _world(model: StoredModel, path: str) -> str | None:
+    """Return the track of the training, None if it is not known."""
+    raw = model.files.get("training_params.yaml")
+    if raw is None:
+        return None
+    params = read_yaml(f"{path}/training_params.yaml", "parameters of a training, KEY: VALUE", raw=raw)
+    world = params.get("WORLD_NAME") if isinstance(params, dict) else None
+    # One for each worker.
+    first = world[0] if isinstance(world, list) and world else world
+    return find_world(first) if isinstance(first, str) else None
+
+
+def _absent(absent: Sequence[str]) -> list[str]:
+    notes = []
+    if VALUE in absent:
+        notes.append(
+            "a frozen graph holds the policy alone: the value network starts fresh, and a clone first learns it with a "
+            "policy that is good already"
+        )
+    if any(name != VALUE for name in absent):
+        notes.append(
+            "a frozen graph holds no standard deviation of the actions: it starts at network.initial_std"
+        )
+    return notes
+
+
+def _remarks(files: CustomFiles, model: StoredModel, world: str | None) -> list[str]:
+    notes = [one for one in files.remarks() if not one.startswith(_CHOSEN_HERE)]
+    if "reward_function.py" not in model.files:
+        notes.append(
+            "reward_function.py: not among the files; clones learn from the default reward unless given reward="
+        )
+    notes.append(
+        f"training_params.yaml: track={world}"
+        if world
+        else "the track of the training is not known: the default is used; track=NAME chooses another"
+    )
+    return notes

@@ -1,0 +1,361 @@
+"""A model of the service becomes a run like any other, and a damaged one becomes nothing."""
+
+import gzip
+import io
+import json
+import random
+import tarfile
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.service_weights import POLICY, VALUE, to_service
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.model_archive import read_model
+from deepracer_exp.deepracer.tf_checkpoint import write_checkpoint
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.resolve import StoredRun
+
+NAME = "11_Step-38428.ckpt"
+INDEX, DATA = f"model/{NAME}.index", f"model/{NAME}.data-00000-of-00001"
+SENSORS = ("FRONT_FACING_CAMERA",)
+METADATA = {
+    "action_space": [{"steering_angle": angle, "speed": 1.5} for angle in (-30, -15, 0, 15, 30)],
+    "sensor": list(SENSORS),
+    "neural_network": "DEEP_CONVOLUTIONAL_NETWORK_DEEP",  # the smallest file
+    "version": "4",
+}
+# Whoever runs it leaves a file.
+REWARD = "open('it_was_run', 'w')\n\n\ndef reward_function(params):\n    return 1.0\n"
+SMALL = {
+    "reward_function.py": REWARD.encode(),
+    "model_metadata.json": json.dumps(METADATA).encode(),
+    "ip/hyperparameters.json": b'{"lr": 0.0002, "batch_size": 32}',
+    "training_params.yaml": b"WORLD_NAME: Oval_track\n",
+    "training-simtrace/0-iteration.csv": b"episode,steps\n",
+}
+
+
+@pytest.fixture(scope="module")
+def networks():
+    experiment, _ = compose_experiment(["observation=camera", "network=deep"])
+    shape = observation_shape(experiment.observation)
+    return build_actor_critic(experiment.network, shape, 5, torch.Generator().manual_seed(1))
+
+
+@pytest.fixture(scope="module")
+def weights(networks):
+    return to_service(networks, SENSORS)
+
+
+def files_of(tensors):
+    index, data = write_checkpoint(tensors)
+    return {INDEX: index, DATA: data} | SMALL
+
+
+def write_folder(folder, files):
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def tar_of(files, *members):
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz", compresslevel=1) as archive:
+        for member in members:
+            archive.addfile(member)
+        for name, content in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    return packed.getvalue()
+
+
+def zip_of(files):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return packed.getvalue()
+
+
+def test_a_model_becomes_a_run_and_nothing_of_it_is_run(call, tmp_path, networks, weights):
+    write_folder(tmp_path / "sent", files_of(weights))
+    ended = call("import", "sent", "--name", "mine", "tracking=off", "seed=3")
+    assert ended.code == 0, ended.stderr
+    assert not list(tmp_path.rglob("it_was_run"))
+    assert f"deepracer-exp clone {ended.folder.name}" in ended.stdout
+    assert "deepracer-exp analyze sent" in ended.stdout
+    run = StoredRun(ended.folder)
+    experiment = run.experiment
+    assert (experiment.name, experiment.seed, list(experiment.tracks)) == ("mine", 3, ["Oval_track"])
+    assert experiment.observation.camera.shape == (1, 120, 160)
+    assert (experiment.algorithm.lr, experiment.algorithm.batch_size) == (2e-4, 32)
+    assert build_action_space(experiment.action_space).n == 5
+    for checkpoint in ("best", "last"):
+        found = read_checkpoint(experiment, run.checkpoints, checkpoint).networks.state_dict()
+        assert all(torch.equal(value, found[name]) for name, value in networks.state_dict().items())
+    assert ended.summary["reason"] == f"imported from sent/{INDEX}"
+    assert (tmp_path / "conf/reward/mine.py").read_text() == REWARD
+    refused = call("import", "sent", "--name", "mine", "tracking=off")
+    assert refused.code == 2
+    assert "exists already" in refused.complaint
+    assert len(list(tmp_path.glob("runs/mine/*"))) == 1
+
+
+@pytest.mark.parametrize("pack", [tar_of, zip_of, None], ids=["tar.gz", "zip", "folder"])
+def test_an_archive_holds_what_the_folder_does(tmp_path, pack):
+    tensors = {"a/kernel": np.arange(6, dtype=np.float32).reshape(2, 3), "b/bias": np.ones(4, np.float32)}
+    files = {f"prefix/{name}": content for name, content in files_of(tensors).items()}
+    if pack is None:
+        path = write_folder(tmp_path / "model", files)
+    else:
+        path = tmp_path / "model.archive"
+        path.write_bytes(pack(files))
+    model = read_model(str(path), "best")
+    assert {name: value.tolist() for name, value in model.tensors.items()} == {
+        name: value.tolist() for name, value in tensors.items()
+    }
+    assert (model.name, model.is_graph, model.has_logs) == (NAME, False, True)
+    assert model.files["hyperparameters.json"] == SMALL["ip/hyperparameters.json"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "chosen", "note"),
+    [
+        ("best", (3, 7, 9), 7, None),
+        ("last", (3, 7, 9), 9, None),
+        (
+            "best",
+            (3, 9),
+            9,
+            "the best checkpoint, 7_Step-70.ckpt, is not among the files: 9_Step-90.ckpt is used",
+        ),
+    ],
+)
+def test_the_best_checkpoint_is_taken_unless_the_last_is_asked_for(tmp_path, asked, there, chosen, note):
+    files = {}
+    for number in there:
+        index, data = write_checkpoint({"a/bias": np.full(1, number, np.float32)})
+        stem = f"model/{number}_Step-{10 * number}.ckpt"
+        files |= {f"{stem}.index": index, f"{stem}.data-00000-of-00001": data}
+    names = {"best_checkpoint": {"name": "7_Step-70.ckpt"}, "last_checkpoint": {"name": "9_Step-90.ckpt"}}
+    files["model/deepracer_checkpoints.json"] = json.dumps(names).encode()
+    model = read_model(str(write_folder(tmp_path / "model", files)), asked)
+    assert model.tensors["a/bias"].item() == chosen
+    assert model.notes == ((note,) if note else ())
+
+
+def _without(weights, name):
+    return {key: value for key, value in weights.items() if key != name}
+
+
+def _header(name, kind=tarfile.REGTYPE, size=0, link=""):
+    member = tarfile.TarInfo(name)
+    member.type, member.linkname = kind, link
+    packed = member.tobuf()
+    if size:
+        member.size = size
+        packed = member.tobuf(tarfile.GNU_FORMAT)
+    return packed
+
+
+def damaged(kind, seed, weights):
+    """Return an archive with one fault."""
+    chance = random.Random(seed)
+    name = chance.choice([one for one in weights if "rescalers" not in one and "Dense_0/kernel" not in one])
+    files = files_of(weights)
+    if kind == "truncated archive":
+        whole = tar_of(files)
+        return whole[: int(len(whole) * chance.uniform(0.01, 0.9))]
+    if kind == "truncated data":
+        files[DATA] = files[DATA][: chance.randrange(len(files[DATA]))]
+    elif kind == "a flipped bit":
+        at = chance.randrange(len(files[DATA]))
+        files[DATA] = (
+            files[DATA][:at] + bytes([files[DATA][at] ^ 1 << chance.randrange(8)]) + files[DATA][at + 1 :]
+        )
+    elif kind == "a flipped bit in the index":
+        at = chance.randrange(len(files[INDEX]) - 48)
+        raw = bytearray(files[INDEX])
+        raw[at] ^= 1 << chance.randrange(8)
+        files[INDEX] = bytes(raw)
+    elif kind == "a link":
+        member = tarfile.TarInfo(chance.choice([DATA, "model/other", "reward_function.py"]))
+        member.type, member.linkname = chance.choice([tarfile.SYMTYPE, tarfile.LNKTYPE]), "/etc/passwd"
+        return tar_of(files, member)
+    elif kind == "a path that leads out":
+        files[chance.choice(["/tmp/x", "../x", "model/../../x", "..\\x", "C:\\x"])] = b"x"
+        return chance.choice([tar_of, zip_of])(files)
+    elif kind == "a promise of terabytes":
+        return gzip.compress(_header("model/big", size=chance.randrange(2**33, 2**40)))
+    elif kind == "a name of gigabytes":
+        return gzip.compress(_header("x", chance.choice([b"x", b"L", b"g"]), size=2**31) + bytes(2**20))
+    elif kind == "a bomb":
+        files["model_metadata.json"] = bytes(2**26)
+        return chance.choice([tar_of, zip_of])(files)
+    elif kind == "a wrong shape":
+        value = weights[name]
+        files |= files_of(weights | {name: np.concatenate([value, value[:1]])})
+    elif kind == "a weight that is not a number":
+        value = weights[name].copy()
+        value.flat[chance.randrange(value.size)] = chance.choice([np.nan, np.inf, -np.inf])
+        files |= files_of(weights | {name: value})
+    elif kind == "a foreign tensor":
+        files |= files_of(weights | {f"{name}_of_others": np.zeros(chance.randrange(1, 9), np.float32)})
+    elif kind == "a missing tensor":
+        files |= files_of(_without(weights, name))
+    elif kind == "other metadata":
+        changes = {"sensor": ["STEREO_CAMERAS"]}, {"action_space": METADATA["action_space"][:4]}
+        sac = {"training_algorithm": "sac"}
+        others = [json.dumps(METADATA | change).encode() for change in (*changes, sac)]
+        other = chance.choice([b"{", b"[]", b"\xff\xfe", *others])
+        files["model_metadata.json"] = other
+    else:
+        assert kind == "other files"
+        del files[chance.choice([DATA, INDEX, "model_metadata.json"])]
+    return tar_of(files)
+
+
+KINDS = [
+    *("truncated archive", "truncated data", "a flipped bit", "a flipped bit in the index", "a link"),
+    *("a path that leads out", "a promise of terabytes", "a name of gigabytes", "a bomb", "a wrong shape"),
+    *(
+        "a weight that is not a number",
+        "a foreign tensor",
+        "a missing tensor",
+        "other metadata",
+        "other files",
+    ),
+]
+
+
+def assert_refused(call, tmp_path, content):
+    (tmp_path / "model.tar.gz").write_bytes(content)
+    ended = call("import", "model.tar.gz", "--name", "mine", "tracking=off")
+    assert ended.code == 2, ended.stderr
+    assert ended.complaint.startswith("deepracer-exp: ")
+    assert "model" in ended.complaint
+    assert "/tmp/tmp" not in ended.complaint
+    assert ended.stdout == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["model.tar.gz"]
+
+
+@pytest.fixture(scope="module")
+def light(weights):
+    """Weights that are packed in no time."""
+    return {name: np.zeros_like(value) for name, value in weights.items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_archive_is_refused_in_one_line_and_leaves_nothing(call, tmp_path, light, kind):
+    assert_refused(call, tmp_path, damaged(kind, 0, light))
+
+
+@pytest.mark.slow
+def test_two_hundred_damaged_archives_are_refused_within_bounded_memory(call, tmp_path, light):
+    packed = sum(value.nbytes for value in light.values())
+    for number in range(200):
+        content = damaged(KINDS[number % len(KINDS)], number, light)
+        tracemalloc.start()
+        assert_refused(call, tmp_path, content)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2 * packed + 2**26, f"{KINDS[number % len(KINDS)]}: {peak / 2**20:.0f} MiB"
+
+
+def actions(networks, frames):
+    for module in networks.modules():
+        if hasattr(module, "matrix_units"):
+            module.matrix_units = False
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        return torch.cat(
+            [networks.policy(TensorDict({"pixels": part}, [len(part)]))["action"] for part in frames]
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("space", ["discrete", "continuous"])
+def test_a_policy_that_goes_there_and_back_acts_the_same(call, space):
+    trained = call(
+        *("train", "experiment=tiny", "tracking=off", "observation=camera", "network=deep", "name=here"),
+        *(f"action_space={space}", "collector=in_process", "budget.env_steps=256", "collector.cars=4"),
+        *("algorithm.frames_per_iteration=128", "algorithm.batch_size=64", "track=Oval_track"),
+    )
+    assert trained.code == 0, trained.stderr
+    here = trained.folder
+    assert call("export", str(here), "format=aws-model", "checkpoint=last", "-o", "sent").code == 0
+    back = call("import", "sent", "--name", "there", "tracking=off")
+    assert back.code == 0, back.stderr
+    (there,) = trained.cwd.glob("runs/there/*")
+    policies = [
+        read_checkpoint(StoredRun(folder).experiment, folder / "checkpoints", "last").networks
+        for folder in (here, there)
+    ]
+    generator = torch.Generator().manual_seed(0)
+    frames = [
+        torch.randint(0, 256, (100, 1, 120, 160), generator=generator, dtype=torch.uint8) for _ in range(10)
+    ]
+    assert torch.equal(actions(policies[0], frames), actions(policies[1], frames))
+    assert call("export", str(there), "format=aws-model", "-o", "again").code == 0
+    for ending in ("index", "data-00000-of-00001"):
+        (sent,), (again,) = (
+            list((trained.cwd / name).glob(f"model/*.{ending}")) for name in ("sent", "again")
+        )
+        assert sent.read_bytes() == again.read_bytes()
+    raced = call("evaluate", str(there), "evaluation=three_trials")
+    assert raced.code == 0, raced.stderr
+    small = ("collector=in_process", "collector.cars=4", "stopping=none", "report=false", "tracking=off")
+    cloned = call(
+        *("clone", str(there), "budget.env_steps=64", "algorithm.frames_per_iteration=64", *small),
+        *(
+            "algorithm.episodes_per_iteration=null",
+            "algorithm.batch_size=64",
+            "algorithm.epochs=1",
+            "name=further",
+        ),
+    )
+    assert cloned.code == 0, cloned.stderr
+    (further,) = trained.cwd.glob("runs/further/*")
+    rates = [StoredRun(folder).experiment.algorithm.lr for folder in (there, further)]
+    assert rates[1] == pytest.approx(rates[0] / 10)
+    begun, then = (folder / "checkpoints" for folder in (there, further))
+    before = read_checkpoint(StoredRun(there).experiment, begun, "last").networks.state_dict()
+    after = read_checkpoint(StoredRun(further).experiment, then, "last").networks.state_dict()
+    moved = [(after[name] - before[name]).abs().max().item() for name in before]
+    assert 0 < max(moved) < 0.01, "both trunks begin where the parent's are"
+
+
+def test_a_run_that_the_service_has_no_network_for_is_refused(trained, call):
+    ended = call("export", str(trained().folder), "format=aws-model")
+    assert ended.code == 2
+    assert "observation: has no camera" in ended.complaint
+
+
+def test_of_a_frozen_graph_the_value_network_starts_fresh(call, tmp_path, weights, networks):
+    from deepracer_exp.deepracer.graph_def import policy_graph
+
+    policy = {name: value for name, value in weights.items() if name.startswith(POLICY)}
+    graph = policy_graph(policy, {SENSORS[0]: (120, 160, 1)}, (4, 2, 2, 1))
+    write_folder(
+        tmp_path / "car", {"agent/model.pb": graph, "model_metadata.json": SMALL["model_metadata.json"]}
+    )
+    ended = call("import", "car", "--name", "mine", "tracking=off")
+    assert ended.code == 0, ended.stderr
+    assert "the value network starts fresh" in ended.stderr
+    run = StoredRun(ended.folder)
+    found = to_service(read_checkpoint(run.experiment, run.checkpoints, "best").networks, SENSORS)
+    assert all(np.array_equal(found[name], value) for name, value in policy.items())
+    assert not np.array_equal(
+        found[f"{VALUE}/middleware_fc_embedder/Dense_0/kernel"],
+        weights[f"{VALUE}/middleware_fc_embedder/Dense_0/kernel"],
+    )
