@@ -68,9 +68,7 @@ _IMPORT_EPILOG = """\
 
 
 def _import(args: argparse.Namespace) -> int:
-    from deepracer_exp.deepracer.model_archive import holds_model
-
-    if holds_model(args.path):
+    if _holds_model(args.path):
         return _import_model(args)
     if args.overrides:
         raise BadInput(f"{args.overrides[0]}: {args.path} holds no model; accepted for one: KEY=VALUE")
@@ -89,6 +87,12 @@ def _import(args: argparse.Namespace) -> int:
         print(path)
     print(f"\n  train it  deepracer-exp train experiment={args.name}")
     return 0
+
+
+def _holds_model(path: str) -> bool:
+    """Return whether a path is a file, or a folder with weights in it."""
+    names = (name for _, _, names in os.walk(path) for name in names)
+    return Path(path).is_file() or any(name.endswith((".index", ".pb")) for name in names)
 
 
 def _import_model(args: argparse.Namespace) -> int:

@@ -80,11 +80,6 @@ class _Files:
         return raw
 
 
-def holds_model(path: str) -> bool:
-    """Return whether a path is a file, or a folder with weights in it."""
-    return Path(path).is_file() or any(_is_weights(name) for _, _, names in os.walk(path) for name in names)
-
-
 def read_model(path: str, checkpoint: str) -> StoredModel:
     """Read the weights of a model and the files beside them.
 
@@ -134,7 +129,7 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
 
 
 def _is_weights(name: str) -> bool:
-    return name.endswith((INDEX, ".pb"))
+    return name.endswith((INDEX, ".pb"))  # as in `commands.files`
 
 
 def _nearest(names: Mapping[str, int], wanted: str) -> str | None:

@@ -68,3 +68,9 @@ def test_what_a_run_does_not_have_is_refused(trained, call, arguments, words):
     ended = call("export", str(trained().folder), *arguments)
     assert ended.code == 2
     assert words in ended.complaint
+
+
+def test_a_run_that_the_service_has_no_network_for_is_refused(trained, call):
+    ended = call("export", str(trained().folder), "format=aws-model")
+    assert ended.code == 2
+    assert "observation: has no camera" in ended.complaint

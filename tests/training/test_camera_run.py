@@ -31,7 +31,10 @@ CAMERA = (
         (),
         ("network.critic=pictures", "action_space=continuous"),
         ("network.critic=pictures", "network.shared_trunk=true", "observation.camera.color=rgb"),
-        ("observation=stereo", "network=medium", "budget.env_steps=512"),
+        (
+            *("observation=stereo", "network=medium", "budget.env_steps=512"),
+            *("observation.camera.width=80", "observation.camera.height=60"),
+        ),
         ("observation=camera", "network=deep", "observation.camera.frames=2", "budget.env_steps=512"),
         ("observation=lidar", "network.critic=pictures", "observation.lidar.kind=sectors"),
         (

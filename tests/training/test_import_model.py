@@ -256,7 +256,8 @@ def light(weights):
     return {name: np.zeros_like(value) for name, value in weights.items()}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+# Those of weights are in the tests of agents.service_weights as well.
+@pytest.mark.parametrize("kind", [*KINDS[:9], "a foreign tensor", "other files"])
 def test_a_damaged_archive_is_refused_in_one_line_and_leaves_nothing(call, tmp_path, light, kind):
     assert_refused(call, tmp_path, damaged(kind, 0, light))
 
@@ -333,12 +334,6 @@ def test_a_policy_that_goes_there_and_back_acts_the_same(call, space):
     after = read_checkpoint(StoredRun(further).experiment, then, "last").networks.state_dict()
     moved = [(after[name] - before[name]).abs().max().item() for name in before]
     assert 0 < max(moved) < 0.01, "both trunks begin where the parent's are"
-
-
-def test_a_run_that_the_service_has_no_network_for_is_refused(trained, call):
-    ended = call("export", str(trained().folder), "format=aws-model")
-    assert ended.code == 2
-    assert "observation: has no camera" in ended.complaint
 
 
 def test_of_a_frozen_graph_the_value_network_starts_fresh(call, tmp_path, weights, networks):
