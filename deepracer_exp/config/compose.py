@@ -114,7 +114,9 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     composition = compose_entry("export", overrides)
     _require_run(composition)
     if composition.mapping["format"] is None:
-        raise BadInput("format: missing; write format=onnx, format=car, format=aws, format=aws-model or format=aws-logs")
+        raise BadInput(
+            "format: missing; write format=onnx, format=car, format=aws, format=aws-model or format=aws-logs"
+        )
     return parse_config(composition.mapping, ExportConfig), composition
 
 

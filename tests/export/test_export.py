@@ -42,7 +42,10 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
     ("arguments", "words"),
     [
         (["format=onnx"], "RUN: missing"),
-        (["nowhere"], "format: missing; write format=onnx, format=car, format=aws, format=aws-model or format=aws-logs"),
+        (
+            ["nowhere"],
+            "format: missing; write format=onnx, format=car, format=aws, format=aws-model or format=aws-logs",
+        ),
         (["nowhere", "format=onnx"], "nowhere: no such run"),
         (["nowhere", "format=coreml"], 'format="coreml"'),
         (
