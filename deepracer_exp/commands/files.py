@@ -97,6 +97,7 @@ def _holds_model(path: str) -> bool:
 
 def _import_model(args: argparse.Namespace) -> int:
     import shlex
+    import zipfile
 
     from deepracer_exp.training.import_model import import_model
 
@@ -107,7 +108,7 @@ def _import_model(args: argparse.Namespace) -> int:
     run = shlex.quote(imported.folder.name)
     print(f"\n  race it            deepracer-exp evaluate {run}")
     print(f"  train it further   deepracer-exp clone {run}")
-    if imported.has_logs:
+    if imported.has_logs and not zipfile.is_zipfile(args.path):
         print(f"  its training       deepracer-exp analyze {shlex.quote(args.path)}")
     return 0
 

@@ -58,7 +58,7 @@ def aws_model(
     _refuse_other_sensors(experiment, metadata)
     networks, note = _with_value(experiment, stored.networks)
     tensors = to_service(networks, metadata.sensor)
-    metadata = replace(metadata, neural_network=_kind(experiment, metadata))
+    metadata = replace(metadata, neural_network=services_kind(experiment, metadata))
     texts["model_metadata.json"] = model_metadata_text(metadata)
     texts["training_params.yaml"], unknown = _training_params(experiment)
     name = f"{stored.counters['iteration']}_Step-{stored.counters['env_steps']}.ckpt"
@@ -102,7 +102,7 @@ def _refuse_other_sensors(experiment: Experiment, metadata: ModelMetadata) -> No
         )
 
 
-def _kind(experiment: Experiment, metadata: ModelMetadata) -> str:
+def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
     """Return the service's name of the network.
 
     Raises:

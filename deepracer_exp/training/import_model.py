@@ -142,11 +142,13 @@ def _kinds(metadata: ModelMetadata, model: StoredModel) -> Iterator[str]:
         value.shape for name, value in model.tensors.items() if value.ndim == 4 and "/network_1/" in name
     )
     for kind in NEURAL_NETWORKS:
+        if kind == metadata.neural_network:
+            continue
         option, values = services_network(replace(metadata, neural_network=kind))
         layers = vars(compose_option("network", option, CNNConfig)) | values
         inputs = [2 if "STEREO_CAMERAS" in metadata.sensor else 1, *layers["filters"]]
         built = zip(layers["kernels"], layers["kernels"], inputs, layers["filters"], strict=False)
-        if kind != metadata.neural_network and sorted(shape for shape in built if shape[0] > 1) == held:
+        if sorted(shape for shape in built if shape[0] > 1) == held:
             yield kind
 
 
