@@ -163,8 +163,11 @@ def _match(
     given: dict[str, Array] = {}
     for name, value in tensors.items():
         ours = re.sub(r"^main_level/agent(?:_\d+)?/main/(?:online|global)/", f"{ONLINE}/", name)
-        if not _UNUSED.search(name) and not ours.endswith(f"/{_RESCALER}"):
-            given[ours] = value
+        if _UNUSED.search(name) or ours.endswith(f"/{_RESCALER}"):
+            continue
+        if ours in given:
+            raise BadInput(f"{where}: {name}: is of a second agent; accepted: a model of one")
+        given[ours] = value
     found = {name: given.pop(name) for name in targets if name in given}
     for name, shape in targets.items():
         if name not in found:

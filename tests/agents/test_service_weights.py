@@ -141,9 +141,10 @@ def test_a_frozen_graph_has_no_value_network_and_no_standard_deviation():
         (f"{POLICY}/{CAMERA}/Conv2d_2/kernel", None, ("has no tensor", "Conv2d_2/kernel", "[4, 4, 6, 5]")),
         (f"{VALUE}/middleware_fc_embedder/Dense_0/bias", np.zeros(13), ("[13]", "accepted: [12]")),
         (f"{POLICY}/{CAMERA}/Conv2d_0/bias", np.full(6, np.nan), ("Conv2d_0/bias", "not finite")),
+        (f"{VALUE}/{CAMERA}/Conv2d_0/bias".replace("agent", "agent_1"), np.zeros(6), ("second agent",)),
         ("main_level/agent/main/online/extra/kernel", np.zeros(3), ("extra/kernel", "no layer for")),
     ],
-    ids=["missing", "shape", "NaN", "foreign"],
+    ids=["missing", "shape", "NaN", "another agent", "foreign"],
 )  # fmt: skip
 def test_what_does_not_fit_is_named(name, value, words):
     tensors = to_service(build((CAMERA,)), (CAMERA,))
