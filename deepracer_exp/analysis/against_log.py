@@ -145,9 +145,11 @@ def logged_laps(view: LogView, course: Track) -> Laps:
     best = laps["lap_time_s"].dropna().nsmallest(MOST_TRAINING_LAPS).index
     if not len(best):
         raise BadInput(
-            f"{view.name}: has no evaluation, and its training no complete lap; accepted: logs with laps to compare"
+            f"{view.name}: has no evaluation, and its training no complete lap with its steps; accepted: logs with "
+            "laps to compare"
         )
-    words = f"the fastest {len(best)} of {count(int(laps['complete'].sum()), 'complete lap')}"
+    words = count(int(laps["lap_time_s"].notna().sum()), "complete lap")
+    words = f"the fastest {len(best)} of {words}" if words != count(len(best), "complete lap") else words
     chosen = np.isin(view.episode_index, best)
     words += " of the training, which explores: the log has no evaluation"
     return laps_on(course, view.steps[chosen], words, chosen=True)

@@ -58,7 +58,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=_ANALYZE_EPILOG,
         runs_rewards=True,
     )
-    what = parser.add_argument("what", metavar="RUN | LOGS", help="a run, or logs of the service")
+    what = parser.add_argument("what", nargs="?", metavar="RUN | LOGS", help="a run, or logs of the service")
     what.completer = complete_runs  # type: ignore[attr-defined]
     add_overrides(parser, "runs_dir=DIR | tracking.uri=URI")
     parser.add_argument(
@@ -111,11 +111,13 @@ def _analyze(args: argparse.Namespace) -> int:
     target_s = None if args.target is None else _seconds(args.target)
 
     # `--compare RUN LOGS runs_dir=DIR` takes all three words.
-    words = [args.what, *args.overrides]
+    words = [word for word in (args.what, *args.overrides) if word is not None]
     stores = read_stores(word for word in [*words, *args.compare] if is_override(word))
     logs = [word for word in words if not is_override(word)]
     if len(logs) != 1:
-        raise BadInput(f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one")
+        raise BadInput(
+            f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one, and others after --compare"
+        )
     place = _place(logs[0], stores)
     beside = [_place(what, stores) for what in args.compare if not is_override(what)]
     _check_output(args.output)
@@ -182,6 +184,8 @@ def _compare(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise BadInput(f"checkpoint={chosen}: {error}") from None
     place = _logs(logs)
+    if place is None and not is_run(Path(name)) and _logs(name) is not None:
+        raise BadInput(f"{name}: is no run; write {shlex.join(['deepracer-exp', 'compare', logs, name])}")
     if place is None or is_run(place):
         why = "no such file or folder" if place is None else "is a run"
         runs = shlex.join(["deepracer-exp", "runs", "compare", name, logs])

@@ -223,7 +223,15 @@ def _compare(args: argparse.Namespace) -> int:
         raise BadInput(f"--output {args.output}: accepted: the name of a page (.html)")
     runs, overrides = runs_and_overrides(args)
     stores = read_stores(overrides)
-    folders = dict.fromkeys(resolve(run, stores.runs_dir, stores.uri).path for run in runs)
+    folders: dict[Path, None] = {}
+    for run in runs:
+        try:
+            folders[resolve(run, stores.runs_dir, stores.uri).path] = None
+        except BadInput:
+            if not Path(run).exists():
+                raise
+            others = "deepracer-exp compare RUN LOGS compares a run with logs of the service"
+            raise BadInput(f"{run}: is no run; accepted: runs; {others}") from None
     if not 2 <= len(folders) <= len(ascii_uppercase):
         raise BadInput(f"{len(folders)} runs given; accepted: 2 to {len(ascii_uppercase)} different ones")
     records = [read_record(folder) for folder in folders]

@@ -108,6 +108,8 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     unknown = (
         f"{run}: no such run in {runs_dir} ({len(folders)} there){nearest(run, [f.name for f in folders])}"
     )
+    if any(folder.parent.name == run for folder in folders):
+        unknown += f"; {BEST}{run} is the best run of that experiment"
     if not is_alias(run) or not has_store(tracking_uri, runs_dir):
         raise BadInput(f"{unknown}; accepted: {ACCEPTED}")
     try:

@@ -13,6 +13,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.against_log import course_driven, race_as_logged
 from deepracer_exp.export.aws_logs import TRACE_HEADER
 from deepracer_exp.tracks.track import Track
+from tests.analysis.made_up import Drive, made_up_recording
 
 CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
 
@@ -66,13 +67,6 @@ def test_a_policy_beside_its_own_log_differs_in_nothing(experiment, driver, tmp_
     assert logged.episodes["lap_time_s"].idxmin() == 1
     assert both.sentences[1].startswith("Line and speed are the same all along the track")
 
-    faster = race_as_logged(experiment, driver(0.3), config, found, logged.steps)
-    both = AgainstLog(course=found, logged=logged, simulated=laps_on(found, faster, "faster"))
-    gain_s = faster["tstamp"].max() - first["tstamp"].max()
-    assert both.table.set_index("name").loc["mean speed, m/s", "difference"] > 0.1
-    assert gain_s < -0.5
-    assert both.sentences[-1].endswith("faster.")
-
 
 def test_a_car_that_leaves_the_track_is_put_back_and_its_mistakes_are_counted(experiment, driver):
     (config,) = experiment.tracks.values()
@@ -86,16 +80,12 @@ def test_a_car_that_leaves_the_track_is_put_back_and_its_mistakes_are_counted(ex
     assert laps.episodes["time_s"].sum() == pytest.approx(moved_s + 2 * put_back, abs=0.5)
 
 
-def test_a_log_of_another_track_is_refused(experiment, driver, tmp_path):
-    (config,) = experiment.tracks.values()
-    track = Track.from_config(config)
-    steps = race_as_logged(experiment, driver(), config, track, started(track, [(0.0, 1)]))
-    view = prepare_races(
-        read_recording(written(steps.assign(X=2 * steps["X"], track_len=31.4), tmp_path / "log"))
-    )
+def test_a_log_of_another_track_is_refused(experiment):
+    view = prepare_races(made_up_recording([Drive()]))
+    elsewhere = dataclasses.replace(view, steps=view.steps.assign(X=2 * view.steps["X"], track_len=31.4))
     with pytest.raises(BadInput, match=r"none of the service's worlds .* accepted: --track"):
-        course_driven(view, experiment)
-    with pytest.raises(BadInput, match="--track Oval_track: is not where the car of log drove"):
+        course_driven(elsewhere, experiment)
+    with pytest.raises(BadInput, match="--track Oval_track: is not where the car of made_up drove"):
         course_driven(view, experiment, "Oval_track")
 
 
