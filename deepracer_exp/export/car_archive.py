@@ -78,6 +78,8 @@ def car_archive(networks: "ActorCritic", experiment: Experiment, actions: Action
     """
     from deepracer_exp.agents.service_weights import to_service
 
+    from .aws_model import services_kind
+
     observation, network = experiment.observation, experiment.network
     check_car(experiment)
     metadata, rescaling = car_actions(actions)
@@ -96,8 +98,15 @@ def car_archive(networks: "ActorCritic", experiment: Experiment, actions: Action
         )
     assert isinstance(network, CNNConfig)  # or to_service had refused it
     graph = policy_graph(tensors, _shapes(observation, metadata.sensor), network.strides, bounds)
-    _check_weights(graph, tensors)
-    text = _metadata_text(metadata, observation.lidar)
+    check_weights(graph, tensors)
+    values = json.loads(model_metadata_text(metadata))
+    try:
+        values["neural_network"] = services_kind(experiment, metadata)
+    except BadInput:  # the service has no such network; the car does not ask
+        del values["neural_network"]
+    if observation.lidar is not None:
+        values["lidar_config"] = _lidar_config(observation.lidar)
+    text = json.dumps(values, indent=2) + "\n"
     return CarArchive(_packed({METADATA: text.encode(), GRAPH: graph}), metadata, notes)
 
 
@@ -136,7 +145,7 @@ def _shapes(observation: ObservationConfig, sensors: tuple[str, ...]) -> dict[st
     return dict(zip(sensors, shapes, strict=True))
 
 
-def _check_weights(graph: bytes, tensors: Tensors) -> None:
+def check_weights(graph: bytes, tensors: Tensors) -> None:
     """Compare what the graph holds with the weights of the policy.
 
     Raises:
@@ -154,24 +163,20 @@ def _check_weights(graph: bytes, tensors: Tensors) -> None:
         raise RunFailed(f"{GRAPH}: its weights are not the network's")
 
 
-def _metadata_text(metadata: ModelMetadata, lidar: LidarConfig | None) -> str:
-    values = json.loads(model_metadata_text(metadata))
-    values.pop("lidar_config", None)
-    if lidar is not None:
-        from deepracer_exp.sim.lidar import ANGLES_RAD, NEAREST_M, RAYS
+def _lidar_config(lidar: LidarConfig) -> dict[str, float]:
+    """Return the car's own keys, all of which it needs; they are not those of the simulator."""
+    from deepracer_exp.sim.lidar import ANGLES_RAD, NEAREST_M, RAYS
 
-        # The car needs all of them, other than the simulator, and numbers with a fraction where it has such.
-        angle_deg = round(float(np.degrees(ANGLES_RAD[-1])), 1)
-        values["lidar_config"] = {
-            "num_values": RAYS,
-            "min_angle": -angle_deg,
-            "max_angle": angle_deg,
-            "min_distance": NEAREST_M,
-            "max_distance": float(lidar.furthest_m),
-            "clipping_distance": float(lidar.furthest_m),
-            "num_sectors": lidar.size,
-        }
-    return json.dumps(values, indent=2) + "\n"
+    angle_deg = round(float(np.degrees(ANGLES_RAD[-1])), 1)
+    return {
+        "num_values": RAYS,
+        "min_angle": -angle_deg,
+        "max_angle": angle_deg,
+        "min_distance": NEAREST_M,
+        "max_distance": float(lidar.furthest_m),  # the car takes no whole number
+        "clipping_distance": float(lidar.furthest_m),
+        "num_sectors": lidar.size,
+    }
 
 
 def _packed(files: Mapping[str, bytes]) -> bytes:
