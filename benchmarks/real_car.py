@@ -3,10 +3,10 @@
     python -m benchmarks.real_car [--seeds 5] [--folder FOLDER] [--json FILE] [OVERRIDE...]
 
 For each seed a policy that sees features is trained for TEACHER_STEPS with `randomization=sim2real`. From it two
-policies learn that see what the car sees (`observation=camera network=shallow`), ITERATIONS of `algorithm=distill`
-each: one in the simulator as it is, one with `randomization=sim2real`. Their last policies then drive laps from STARTS
-starts spread evenly over the lap under `evaluation=real_car`: as in the simulator, with each of the car's ways alone,
-and with all of them.
+policies learn that see what the car sees (`observation=camera`), ITERATIONS of `algorithm=distill` each, at a falling
+learning rate: one in the simulator as it is, one with `randomization=sim2real`. Their last policies then drive laps
+from STARTS starts spread evenly over the lap under `evaluation=real_car`: as in the simulator, with each of the car's
+ways alone, and with all of them.
 
 `lap_share` is the share of complete laps, `completion` the mean share of the lap that was driven, `lap_time_s` the mean
 of the complete laps. Intervals are those of the mean over seeds (95 %, t); `gain` is with less without, seed by seed.
@@ -22,14 +22,14 @@ from typing import Any
 
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.real_car import compare, figures
+from deepracer_exp.evaluation.real_car import compare, key_figures
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
 from .command import train
 from .report import benchmark_parser, mean_and_interval, number, percent, table, write_json
 
-TEACHER_STEPS, ITERATIONS, STARTS = 300_000, 10, 20
+TEACHER_STEPS, ITERATIONS, STARTS = 300_000, 40, 20
 WAYS: dict[str, list[str]] = {"without": [], "with": ["randomization=sim2real"]}
 FIGURES = ("lap_share", "completion", "lap_time_s")
 _EVERY = ["stopping=none", "checkpoints.every=null", "tracking=off", "report=false"]
@@ -55,7 +55,7 @@ def drive(run: Path) -> Figures:
     trials = f"evaluation.trials={STARTS}"
     config = compose_evaluation(["run=any", "evaluation=real_car", trials])[0].evaluation
     of_car = Evaluator(stored.experiment, config)(policy)
-    return figures(compare(stored.experiment, config, policy, of_car))
+    return key_figures(compare(stored.experiment, config, policy, of_car))
 
 
 def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figures]:
@@ -69,9 +69,9 @@ def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figu
             length = f"budget.env_steps={TEACHER_STEPS}"
             teacher = trained(folder, "teacher", [own, length, "randomization=sim2real"])
             student = [
-                *("observation=camera", "network=shallow", "network.critic=features", "algorithm=distill"),
-                *(f"algorithm.teacher_iterations={ITERATIONS}", f"budget.iterations={ITERATIONS}"),
-                *("budget.env_steps=null", f"teacher={teacher.resolve()}", own),
+                *("observation=camera", "algorithm=distill", f"algorithm.teacher_iterations={ITERATIONS}"),
+                *(f"budget.iterations={ITERATIONS}", "budget.env_steps=null", "lr_schedule=linear"),
+                *(f"teacher={teacher.resolve()}", own),
             ]
             run = trained(folder, way, [*student, *randomization, *overrides])
             began = time.monotonic()

@@ -24,7 +24,7 @@ from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
 from .evaluator import Evaluator
-from .real_car import compare, explain_controls, figures, losses_table
+from .real_car import compare, explain_controls, key_figures, losses_table
 from .result import CONFIDENCE, USUAL, Evaluation
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def write_evaluation(
         **evaluation.as_dict(),
     }
     if car is not None:
-        content["real_car"] = figures(car)
+        content["real_car"] = key_figures(car)
     target = folder / EVALUATIONS
     try:
         target.mkdir(exist_ok=True)

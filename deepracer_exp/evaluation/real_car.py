@@ -49,7 +49,7 @@ def compare(
     return {**found, CAR: of_car}
 
 
-def figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, Any]]:
+def key_figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, Any]]:
     """Return `lap_share`, `completion` (0 to 1) and `lap_time_s` (None on several tracks) of each, JSON types."""
     found = {}
     for name, evaluation in evaluations.items():
@@ -64,7 +64,7 @@ def figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, Any]]:
 
 def losses_table(evaluations: Mapping[str, Evaluation]) -> Table:
     """Return what is lost under usual conditions as a table: simulator, each of the car's ways alone, all of them."""
-    found = figures(evaluations)
+    found = key_figures(evaluations)
     base = found[SIMULATOR]
     shown = Table(box=None, pad_edge=False, title="from the simulator to the car", title_justify="left")
     for name in ("as on the car", "laps %", "lost %", "done %", "lap s", "lost s"):

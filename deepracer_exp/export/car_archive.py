@@ -214,7 +214,7 @@ def _notes(sensors: tuple[str, ...]) -> list[str]:
     return notes
 
 
-def describe_actions(metadata: ModelMetadata) -> list[str]:
+def describe_commands(metadata: ModelMetadata) -> list[str]:
     """Return a line on what the car makes of each action, of a continuous space of its ends and middle."""
     scale = full_scale(metadata)
     if metadata.low is not None and metadata.high is not None:

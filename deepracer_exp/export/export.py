@@ -29,7 +29,7 @@ from deepracer_exp.validation.console import console_findings
 from .aws_files import aws_files, write_texts, writing
 from .aws_logs import write_aws_logs
 from .aws_model import aws_model
-from .car_archive import ENDING, car_archive, describe_actions, name_on_car
+from .car_archive import ENDING, car_archive, describe_commands, name_on_car
 
 POLICY, COMMAND = "policy", "command"
 CHECKED, CHECKED_PICTURES = 1000, 100
@@ -118,7 +118,7 @@ def _car(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
     for note in archive.notes:
         out.print(f"  {note}", soft_wrap=True)
     out.print("  What the car makes of the actions, with its maximum speed at 100 %:")
-    for line in describe_actions(archive.metadata):
+    for line in describe_commands(archive.metadata):
         out.print(f"  {line}", soft_wrap=True)
     return path
 

@@ -10,7 +10,7 @@ from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.real_car import CAR, SIMULATOR, compare, figures, protocols
+from deepracer_exp.evaluation.real_car import CAR, SIMULATOR, compare, key_figures, protocols
 
 
 class BrightSide(torch.nn.Module):
@@ -41,7 +41,7 @@ def test_each_part_is_driven_alone_and_no_part_is_the_simulator_bit_for_bit(sees
     assert len(set(attempts.values())) == len(attempts)  # each part makes a difference
     nothing = replace(config, real_car=RealCarConfig(picture=None, timing=None, controls=None))
     assert Evaluator(sees, nothing, threads=1)(policy).groups[0].attempts == attempts[SIMULATOR]
-    assert all(np.isfinite(one["completion"]) for one in figures(found).values())
+    assert all(np.isfinite(one["completion"]) for one in key_figures(found).values())
 
 
 def test_parts_that_are_off_are_not_driven(config):
