@@ -98,6 +98,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | runs_dir=DIR | tracking.uri=URI", many=True)
+    parser.usage = "%(prog)s [-h] [--open] [--track NAME | ROUTE] [-o FILE] RUN LOGS [KEY=VALUE ...]"
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(
         "--track", metavar="NAME | ROUTE", help="one of several tracks, or the route (.npy) of an unknown one"
