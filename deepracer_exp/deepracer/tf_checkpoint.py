@@ -12,12 +12,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import google_crc32c
 import numpy as np
 import numpy.typing as npt
 
 from deepracer_exp.errors import BadInput
 
-from .crc32c import crc32c
 from .protobuf import field, read_fields, read_varint, varint
 
 Array = npt.NDArray[np.float32]
@@ -133,7 +133,7 @@ def write_index(entries: Mapping[str, Entry]) -> bytes:
 
 def masked_crc32c(data: bytes | memoryview) -> int:
     """Return the checksum of bytes as LevelDB stores it."""
-    crc = crc32c(data)
+    crc: int = google_crc32c.value(bytes(data))
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
