@@ -1,17 +1,20 @@
-"""Exact nearest-segment queries on polylines at a cost that does not grow with their length or number.
+"""Exact queries on polylines and polygons at a cost that does not grow with their length or number.
 
 A uniform grid stores for each cell every segment that can be nearest to some point of the cell. Let c be
 the cell's centre and h its half diagonal: no point of the cell is farther than h from c, so the nearest
 segment of any point p of the cell lies within d(c) + 2 h of c, where d(c) is the distance from c to the
-polyline. The stored set is therefore a superset of the answers, and testing it alone is exact.
+polyline. The stored set is therefore a superset of the answers, and testing it alone is exact. The edges of polygons
+are sorted into horizontal bands, and a point is tested against those of its own band.
 """
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import shapely
 from numba import njit
+from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.deepracer.routes import is_first_of_equals
 
@@ -22,6 +25,9 @@ MARGIN_M = 1.0
 """How far the grid reaches beyond the polyline; points farther out are answered by a full scan."""
 SPLIT = 8
 """Fine cells to the side of a coarse one, which narrows the search while the grid is built."""
+BAND_M = 0.1
+"""Height of the y bands that edges are sorted into; grown until there are at most `MOST_BANDS`."""
+MOST_BANDS = 10_000
 
 
 class Segments(NamedTuple):
@@ -120,22 +126,79 @@ def build_segments(vertices: np.ndarray) -> Segments:
 
 def join_segments(lines: Sequence[Segments]) -> Segments:
     """Join polylines in their order."""
-    if len(lines) == 1:
-        return lines[0]
-    at, bucket_at, cell_at, member_at = (
-        np.cumsum([0, *(len(getattr(line, name)) for line in lines[:-1])])
-        for name in ("x", "bucket", "first", "member")
-    )
-    joined = {name: np.concatenate([getattr(line, name) for line in lines]) for name in Segments._fields}
     moved = {
-        "at": np.concatenate([line.at + by for line, by in zip(lines, at, strict=True)]),
-        "bucket": np.concatenate([line.bucket + by for line, by in zip(lines, at, strict=True)]),
-        "bucket_at": np.concatenate([line.bucket_at + by for line, by in zip(lines, bucket_at, strict=True)]),
-        "cell_at": np.concatenate([line.cell_at + by for line, by in zip(lines, cell_at, strict=True)]),
-        "first": np.concatenate([line.first + by for line, by in zip(lines, member_at, strict=True)]),
-        "member": np.concatenate([line.member + np.int32(by) for line, by in zip(lines, at, strict=True)]),
+        "at": "x",
+        "bucket": "x",
+        "bucket_at": "bucket",
+        "cell_at": "first",
+        "first": "member",
+        "member": "x",
     }
-    return Segments(**{**joined, **moved})
+    return _joined(lines, moved)
+
+
+class Bands(NamedTuple):
+    """The edges of one or more polygons, sorted by y band.
+
+    Band k of polygon w has the rows `first[b]:first[b + 1]` of `edge` with b = `at[w] + k`.
+    """
+
+    low_y: np.ndarray
+    band_m: np.ndarray
+    bands: np.ndarray
+    at: np.ndarray
+    first: np.ndarray
+    edge: np.ndarray
+    """(entries, 4): lower y, upper y, x at the lower end, dx / dy."""
+
+
+def build_bands(road: BaseGeometry) -> Bands:
+    """Sort the edges of the road's polygons into y bands for the crossing-number test."""
+    corners = [shapely.get_coordinates(ring) for ring in shapely.get_rings(shapely.get_parts(road))]
+    a = np.concatenate([ring[:-1] for ring in corners])
+    b = np.concatenate([ring[1:] for ring in corners])
+    # A level edge is never crossed by the level ray that the test sends out.
+    a, b = a[a[:, 1] != b[:, 1]], b[a[:, 1] != b[:, 1]]
+    up = a[:, 1] < b[:, 1]
+    low, high = np.where(up[:, None], a, b), np.where(up[:, None], b, a)
+    low_y, high_y = float(low[:, 1].min()), float(high[:, 1].max())
+    band_m = max(BAND_M, (high_y - low_y) / MOST_BANDS)
+    bands = math.ceil((high_y - low_y) / band_m)
+    begin = np.clip(((low[:, 1] - low_y) / band_m).astype(np.int64), 0, bands - 1)
+    end = np.clip(((high[:, 1] - low_y) / band_m).astype(np.int64), 0, bands - 1)
+    band = np.concatenate([np.arange(i, j + 1) for i, j in zip(begin, end, strict=True)])
+    index = np.repeat(np.arange(len(low)), end - begin + 1)
+    index = index[np.argsort(band, kind="stable")]
+    edges = np.column_stack(
+        [low[:, 1], high[:, 1], low[:, 0], (high[:, 0] - low[:, 0]) / (high[:, 1] - low[:, 1])]
+    )
+    first = np.r_[0, np.cumsum(np.bincount(band, minlength=bands))]
+    return Bands(
+        low_y=np.array([low_y]),
+        band_m=np.array([band_m]),
+        bands=np.array([bands]),
+        at=np.array([0]),
+        first=first,
+        edge=np.ascontiguousarray(edges[index]),
+    )
+
+
+def join_bands(roads: Sequence[Bands]) -> Bands:
+    """Join polygons in their order."""
+    return _joined(roads, {"at": "first", "first": "edge"})
+
+
+def _joined(parts: Sequence[Any], moved: Mapping[str, str]) -> Any:
+    """Join arrays field by field; those of `moved` hold rows of another field, which follow those of earlier parts."""
+    if len(parts) == 1:
+        return parts[0]
+    fields: dict[str, list[np.ndarray]] = {
+        name: [getattr(part, name) for part in parts] for name in parts[0]._fields
+    }
+    for name, other in moved.items():
+        begin = np.cumsum([0, *map(len, fields[other][:-1])])
+        fields[name] = [a + by.astype(a.dtype) for a, by in zip(fields[name], begin, strict=True)]
+    return type(parts[0])(**{name: np.concatenate(arrays) for name, arrays in fields.items()})
 
 
 @njit(cache=True, nogil=True)
@@ -288,3 +351,28 @@ def poses_at(s, closed, track_index, ndist):  # type: ignore[no-untyped-def]
         else:
             x[i], y[i], heading_rad[i] = np.nan, np.nan, np.nan
     return x, y, heading_rad
+
+
+@njit(cache=True, nogil=True)
+def on_road(b, track_index, points):  # type: ignore[no-untyped-def]
+    """Return for points (m, 2) whether a ray to the right crosses an odd number of edges of their polygon.
+
+    `track_index` (n,) has the polygon of each m / n neighbouring points.
+    """
+    inside = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        road = track_index[i * len(track_index) // len(points)]
+        px, py = points[i, 0], points[i, 1]
+        band = (py - b.low_y[road]) / b.band_m[road]
+        # The top edge can round into the band above the last; nan falls through both comparisons.
+        if 0.0 <= band < b.bands[road] + 1:
+            k = b.at[road] + min(int(band), b.bands[road] - 1)
+            odd = False
+            for j in range(b.first[k], b.first[k + 1]):
+                if (
+                    b.edge[j, 0] <= py < b.edge[j, 1]
+                    and px < b.edge[j, 2] + (py - b.edge[j, 0]) * b.edge[j, 3]
+                ):
+                    odd = not odd
+            inside[i] = odd
+    return inside

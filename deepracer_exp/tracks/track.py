@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.config.track import FloorConfig, TrackConfig
-from deepracer_exp.deepracer.routes import checked_rows, read_knots, read_route, world_rows
+from deepracer_exp.deepracer.routes import checked_rows, read_knots, read_route, rows_from_knots, world_rows
 from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.errors import BadInput
 
 from . import segments
-from .road import Bands, build_bands, join_bands, on_road, road_area, rows_from_knots
-from .segments import Segments, build_segments
+from .segments import Bands, Segments, build_bands, build_segments
 
 PLAIN_FLOOR = FloorConfig(friction=1.0, road_color="#3d4148", ground_color="#54795a", line_color="#f2f2ee")
 """The default floor."""
+MOST_OFF = 0.05
+"""Share of waypoints that may lie off the road before the borders count as wrong."""
 _FIRST = np.zeros(1, np.intp)
 
 TrackIndex = NDArray[np.intp]
@@ -122,7 +123,7 @@ class Track:
         """
         rows = checked_rows(rows)
         closed = bool((rows[0] == rows[-1]).all())
-        road = road_area(rows[:, :2], rows[:, 2:4], rows[:, 4:], closed)
+        road = _road_area(rows[:, :2], rows[:, 2:4], rows[:, 4:], closed)
         counter_clockwise = not closed or _is_counter_clockwise(rows[:, :2])
         if reversed:
             rows = rows[::-1]
@@ -268,7 +269,7 @@ class Tracks:
         self._center_line = segments.join_segments([track._center_line for track in tracks])
         self._inner_line = segments.join_segments([track._inner_line for track in tracks])
         self._outer_line = segments.join_segments([track._outer_line for track in tracks])
-        self._bands = join_bands([track._bands for track in tracks])
+        self._bands = segments.join_bands([track._bands for track in tracks])
 
     def project(self, points: np.ndarray, track_index: TrackIndex) -> Projection:
         """Project points (m, 2) on the centre lines, as `Track.project` does."""
@@ -285,7 +286,7 @@ class Tracks:
 
     def on_road(self, points: np.ndarray, track_index: TrackIndex) -> np.ndarray:
         """Return for points (m, 2) whether they are inside the road of their course (bool)."""
-        return on_road(self._bands, track_index, _points(points))
+        return segments.on_road(self._bands, track_index, _points(points))
 
     def points_at(self, ndist: np.ndarray, track_index: TrackIndex) -> np.ndarray:
         """Return the centre-line points (..., 2) at normalised distances, as `Track.points_at` does."""
@@ -328,3 +329,30 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 def _is_counter_clockwise(ring: np.ndarray) -> bool:
     return bool(shapely.is_ccw(shapely.LinearRing(ring)))
+
+
+def _road_area(center: np.ndarray, inner: np.ndarray, outer: np.ndarray, closed: bool) -> BaseGeometry:
+    """Return the road between two borders as AWS builds it (deepracer-simapp, track_geom).
+
+    A closed course is the outer ring minus the inner one; an open one is the ring of the outer border
+    followed by the inner one backwards.
+
+    Raises:
+        BadInput: The borders enclose no road, or not the one the centre line runs on.
+    """
+    ring = outer if closed else np.concatenate([outer, inner[::-1]])
+    road = _area(ring).difference(_area(inner)) if closed else _area(ring)
+    off = (
+        ~shapely.dwithin(road, shapely.points(center), 1e-6) if road.area > 0 else np.ones(len(center), bool)
+    )
+    if off.mean() > MOST_OFF:
+        raise BadInput(
+            f"{off.sum()} of {len(center)} centre points lie off the road between the borders; accepted are "
+            "borders on both sides of the centre line that do not cross, the inner one inside"
+        )
+    return road
+
+
+def _area(ring: np.ndarray) -> BaseGeometry:
+    polygon = shapely.Polygon(ring)
+    return polygon if polygon.is_valid else shapely.make_valid(polygon)

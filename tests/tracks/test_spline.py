@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import shapely
 
+from deepracer_exp.deepracer.routes import rows_from_knots
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracks.road import rows_from_knots
 
 SQUARE = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 6.0], [0.0, 6.0]])
 
