@@ -12,17 +12,8 @@ Waypoints = list[tuple[float, float]]
 Row = tuple[Any, ...]
 
 FLOAT_COLUMNS = (
-    "x",
-    "y",
-    "heading",
-    "distance_from_center",
-    "projection_distance",
-    "progress",
-    "steps",
-    "speed",
-    "steering_angle",
-    "track_width",
-    "sim_time",
+    *("x", "y", "heading", "distance_from_center", "projection_distance", "progress"),
+    *("steps", "speed", "steering_angle", "track_width", "sim_time"),
 )
 BOOL_COLUMNS = ("all_wheels_on_track", "is_left_of_center", "is_offtrack")
 INDEX_COLUMNS = ("closest_waypoints",)
@@ -79,52 +70,22 @@ def scalar_params(row: Row, waypoints: Waypoints, track_length: float, is_revers
         track_length: Metres.
         is_reversed: Whether the track is driven against its waypoint order.
     """
-    (
-        x,
-        y,
-        heading,
-        distance_from_center,
-        projection_distance,
-        progress,
-        steps,
-        speed,
-        steering_angle,
-        track_width,
-        sim_time,
-        all_wheels_on_track,
-        is_left_of_center,
-        is_offtrack,
-        closest_waypoints,
-    ) = row
-    return {
-        "all_wheels_on_track": all_wheels_on_track,
-        "x": x,
-        "y": y,
-        "heading": heading,
-        "distance_from_center": distance_from_center,
-        "projection_distance": projection_distance,
-        "progress": progress,
-        "steps": steps,
-        "speed": speed,
-        "steering_angle": steering_angle,
-        "track_width": track_width,
-        "track_length": track_length,
-        "waypoints": waypoints[:],
-        "closest_waypoints": closest_waypoints[:],
-        "is_left_of_center": is_left_of_center,
-        "is_reversed": is_reversed,
-        "is_crashed": False,
-        "is_offtrack": is_offtrack,
-        "closest_objects": [0, 0],
-        "objects_location": [],
-        "objects_left_of_center": [],
-        "object_in_camera": False,
-        "objects_speed": [],
-        "objects_heading": [],
-        "objects_distance_from_center": [],
-        "objects_distance": [],
-        "sim_time": sim_time,
-    }
+    return dict(
+        zip(COLUMNS, row, strict=True),
+        track_length=track_length,
+        waypoints=waypoints[:],
+        closest_waypoints=row[-1][:],
+        is_reversed=is_reversed,
+        is_crashed=False,
+        closest_objects=[0, 0],
+        objects_location=[],
+        objects_left_of_center=[],
+        object_in_camera=False,
+        objects_speed=[],
+        objects_heading=[],
+        objects_distance_from_center=[],
+        objects_distance=[],
+    )
 
 
 def batch_params(
