@@ -141,7 +141,7 @@ def logged_laps(view: LogView, course: Track) -> Laps:
         streams = [str(name) for name in laps["stream"].unique()]
         named = f"{', '.join(streams[:2])}{' ...' * (len(streams) > 2)}"
         words = f"{count(len(laps), 'lap')} of {count(len(streams), 'evaluation')}"
-        return laps_on(course, view.steps, f"{words} ({named})")
+        return laps_on(course, view.steps, f"{words} ({named}){_company(view)}")
     best = laps["lap_time_s"].dropna().nsmallest(MOST_TRAINING_LAPS).index
     if not len(best):
         raise BadInput(
@@ -151,8 +151,15 @@ def logged_laps(view: LogView, course: Track) -> Laps:
     words = count(int(laps["lap_time_s"].notna().sum()), "complete lap")
     words = f"the fastest {len(best)} of {words}" if words != count(len(best), "complete lap") else words
     chosen = np.isin(view.episode_index, best)
-    words += " of the training, which explores: the log has no evaluation"
+    words += f" of the training, which explores: the log has no evaluation{_company(view)}"
     return laps_on(course, view.steps[chosen], words, chosen=True)
+
+
+def _company(view: LogView) -> str:
+    """Say that the log was not driven alone, as its crashes show; without a crash it does not record bots or boxes."""
+    steps = view.recording.steps
+    crashed = (steps["episode_status"] == "crashed") | (steps["obstacle_crash_counter"] > 0)
+    return "; driven among bots or obstacles, the simulated car drives alone" if crashed.any() else ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,9 @@
 """Where two sets of laps part, known by construction."""
 
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
 import pytest
 
 from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps, prepare_races
@@ -61,6 +65,19 @@ def test_a_training_without_a_lap_and_without_an_evaluation_has_nothing_to_compa
     view = prepare_races(made_up_recording([Drive(until=0.5), Drive(off_at=40)]))
     with pytest.raises(BadInput, match="has no evaluation, and its training no complete lap"):
         logged_laps(view, made_up_course())
+
+
+@pytest.mark.parametrize("evaluations", [{}, {"evaluation-1": [Drive(), Drive()]}])
+@pytest.mark.parametrize("column", ["episode_status", "obstacle_crash_counter"])
+def test_laps_driven_among_bots_say_that_the_simulated_car_is_alone(evaluations, column):
+    recording = made_up_recording([Drive()], evaluations=evaluations)
+    course, alone = made_up_course(), "the simulated car drives alone"
+    assert alone not in logged_laps(prepare_races(recording), course).words
+    steps = recording.steps
+    crash = pd.Series(["crashed" if column == "episode_status" else 1.0] * len(steps))
+    last = np.arange(len(steps)) == len(steps) - 5
+    met = steps.assign(**{column: steps[column].astype(crash.dtype).mask(last, crash)})
+    assert logged_laps(prepare_races(replace(recording, steps=met)), course).words.endswith(alone)
 
 
 @pytest.mark.parametrize("until", [1.0, 0.3, 0.02])
