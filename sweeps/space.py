@@ -21,6 +21,7 @@ from deepracer_exp.config.overrides import OPEN_MAPPINGS
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.env.real_car import require_car
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import load_reward_source
 
@@ -67,7 +68,7 @@ class SearchSpace:
                 "sweep=lr_entropy"
             )
         found = {key: dimension(key, text) for key, text in request.space.items()}
-        trials = _Trials(request.base, check, found)
+        trials = _Trials(request, check, found)
         dimensions = [
             Dimension(key, request.space[key], _distribution(what), *trials.condition(key))
             for key, what in sorted(found.items(), key=lambda item: item[0] not in groups())
@@ -132,10 +133,11 @@ class SearchSpace:
 class _Trials:
     """Composed experiments, to check values with."""
 
-    def __init__(self, base: Sequence[str], check: Check | None, found: Mapping[str, Choices | Range]):
-        self._base, self._found = list(base), found
+    def __init__(self, request: SweepRequest, check: Check | None, found: Mapping[str, Choices | Range]):
+        self._base, self._found = list(request.base), found
+        self._on_the_car = request.protocol.real_car is not None
         self._from_scratch = check is None
-        self._check = check or _compose
+        self._check = check or self._compose
         self._composed: dict[tuple[str, ...], Mapping[str, Any]] = {}
         self._context: dict[str, str] = {}
         try:
@@ -184,7 +186,7 @@ class _Trials:
             if self._from_scratch and one.key not in groups() and holder is not None:
                 # Composing takes a hundred times as long as setting a value.
                 holder[one.key.rpartition(".")[2]] = override_value(line)
-                _read(parse_experiment(changed))
+                self._read(parse_experiment(changed))
             else:
                 self._values({**context, one.key: line})
         except BadInput as error:
@@ -202,6 +204,18 @@ class _Trials:
             self._composed[overrides] = self._check(list(overrides))
         return self._composed[overrides]
 
+    def _compose(self, overrides: list[str]) -> Mapping[str, Any]:
+        experiment, composition = compose_experiment(overrides)
+        self._read(experiment)
+        return composition.mapping
+
+    def _read(self, experiment: Experiment) -> None:
+        """Refuse what a run would refuse at its start, or its evaluation."""
+        load_reward_source(experiment.reward)
+        build_action_space(experiment.action_space)
+        if self._on_the_car:
+            require_car(experiment)
+
     def _with(self, group: str, option: Choice) -> Mapping[str, Any]:
         return self._values({group: as_override(group, option)})
 
@@ -218,18 +232,6 @@ class _Trials:
             reward = parse_experiment(dict(values)).reward
             return key.removeprefix(f"{_CONSTANTS}.") in load_reward_source(reward).constants
         return _holder(values, key) is not None
-
-
-def _compose(overrides: list[str]) -> Mapping[str, Any]:
-    experiment, composition = compose_experiment(overrides)
-    _read(experiment)
-    return composition.mapping
-
-
-def _read(experiment: Experiment) -> None:
-    """Refuse what a run would refuse at its start."""
-    load_reward_source(experiment.reward)
-    build_action_space(experiment.action_space)
 
 
 def _holder(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:

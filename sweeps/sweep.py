@@ -21,6 +21,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
+from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
@@ -78,6 +79,8 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     build_sampler(config, space)
     build_pruner(config)
     experiment, _ = compose(space.example())
+    if parent and protocol.real_car is not None:
+        require_car(experiment)
     if not parent:
         setup = build_setup(experiment)
         RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)

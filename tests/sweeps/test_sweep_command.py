@@ -37,6 +37,8 @@ def assert_nothing_begun(ended):
         ((LR, "sweep.sampler=tpee"), ("sweep.sampler", "tpe")),
         ((LR, "sweep.pruners=[median]", "sweep.objectives=[lap_time,completion]"), ("median", "several")),
         ((LR, "sweep.protocol=three_trial"), ("three_trials",)),
+        ((LR, "sweep.protocol=real_car"), ("real_car", "the car has no features of the road")),
+        (("observation=camera,camera_small", "sweep.protocol=real_car"), ("observation=camera", "160x120")),
         ((LR, "seed=0,1"), ("sweep.seeds",)),
         ((LR, "study=../evil"), ("study",)),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
