@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.log_course import catalogue_track, find_courses
+from deepracer_exp.analysis.log_course import catalogue_track, find_courses, numbered_as_logged
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
@@ -88,6 +88,20 @@ def test_a_page_has_the_waypoint_numbers_of_its_log_wherever_it_has_any(every: i
     assert near.mean() > 0.95
     assert max(part.last_waypoint for part in sectors_of(view.course)) <= logged.max() + 1
     assert view.course.length_m == pytest.approx(made_up_course().length_m, rel=0.03)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_course_with_the_numbers_of_a_log_is_driven_in_the_same_direction(backwards: bool) -> None:
+    course, ndist = catalogue_track("reinvent_base", backwards), np.linspace(0.0, 0.999, 1000)
+    points = course.points_at(ndist)
+    logged = course.project(points).previous // 2
+    steps = pd.DataFrame({"X": points[:, 0], "Y": points[:, 1], "closest_waypoint": logged})
+    numbered = numbered_as_logged(course, steps)
+    assert (numbered.reversed, numbered.is_clockwise) == (backwards, course.is_clockwise)
+    found = numbered.project(points)
+    assert (np.minimum(np.abs(logged - found.previous), np.abs(logged - found.next)) <= 1).mean() > 0.95
+    # The first number is half a spacing further than in the course.
+    assert np.abs((found.ndist - ndist + 0.5) % 1.0 - 0.5).max() < 0.02
 
 
 def test_of_several_courses_the_most_driven_one_is_shown_unless_another_is_asked_for() -> None:
