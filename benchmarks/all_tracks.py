@@ -70,19 +70,11 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     head = ("track", "name", "length (m)", "steps to 90 %", "seconds to 90 %", "best lap (s)")
     lines = []
     for row in rows:
-        share = 0.0 if row["lap_share"] is None else row["lap_share"]
-        unreached = f"not in {row['env_steps']:,} ({share:.0%})"
+        unreached = f"not in {row['env_steps']:,} ({row['lap_share'] or 0.0:.0%})"
         steps = number(row["reliable_steps"]) if row["reliable_steps"] is not None else unreached
-        lines.append(
-            (
-                f"`{row['track']}`",
-                row["title"],
-                number(row["length_m"], 2),
-                steps,
-                number(row["reliable_s"]),
-                number(row["best_lap_time_s"], 2),
-            )
-        )
+        lap_s = number(row["best_lap_time_s"], 2)
+        course = f"`{row['track']}`", row["title"], number(row["length_m"], 2)
+        lines.append((*course, steps, number(row["reliable_s"]), lap_s))
     return table(head, lines)
 
 

@@ -72,17 +72,20 @@ def boxes_beside(track: Track) -> NDArray[np.float32]:
 
 def random_poses(track: Track, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """Return poses near the centre line, some degrees off in every direction, (count, 5)."""
-    pose = track.start_pose(generator.random(count))
-    side = generator.uniform(-0.3, 0.3, count) * track.width_m
-    return np.column_stack(
-        [
-            pose.x - side * np.sin(pose.yaw_rad),
-            pose.y + side * np.cos(pose.yaw_rad),
-            pose.yaw_rad + generator.normal(0, 0.3, count),
-            generator.normal(0, 0.03, count),
-            generator.normal(0, 0.03, count),
-        ]
-    )
+    ndist, side_m = generator.random(count), generator.uniform(-0.3, 0.3, count) * track.width_m
+    return poses_on(track, ndist, side_m, *generator.normal(0, [[0.3], [0.03], [0.03]], (3, count)))
+
+
+def poses_on(
+    track: Track,
+    ndist: NDArray[np.float64],
+    side_m: NDArray[np.float64],
+    turn_rad: NDArray[np.float64],
+    *lean_rad: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return poses (N, 5) to the left of the centre line, turned from it, with a pitch and a roll."""
+    x, y, yaw = track.start_pose(ndist)
+    return np.column_stack([x - side_m * np.sin(yaw), y + side_m * np.cos(yaw), yaw + turn_rad, *lean_rad])
 
 
 def pictures(

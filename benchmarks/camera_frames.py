@@ -19,7 +19,7 @@ from deepracer_exp.sim.camera import Lens
 from deepracer_exp.sim.scenery import MATERIALS, Scenery, build_scenery
 from deepracer_exp.tracks.track import Track, world_track
 
-from .camera import pictures
+from .camera import pictures, poses_on
 
 TRACK = "reinvent_base"
 SHARES = np.eye(len(MATERIALS), dtype=np.float32) * 255
@@ -72,41 +72,17 @@ def find_poses(
     small = replace(lens, width=lens.width // COARSE, height=lens.height // COARSE)
     shape = (len(frames), small.height, COARSE, small.width, COARSE)
     shrunk = frames.reshape(shape).mean(axis=(2, 4)).reshape(len(frames), -1)
-    ndist, side, turn = (
-        axis.ravel()
-        for axis in np.meshgrid(
-            np.arange(0, 1, 0.05 / track.length_m),
-            np.linspace(-0.45, 0.45, 7) * track.width_m,
-            np.linspace(-0.7, 0.7, 15),
-            indexing="ij",
-        )
-    )
-    pose = track.start_pose(ndist)
-    zero = np.zeros_like(ndist)
-    tried = np.column_stack(
-        [
-            pose.x - side * np.sin(pose.yaw_rad),
-            pose.y + side * np.cos(pose.yaw_rad),
-            pose.yaw_rad + turn,
-            zero,
-            zero,
-        ]
-    )
+    ndist = np.arange(0, 1, 0.05 / track.length_m)
+    side_m, turn_rad = np.linspace(-0.45, 0.45, 7) * track.width_m, np.linspace(-0.7, 0.7, 15)
+    grid = [axis.ravel() for axis in np.meshgrid(ndist, side_m, turn_rad, [0.0], [0.0], indexing="ij")]
+    tried = poses_on(track, *grid)
     drawn = pictures(small, scenery, tried, colors[:, None]).reshape(len(tried), -1).astype(np.float32)
     generator = np.random.default_rng(0)
-    return np.stack(
-        [
-            _refine(
-                frame,
-                tried[np.argsort(np.abs(drawn - look).mean(axis=1))[:BEST]],
-                lens,
-                scenery,
-                colors,
-                generator,
-            )
-            for frame, look in zip(frames, shrunk, strict=True)
-        ]
-    )
+    found = []
+    for frame, look in zip(frames, shrunk, strict=True):
+        best = tried[np.argsort(np.abs(drawn - look).mean(axis=1))[:BEST]]
+        found.append(_refine(frame, best, lens, scenery, colors, generator))
+    return np.stack(found)
 
 
 def _refine(

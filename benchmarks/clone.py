@@ -24,7 +24,7 @@ import yaml
 
 from .command import at_once, read_summary, train
 from .fresh import TRIALS, drive
-from .report import benchmark_parser, mean_and_interval, number, table, write_json
+from .report import benchmark_parser, interval_text, mean_and_interval, number, table, write_json
 
 POLICIES = ("parent", "tenth", "same")
 """The trained run, and its clones by their rate."""
@@ -86,23 +86,16 @@ def summarize(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def markdown(seeds: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
     """Return the table of seeds, means and differences."""
     head = ("", "lap (s)", "done (%)", "complete laps", "held-out lap (s)", "held-out done (%)")
-    digits = (2, 1, 2, 2, 1)
-
-    def shown(figure: dict[str, Any], places: int) -> str:
-        low, high = figure["interval"] or (None, None)
-        mean = number(figure["mean"], places)
-        return mean if low is None else f"{mean} [{number(low, places)}, {number(high, places)}]"
-
+    show = {
+        name: partial(number, digits=digits) for name, digits in zip(FIGURES, (2, 1, 2, 2, 1), strict=True)
+    }
     rows = [
-        (
-            f"seed {seed['seed']}, {name}",
-            *(number(seed[name][f], d) for f, d in zip(FIGURES, digits, strict=True)),
-        )
+        (f"seed {seed['seed']}, {name}", *(show[figure](seed[name][figure]) for figure in FIGURES))
         for seed in seeds
         for name in POLICIES
     ]
     for name, figures in summary.items():
-        cells = (shown(figures[figure], places) for figure, places in zip(FIGURES, digits, strict=True))
+        cells = (interval_text(figures[figure], show[figure]) for figure in FIGURES)
         rows.append((name.replace("_", " "), *cells))
     return table(head, rows)
 

@@ -3,10 +3,15 @@
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
+
+import yaml
+
+from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 
 Result = TypeVar("Result")
 
@@ -29,6 +34,20 @@ def train(overrides: Sequence[str], folder: Path, command: str = "train") -> Pat
         raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr}")
     (summary,) = set(folder.glob("runs/*/*/summary.json")) - before
     return summary.parent
+
+
+def trained(folder: Path, overrides: Sequence[str]) -> Path:
+    """Return a finished run of these overrides in `folder`; train if there is none."""
+    for summary in sorted(folder.glob("runs/*/*/summary.json")):
+        run = summary.parent
+        stored = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
+        if stored == list(overrides) and read_summary(run)["status"] in (FINISHED, STOPPED_EARLY):
+            return run
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    run = train(overrides, folder)
+    print(f"{folder.name}: {run.parent.name} trained in {time.monotonic() - began:.0f} s", flush=True)
+    return run
 
 
 def at_once(jobs: int, calls: Sequence[Callable[[], Result]]) -> list[Result]:

@@ -83,7 +83,7 @@ class SameDriving:
         for before, command in self._noted:
             self._cars.state = before
             began = time.perf_counter()
-            self._cars.drive(**command)
+            self._cars.drive(*command)
             seconds += time.perf_counter() - began
         assert np.array_equal(self._cars.state, self._last), (
             "the physics drove another way than the environment"
@@ -96,18 +96,14 @@ class _Noting:
 
     def __init__(self, cars: CarBatch):
         self._cars = cars
-        self.noted: list[tuple[np.ndarray, dict[str, Any]]] = []
+        self.noted: list[tuple[np.ndarray, tuple[np.ndarray, ...]]] = []
         self.after: np.ndarray
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._cars, name)
 
     def drive(self, speed_mps: np.ndarray, steering_rad: np.ndarray, moving: np.ndarray) -> None:
-        command = {
-            "speed_mps": speed_mps.copy(),
-            "steering_rad": steering_rad.copy(),
-            "moving": moving.copy(),
-        }
+        command = speed_mps.copy(), steering_rad.copy(), moving.copy()
         self.noted.append((self._cars.state, command))
-        self._cars.drive(**command)
+        self._cars.drive(*command)
         self.after = self._cars.state

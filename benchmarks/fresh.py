@@ -5,9 +5,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
 from deepracer_exp.runs.checkpoints import read_checkpoint
@@ -47,19 +49,25 @@ def fresh_trials(trials: int = TRIALS) -> EvaluationConfig:
     return compose_evaluation(["run=any", "evaluation=three_trials", *overrides])[0].evaluation
 
 
-def drive(run: Path, checkpoints: Sequence[str], trials: int = TRIALS) -> list[Driven]:
+def stored_policy(run: Path, checkpoint: str | None = None) -> tuple[Experiment, nn.Module]:
+    """Return a run's experiment and a policy of it; None: the best, or the last of a run too short to be ranked."""
+    stored = resolve(str(run), run.parent, None)
+    found = read_checkpoint(stored.experiment, stored.checkpoints, stored.choose_checkpoint(checkpoint))
+    return stored.experiment, found.networks.policy
+
+
+def drive(run: Path, checkpoints: Sequence[str | None], trials: int = TRIALS) -> list[Driven]:
     """Let policies of a run drive the fresh trials.
 
     Args:
         run: its folder.
-        checkpoints: `best`, `last` or iterations.
+        checkpoints: as for `stored_policy`.
         trials: on each of usual and held-out conditions.
     """
     torch.set_num_threads(1)
-    stored = resolve(str(run), run.parent, None)
-    evaluator = Evaluator(stored.experiment, fresh_trials(trials))
-    policies = [read_checkpoint(stored.experiment, stored.checkpoints, name) for name in checkpoints]
-    return [driven(evaluator(policy.networks.policy)) for policy in policies]
+    stored = [stored_policy(run, name) for name in checkpoints]
+    evaluator = Evaluator(stored[0][0], fresh_trials(trials))
+    return [driven(evaluator(policy)) for _, policy in stored]
 
 
 def driven(evaluation: Evaluation) -> Driven:

@@ -26,10 +26,9 @@ import torch
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import resolve
 
 from .command import train
+from .fresh import stored_policy
 from .report import benchmark_parser, number, table, write_json
 
 SEEN = (
@@ -83,14 +82,11 @@ def training_overrides(tracks: Sequence[str], seed: int, steps: int) -> list[str
 def drive(run: Path, tracks: Sequence[str], starts: int = STARTS) -> dict[str, Driven]:
     """Let a run's best policy drive tracks both ways, once from each start."""
     torch.set_num_threads(1)
-    stored = resolve(str(run), run.parent, None)
-    # A training too short to be ranked has no best.
-    name = "best" if (stored.checkpoints / "best").exists() else "last"
-    policy = read_checkpoint(stored.experiment, stored.checkpoints, name).networks.policy
+    experiment, policy = stored_policy(run)
     driven_on = compose_experiment([f"track=[{','.join(tracks)}]", "track.direction=alternate"])[0]
     protocol = ("evaluation=three_trials", "evaluation.held_out=null", f"evaluation.trials={starts}")
     config = compose_evaluation(["run=any", *protocol])[0].evaluation
-    evaluation = Evaluator(dataclasses.replace(stored.experiment, track=driven_on.track), config)(policy)
+    evaluation = Evaluator(dataclasses.replace(experiment, track=driven_on.track), config)(policy)
     ways = {group.track: group for group in evaluation.groups}
     found = {}
     for track in tracks:

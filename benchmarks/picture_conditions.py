@@ -21,6 +21,7 @@ import json
 import math
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -29,11 +30,10 @@ from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.driving import PictureRandomizationConfig
 from deepracer_exp.config.overrides import override_line
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import resolve
 
 from .command import train
-from .report import benchmark_parser, mean_and_interval, table, write_json
+from .fresh import stored_policy
+from .report import benchmark_parser, interval_text, mean_and_interval, number, table, write_json
 
 STARTS = 20
 LIMITS = {"scale": (0.5, 2.0), "objects": (0, 50)} | dict.fromkeys(
@@ -69,26 +69,16 @@ def conditions(trained: PictureRandomizationConfig) -> dict[str, PictureRandomiz
 def drive(run: Path, under: dict[str, PictureRandomizationConfig | None]) -> dict[str, float]:
     """Let a run's last policy drive under each condition; return the completion."""
     torch.set_num_threads(1)
-    stored = resolve(str(run), run.parent, None)
-    policy = read_checkpoint(stored.experiment, stored.checkpoints, "last").networks.policy
+    stored, policy = stored_policy(run, "last")
     protocol = ("evaluation=three_trials", "evaluation.usual=null", "evaluation.held_out=null")
     config = compose_evaluation(["run=any", *protocol, f"evaluation.trials={STARTS}"])[0].evaluation
     completion = {}
     for name, pictures in under.items():
-        randomization = dataclasses.replace(stored.experiment.randomization, pictures=pictures)
-        experiment = dataclasses.replace(stored.experiment, randomization=randomization)
+        randomization = dataclasses.replace(stored.randomization, pictures=pictures)
+        experiment = dataclasses.replace(stored, randomization=randomization)
         (group,) = Evaluator(experiment, config)(policy).groups
         completion[name] = group.completion / 100
     return completion
-
-
-def shown(figure: dict[str, float | list[float] | None]) -> str:
-    """Return a mean with its interval for a table."""
-    mean, interval = figure["mean"], figure["interval"]
-    assert isinstance(mean, float)
-    return f"{mean:.2f}" + (
-        f" ({interval[0]:.2f} to {interval[1]:.2f})" if isinstance(interval, list) else ""
-    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -100,14 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     trained = compose_experiment(["randomization=sim2real"])[0].randomization.pictures
     assert trained is not None
     under = conditions(trained)
-    ways = {
-        "without": [],
-        "with": [
-            override_line(
-                "randomization.pictures", {name: list(ends) for name, ends in vars(trained).items()}
-            )
-        ],
-    }
+    ranges = {name: list(ends) for name, ends in vars(trained).items()}
+    ways = {"without": [], "with": [override_line("randomization.pictures", ranges)]}
     driven: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
     fixed = ["observation=camera_small", "stopping=none", "checkpoints.every=null", "tracking=off"]
     for seed in range(options.seeds):
@@ -120,18 +104,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     completion = {
         name: {way: mean_and_interval([one[name] for one in driven[way]]) for way in ways} for name in under
     }
-    rows = [(name, *map(shown, by_way.values())) for name, by_way in completion.items()]
+    two_digits = partial(number, digits=2)
+    rows = [
+        (name, *(interval_text(one, two_digits) for one in by_way.values()))
+        for name, by_way in completion.items()
+    ]
     print()
     print(table(("condition", *(f"trained {way} it" for way in ways)), rows))
-    write_json(
-        options.json,
-        {
-            "completion": completion,
-            "seeds": driven,
-            "steps": options.steps,
-            "overrides": options.overrides,
-        },
-    )
+    result = {"completion": completion, "seeds": driven}
+    write_json(options.json, {**result, "steps": options.steps, "overrides": options.overrides})
 
 
 if __name__ == "__main__":

@@ -16,64 +16,50 @@ FOLDER keeps runs and results, so that a second call continues the first; overri
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.real_car import compare, key_figures
-from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import resolve
 
-from .command import train
-from .report import benchmark_parser, mean_and_interval, number, percent, table, write_json
+from .command import trained
+from .fresh import stored_policy
+from .report import benchmark_parser, interval_text, mean_and_interval, number, percent, table, write_json
 
 TEACHER_STEPS, ITERATIONS, STARTS = 300_000, 40, 20
 WAYS: dict[str, list[str]] = {"without": [], "with": ["randomization=sim2real"]}
 FIGURES = ("lap_share", "completion", "lap_time_s")
-_EVERY = ["stopping=none", "checkpoints.every=null", "tracking=off", "report=false"]
 
 Figures = dict[str, dict[str, Any]]
 
 
-def trained(folder: Path, name: str, overrides: Sequence[str]) -> Path:
-    """Return the finished run `name` in a folder; train it if there is none."""
-    for summary in sorted(folder.glob(f"runs/{name}/*/summary.json")):
-        if json.loads(summary.read_text(encoding="utf-8"))["status"] == "finished":
-            return summary.parent
-    began = time.monotonic()
-    run = train([f"name={name}", *_EVERY, *overrides], folder)
-    print(f"{folder.name}: {name} trained in {time.monotonic() - began:.0f} s", flush=True)
-    return run
-
-
 def drive(run: Path) -> Figures:
     """Let a run's last policy drive as in the simulator and as on the car."""
-    stored = resolve(str(run), run.parent, None)
-    policy = read_checkpoint(stored.experiment, stored.checkpoints, "last").networks.policy
+    experiment, policy = stored_policy(run, "last")
     trials = f"evaluation.trials={STARTS}"
     config = compose_evaluation(["run=any", "evaluation=real_car", trials])[0].evaluation
-    of_car = Evaluator(stored.experiment, config)(policy)
-    return key_figures(compare(stored.experiment, config, policy, of_car))
+    return key_figures(compare(experiment, config, policy, Evaluator(experiment, config)(policy)))
 
 
 def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figures]:
     """Train and drive with one seed, as far as the folder does not have it."""
     folder.mkdir(parents=True, exist_ok=True)
-    own = f"seed={seed}"
+    every = ["stopping=none", "checkpoints.every=null", "tracking=off", "report=false", f"seed={seed}"]
     driven = {}
     for way, randomization in WAYS.items():
         result = folder / f"{way}.json"
         if not result.exists():
             length = f"budget.env_steps={TEACHER_STEPS}"
-            teacher = trained(folder, "teacher", [own, length, "randomization=sim2real"])
+            teacher = trained(folder, ["name=teacher", *every, length, "randomization=sim2real"])
             student = [
-                *("observation=camera", "algorithm=distill", f"algorithm.teacher_iterations={ITERATIONS}"),
-                *(f"budget.iterations={ITERATIONS}", "budget.env_steps=null", "lr_schedule=linear"),
-                *(f"teacher={teacher.resolve()}", own),
+                *(f"name={way}", f"teacher={teacher.resolve()}", "observation=camera", "lr_schedule=linear"),
+                *("algorithm=distill", f"algorithm.teacher_iterations={ITERATIONS}"),
+                *(f"budget.iterations={ITERATIONS}", "budget.env_steps=null"),
             ]
-            run = trained(folder, way, [*student, *randomization, *overrides])
+            run = trained(folder, [*student, *every, *randomization, *overrides])
             began = time.monotonic()
             result.write_text(json.dumps(drive(run), indent=2) + "\n", encoding="utf-8")
             print(f"{folder.name}: {way} driven in {time.monotonic() - began:.0f} s", flush=True)
@@ -96,15 +82,6 @@ def summarize(seeds: Sequence[dict[str, Figures]]) -> dict[str, Any]:
     return found
 
 
-def shown(figure: dict[str, Any], share: bool) -> str:
-    """Return a mean with its interval for a table."""
-    texts = [
-        percent(value) if share else number(value, 2)
-        for value in (figure["mean"], *(figure["interval"] or ()))
-    ]
-    return texts[0] + (f" ({texts[1]} to {texts[2]})" if len(texts) > 1 else "")
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = benchmark_parser("real_car", __doc__)
@@ -117,32 +94,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         measure(options.folder / f"seed{seed}", seed, options.overrides) for seed in range(options.seeds)
     ]
     found = summarize(seeds)
-    head = ["as on the car"]
-    head += [f"{what}, trained {way}" for what in ("complete laps", "lap (s)") for way in WAYS]
+    columns: dict[tuple[str, str], Callable[[float | None], str]] = {
+        ("complete laps", "lap_share"): percent,
+        ("lap (s)", "lap_time_s"): partial(number, digits=2),
+    }
+    head = ["as on the car", *(f"{what}, trained {way}" for what, _ in columns for way in WAYS)]
     rows = [
         (
             {"simulator": "nothing", "car": "all"}.get(name, name),
-            *(
-                shown(one[figure][way], figure == "lap_share")
-                for figure in ("lap_share", "lap_time_s")
-                for way in WAYS
-            ),
+            *(interval_text(one[figure][way], show) for (_, figure), show in columns.items() for way in WAYS),
         )
         for name, one in found.items()
     ]
-    print()
-    print(table(head, rows))
-    write_json(
-        options.json,
-        {
-            "figures": found,
-            "seeds": seeds,
-            "teacher_steps": TEACHER_STEPS,
-            "iterations": ITERATIONS,
-            "starts": STARTS,
-            "overrides": options.overrides,
-        },
-    )
+    print(f"\n{table(head, rows)}")
+    given = {"teacher_steps": TEACHER_STEPS, "iterations": ITERATIONS, "starts": STARTS}
+    result = {"figures": found, "seeds": seeds, **given, "overrides": options.overrides}
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Recordings cut into windows, and the simulated car driven through them with the recorded actions."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -73,15 +73,8 @@ class Windows:
 
     def choose(self, chosen: Ids | NDArray[np.bool_]) -> "Windows":
         """Return some of the windows, by numbers or by a mask."""
-        return Windows(
-            self.pose[chosen],
-            self.action[chosen],
-            self.duration_s[chosen],
-            self.first[chosen],
-            self.standing[chosen],
-            self.iteration[chosen],
-            self.episode[chosen],
-        )
+        arrays = (field.name for field in fields(self) if field.name != "left_out")
+        return Windows(**{name: getattr(self, name)[chosen] for name in arrays})
 
 
 def cut_windows(
@@ -109,14 +102,10 @@ def cut_windows(
     broken = (np.hypot(np.diff(x), np.diff(y)) > _JUMP_M) | (np.abs(turned) > _JUMP_RAD)
     broken |= (recorded["episode_status"] == "pause").to_numpy()[1:]
     rows: list[Ids] = []
-    first: list[int] = []
-    standing: list[bool] = []
-    episode: list[int] = []
+    cut: list[tuple[int, bool, int]] = []  # first, standing, episode
     left_out = 0
     end_of_last, last_car = np.zeros(0, np.intp), None
-    episodes = recorded.groupby(
-        ["stream", "worker", "iteration", "episode"], sort=False, observed=True
-    ).indices
+    episodes = _by_episode(recorded).indices
     for number, ((stream, worker, _, _), places) in enumerate(episodes.items()):
         car = stream, worker
         under_way = range(_FIRST_MOVING_ROW + WARM_UP_STEPS, len(places) - steps, every)
@@ -135,21 +124,24 @@ def cut_windows(
             missing = WARM_UP_STEPS - len(before)
             known = np.concatenate([before, ahead])
             rows.append(np.concatenate([np.full(missing, known[0]), known]))
-            first.append(missing)
-            standing.append(stands)
-            episode.append(number)
+            cut.append((missing, stands, number))
         end_of_last, last_car = places[_FIRST_MOVING_ROW:][-WARM_UP_STEPS:], car
     at_rows = np.array(rows, np.intp).reshape(len(rows), WARM_UP_STEPS + 1 + steps)
+    first, standing, episode = np.array(cut, np.int64).reshape(len(cut), 3).T
     return Windows(
         pose=np.stack([x[at_rows], y[at_rows], np.unwrap(yaw[at_rows], axis=1)], axis=-1),
         action=np.stack([speed, steering], axis=-1)[at_rows[:, :-1]],
         duration_s=_durations(recorded, x, y)[at_rows[:, :-1]],
-        first=np.array(first, np.intp),
-        standing=np.array(standing, bool),
+        first=first,
+        standing=standing.astype(bool),
         iteration=recorded["iteration"].to_numpy(np.int64)[at_rows[:, -1]],
-        episode=np.array(episode, np.int64),
+        episode=episode,
         left_out=left_out,
     )
+
+
+def _by_episode(recorded: pd.DataFrame) -> Any:
+    return recorded.groupby(["stream", "worker", "iteration", "episode"], sort=False, observed=True)
 
 
 def _durations(recorded: pd.DataFrame, x_m: Floats, y_m: Floats) -> Floats:
@@ -162,7 +154,7 @@ def _durations(recorded: pd.DataFrame, x_m: Floats, y_m: Floats) -> Floats:
     stamp = recorded["tstamp"].to_numpy(np.float64)
     relative = np.zeros(len(stamp))
     relative[1:] = np.diff(stamp) / PERIOD_S - 1.0
-    group = recorded.groupby(["stream", "worker", "iteration", "episode"], sort=False, observed=True).ngroup()
+    group = _by_episode(recorded).ngroup()
     same = np.zeros(len(stamp), bool)
     same[1:] = group.to_numpy()[1:] == group.to_numpy()[:-1]
     relative[~same | (np.abs(relative) > _MOST_JITTER)] = 0.0
@@ -178,12 +170,7 @@ def _durations(recorded: pd.DataFrame, x_m: Floats, y_m: Floats) -> Floats:
     if steady.sum() < _LEAST_STEADY:
         return np.full(len(stamp), PERIOD_S)
     # Neighbours take part, since jitter alternates.
-    columns = [
-        np.roll(relative, 1)[steady],
-        relative[steady],
-        np.roll(relative, -1)[steady],
-        np.ones(steady.sum()),
-    ]
+    columns = [*(np.roll(relative, shift)[steady] for shift in (1, 0, -1)), np.ones(steady.sum())]
     share = np.linalg.lstsq(np.stack(columns, axis=1), longer[steady], rcond=None)[0][1]
     durations: Floats = PERIOD_S * (1.0 + np.clip(share, 0.0, 1.0) * relative)
     return durations

@@ -6,7 +6,7 @@ import math
 import os
 import platform
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +59,7 @@ def percent(share: float | None, digits: int = 0) -> str:
     return "-" if share is None else f"{share:.{digits}%}"
 
 
-def mean_and_interval(
-    values: Sequence[float | None], digits: int = 4
-) -> dict[str, float | list[float] | None]:
+def mean_and_interval(values: Sequence[float | None], digits: int = 4) -> dict[str, Any]:
     """Return `mean` and `interval` of the values that are known, for JSON.
 
     Runs differ by their seeds only, and there are few of them: Student's interval of the mean. It is None with fewer
@@ -75,6 +73,12 @@ def mean_and_interval(
         return {"mean": round(mean, digits), "interval": [round(mean, digits)] * 2}
     low, high = ttest_1samp(known, 0.0).confidence_interval(CONFIDENCE)
     return {"mean": round(mean, digits), "interval": [round(float(low), digits), round(float(high), digits)]}
+
+
+def interval_text(figure: dict[str, Any], show: Callable[[float | None], str]) -> str:
+    """Return what `mean_and_interval` found, for a table."""
+    mean, *ends = map(show, (figure["mean"], *(figure["interval"] or ())))
+    return f"{mean} ({' to '.join(ends)})" if ends else mean
 
 
 def machine() -> dict[str, Any]:

@@ -106,30 +106,20 @@ def build(experiment: Experiment, physics_threads: int, car_racing: bool = False
     algorithm, network = experiment.algorithm, experiment.network
     assert algorithm.frames_per_iteration is not None
     n_cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+    layers: dict[str, Any]
     if isinstance(network, MLPConfig):
-        hidden = list(network.hidden)
-        policy, layers = (
-            "MlpPolicy",
-            {
-                "net_arch": {"pi": hidden, "vf": hidden},
-                "activation_fn": _ACTIVATIONS[network.activation],
-            },
-        )
+        sizes = {key: list(network.hidden) for key in ("pi", "vf")}
+        policy, layers = "MlpPolicy", {"net_arch": sizes, "activation_fn": _ACTIVATIONS[network.activation]}
     else:
         assert isinstance(network, CNNConfig)
-        policy, layers = (
-            "CnnPolicy",
-            {
-                "net_arch": [],
-                "features_extractor_class": Convolutions,
-                "features_extractor_kwargs": {"network": network},
-            },
-        )
+        given = {"features_extractor_kwargs": {"network": network}}
+        policy, layers = "CnnPolicy", {"net_arch": [], "features_extractor_class": Convolutions, **given}
     cars: VecEnv
     if car_racing:
         n_cars = cores()
-        options = {"continuous": False}
-        cars = make_vec_env("CarRacing-v3", n_cars, env_kwargs=options, vec_env_cls=SubprocVecEnv)
+        cars = make_vec_env(
+            "CarRacing-v3", n_cars, env_kwargs={"continuous": False}, vec_env_cls=SubprocVecEnv
+        )
     else:
         cars = SB3Cars(DeepRacerVectorEnv(n_cars, threads=physics_threads, setup=build_setup(experiment)))
     return PPO(

@@ -33,23 +33,19 @@ import argparse
 import json
 import statistics
 import tempfile
-import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
 from deepracer_exp.runs.files import read_record
-from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.training.metrics import NOT_EVALUATED
 from deepracer_exp.training.stopping_replay import replay
 
-from .command import at_once, read_metrics, read_summary, train
+from .command import at_once, read_metrics, read_summary, trained
 from .fresh import TRIALS, Driven, drive
 from .report import benchmark_parser, mean_and_interval, number, percent, table, write_json
 from .same import different_rows
@@ -66,20 +62,6 @@ def training_overrides(track: str, seed: int, steps: int, overrides: Sequence[st
     # Every checkpoint stays: the best of the beginning is not the best of the whole run.
     keep = ("checkpoints.keep=1000", "tracking=off", f"budget.env_steps={steps}")
     return [f"track={track}", *overrides, rule, *keep, f"seed={seed}"]
-
-
-def trained(folder: Path, overrides: Sequence[str]) -> Path:
-    """Return a finished run of these overrides in `folder`; train if there is none."""
-    for summary in sorted(folder.glob("runs/*/*/summary.json")):
-        run = summary.parent
-        stored = yaml.safe_load((run / "overrides.yaml").read_text(encoding="utf-8"))
-        if stored == list(overrides) and read_summary(run)["status"] in (FINISHED, STOPPED_EARLY):
-            return run
-    folder.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    run = train(overrides, folder)
-    print(f"{folder.name}: trained in {time.monotonic() - began:.0f} s", flush=True)
-    return run
 
 
 def best_within(run: Path, iteration: int) -> str:

@@ -219,8 +219,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         won = winner_of([one for one in each if one.value is not None], objective, config.rerank, value_again)
         run = runs[won.number]
         if run not in driven:
-            checkpoint = "best" if (run / "checkpoints" / "best").exists() else "last"
-            (driven[run],) = drive(run, [checkpoint], options.laps)
+            (driven[run],) = drive(run, [None], options.laps)
         seconds = noted["seconds"] if name == OWN else makespan_s(each) + besides_s
         best = {"trial": won.number, "value": won.value, "value_again": value_again(won)}
         found[name] = {

@@ -26,14 +26,13 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
-from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.runs.result import BUDGET_REACHED
 from sweeps.labels import outcome_of
 from sweeps.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary
+from .fresh import stored_policy
 
 _LEFT_BEHIND = ("trace", TRACKING)
 """Of a trial's run: most of its bytes, and its run in MLflow."""
@@ -284,11 +283,8 @@ def score(run: Path, objective: str, protocol: EvaluationConfig) -> float:
     file, key = run / _SCORES, f"{objective}: {protocol}"
     known = read_object(file)
     if key not in known:
-        stored = resolve(str(run), run.parent, None)
-        policy = read_checkpoint(
-            stored.experiment, stored.checkpoints, stored.choose_checkpoint(None)
-        ).networks.policy
-        evaluation = Evaluator(stored.experiment, protocol)(policy)
+        experiment, policy = stored_policy(run)
+        evaluation = Evaluator(experiment, protocol)(policy)
         known[key] = values_of(evaluation, [objective], protocol.time_s)[0]
         file.write_text(json.dumps(known), encoding="utf-8")
     return float(known[key])

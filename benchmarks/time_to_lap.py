@@ -74,28 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     wanted = (number(WANTED_S.get(key)) for key in FIGURES)
     console = (number(CONSOLE_FIRST_LAP_STEPS if key == "first_lap_steps" else None) for key in FIGURES)
     head = ("seed", "first lap (s)", "first lap (steps)", "reliable (s)", "reliable (steps)")
-    print()
-    print(
-        table(
-            head,
-            [
-                *rows,
-                ("median", *middle),
-                ("wanted, at most", *wanted),
-                ("a run of the AWS console", *console),
-            ],
-        )
-    )
-    write_json(
-        options.json,
-        {
-            "seeds": seeds,
-            **medians,
-            "wanted": WANTED_S,
-            "overrides": options.overrides,
-            "distill": options.distill,
-        },
-    )
+    rows += [("median", *middle), ("wanted, at most", *wanted), ("a run of the AWS console", *console)]
+    print(f"\n{table(head, rows)}")
+    given = {"overrides": options.overrides, "distill": options.distill}
+    write_json(options.json, {"seeds": seeds, **medians, "wanted": WANTED_S, **given})
 
 
 if __name__ == "__main__":

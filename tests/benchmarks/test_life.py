@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import clone, resume, stopping
+from benchmarks import clone, command, resume, stopping
 from benchmarks.command import at_once
 from benchmarks.fresh import Driven, drive, fresh_trials
 from benchmarks.report import mean_and_interval
@@ -101,7 +101,7 @@ def test_a_finished_run_of_the_same_overrides_is_used_again(tmp_path: Path, monk
     asked = stopping.training_overrides("Oval_track", 1, 5000, ["network=mlp"], "stopping=none")
     compose_experiment(asked)
     trained = []
-    monkeypatch.setattr(stopping, "train", lambda overrides, folder: trained.append(overrides) or folder)
+    monkeypatch.setattr(command, "train", lambda overrides, folder: trained.append(overrides) or folder)
     states = {
         "a": ("interrupted", asked),
         "b": ("finished", [*asked, "debug=true"]),
@@ -112,9 +112,9 @@ def test_a_finished_run_of_the_same_overrides_is_used_again(tmp_path: Path, monk
         run.mkdir(parents=True)
         (run / "summary.json").write_text(json.dumps({"status": status}))
         (run / "overrides.yaml").write_text("".join(f"- {json.dumps(one)}\n" for one in overrides))
-    assert stopping.trained(tmp_path, asked).name == "c"
+    assert command.trained(tmp_path, asked).name == "c"
     assert trained == []
-    assert stopping.trained(tmp_path, [*asked, "seed=2"]) == tmp_path
+    assert command.trained(tmp_path, [*asked, "seed=2"]) == tmp_path
     assert trained == [[*asked, "seed=2"]]
 
 
