@@ -124,12 +124,11 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
     with start(1) as one, start(2) as two:
         passes: dict[str, Callable[[], tuple[float, float]]] = {}
         for name, collection in (("collect 1", one), ("collect 2", two)):
-            batches = iter(collection)
-            next(batches)  # imports, compilation and the first episodes' common start
+            collection.next_batch()  # imports, compilation and the first episodes' common start
 
-            def one_batch(batches: Any = batches) -> tuple[float, float]:
+            def one_batch(batches: LocalCollector = collection) -> tuple[float, float]:
                 began = time.perf_counter()
-                steps = next(batches).numel()
+                steps = batches.next_batch().numel()
                 return steps, time.perf_counter() - began
 
             passes[name] = one_batch

@@ -3,7 +3,7 @@
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Self
 
 import torch
@@ -29,10 +29,6 @@ class Collector(ABC):
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.close()
-
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        while True:
-            yield self.next_batch()
 
     def collect(self, algorithm: AlgorithmConfig) -> tuple[TensorDictBase, float]:
         """Return what one update learns from, as much as the algorithm says, and the seconds it took to collect.
@@ -91,15 +87,21 @@ def worker_count(config: CollectorConfig) -> int:
     return 0 if config.mode == "in_process" else config.processes or cores()
 
 
-def worker_name(worker: int) -> str:
-    """Return the key of a worker's part in a state: state dicts have names for keys."""
-    return f"worker-{worker}"
+def by_worker(states: Iterable[Any]) -> dict[str, Any]:
+    """Return the states of workers as a collector's `state_dict`: state dicts have names for keys."""
+    return {f"worker-{worker}": state for worker, state in enumerate(states)}
 
 
-def refuse_other_cars(state: Mapping[str, Any], names: set[str]) -> None:
-    """Refuse the state of other workers than those of these names; an empty one fits all."""
-    if state and set(state) != names:
+def states_of(state: Mapping[str, Any], workers: int) -> list[Any]:
+    """Return the workers' states of a collector's `state_dict`, none of an empty one.
+
+    Raises:
+        BadInput: it is that of other workers.
+    """
+    names = by_worker(range(workers))
+    if state and state.keys() != names.keys():
         raise BadInput(
             f"the checkpoint does not fit: it has the cars of {count(len(state), 'synchronous worker')}; "
             f"accepted by this collector: {len(names)}"
         )
+    return [state[name] for name in names if state]

@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +24,7 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs.crash_dump import read_crash_dump
 from deepracer_exp.runs.files import HEARTBEAT
 
-from .base import Collector, refuse_other_cars, worker_count, worker_name
+from .base import Collector, by_worker, states_of, worker_count
 from .watchdog import Watchdog
 from .worker import EnvFactory
 
@@ -57,8 +57,7 @@ class LocalCollector(Collector):
         self._run_dir = run_dir
         self._batches = 0
         self._begun_from = state or {}
-        names = {worker_name(worker) for worker in range(max(1, self._workers))}
-        refuse_other_cars(self._begun_from, set() if config.mode == "async" else names)
+        states = states_of(self._begun_from, 0 if config.mode == "async" else max(1, self._workers))
         self._watchdog: Watchdog | None = None
         parts = self._workers if config.mode == "sync" else 1
         steps_per_batch = -(-frames_per_batch // (parts * config.cars))
@@ -72,7 +71,7 @@ class LocalCollector(Collector):
         if self._workers == 0:
             self._random = torch.get_rng_state()
             with self._own_stream():
-                env = factory(worker=0, threads=config.threads, heartbeat=None)
+                env = factory(worker=0, threads=config.threads)
                 self._collector: Any = TorchRLCollector(
                     env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
                 )
@@ -90,10 +89,10 @@ class LocalCollector(Collector):
             if config.mode == "sync":
                 _watch_deliveries(self._collector.queue_out, self._watchdog)
         self._source = iter(self._collector)
-        if self._begun_from:
+        if states:
             with contextlib.ExitStack() as undo:
                 undo.callback(self.close)
-                self._restore_cars()
+                self._restore_cars(states)
                 undo.pop_all()
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -118,12 +117,12 @@ class LocalCollector(Collector):
             return dict(self._begun_from)
         if self._watchdog is None:
             with self._own_stream():
-                return {worker_name(0): self._collector.env.take_state()}
+                return by_worker([self._collector.env.take_state()])
         states = self._ask(
             lambda: self._collector.map_fn("env.take_state"),
             lambda: "a collector worker did not report the state of its cars",
         )
-        return {worker_name(worker): state for worker, state in enumerate(states)}
+        return by_worker(states)
 
     def close(self) -> None:
         """End every worker."""
@@ -179,12 +178,11 @@ class LocalCollector(Collector):
                 queue.cancel_join_thread()
         self._weights.shutdown()
 
-    def _restore_cars(self) -> None:
-        """Put the cars where those of the given state were.
+    def _restore_cars(self, states: Sequence[Any]) -> None:
+        """Put the cars where those of each worker's state were.
 
         TorchRL tries the policy once while it starts, which draws a number: the state is put back after that.
         """
-        states = [self._begun_from[worker_name(worker)] for worker in range(max(1, self._workers))]
         if self._watchdog is None:
             with self._own_stream():
                 self._collector.env.put_state(states[0])

@@ -4,7 +4,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import REWARD_PRINTS
 
 from . import ray_cluster
-from .base import Collector, refuse_other_cars, worker_name
+from .base import Collector, by_worker, states_of
 from .worker import EnvFactory
 
 _LOOK_EVERY_S = 0.2
@@ -67,20 +67,6 @@ class KeptPrints(RewardPrints):
         self._lines.append(text)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RemoteEnvFactory(EnvFactory):
-    """Builds the cars of one process that shares no file with the training process."""
-
-    kept: KeptPrints = field(default_factory=KeptPrints)
-    on_step: Callable[[], None] | None = None
-
-    def _prints(self) -> RewardPrints:
-        return self.kept
-
-    def _sign_of_life(self) -> Callable[[], None] | None:
-        return self.on_step
-
-
 class Cars:
     """The cars of one process; a Ray actor whose methods run in its main thread.
 
@@ -89,14 +75,14 @@ class Cars:
     """
 
     def build(
-        self, factory: RemoteEnvFactory, policy: torch.nn.Module, frames_per_batch: int, beats: Any
+        self, factory: EnvFactory, policy: torch.nn.Module, frames_per_batch: int, beats: Any
     ) -> tuple[str, int]:
         """Put the cars on the road; return the address of the node and the number of the process."""
         import ray
 
         # As in worker processes of one machine: with other threads sums have other last digits.
         torch.set_num_threads(1)
-        self._policy, self._kept = policy, factory.kept
+        self._policy, self._kept = policy, KeptPrints()
         steps, reported_at = 0, 0.0
 
         def on_step() -> None:
@@ -108,7 +94,7 @@ class Cars:
                 beats.report.remote(factory.worker, steps)
 
         self._collector = TorchRLCollector(
-            replace(factory, on_step=on_step)(),
+            replace(factory, prints=self._kept, on_step=on_step)(),
             policy,
             frames_per_batch=frames_per_batch,
             total_frames=-1,
@@ -171,7 +157,7 @@ class RayCollector(Collector):
         self._hang_timeout_s = config.hang_timeout_s
         self._begun_from = state or {}
         self._began = False
-        refuse_other_cars(self._begun_from, {worker_name(worker) for worker in range(config.processes)})
+        states = states_of(self._begun_from, config.processes)
         ray_cluster.check_collector(config)
         self._beats = ray.remote(num_cpus=0)(Beats).remote()
         self._asked, self._reported = self._beats.steps.remote(), dict[int, int]()
@@ -179,23 +165,18 @@ class RayCollector(Collector):
         self._cars = [kind.remote() for _ in range(config.processes)]
         self._where = ["Ray cluster"] * config.processes
         try:
-            self._start(config, setup, frames_per_batch)
+            self._start(config, setup, frames_per_batch, states)
         except BaseException:
             self.close()
             raise
 
-    def _start(self, config: CollectorConfig, setup: RaceSetup, frames_per_batch: int) -> None:
+    def _start(
+        self, config: CollectorConfig, setup: RaceSetup, frames_per_batch: int, states: Sequence[Any]
+    ) -> None:
         frames = -(-frames_per_batch // (len(self._cars) * config.cars)) * config.cars
         threads = config.threads or 1
         factories = [
-            RemoteEnvFactory(
-                setup=setup,
-                worker=worker,
-                n_cars=config.cars,
-                threads=threads,
-                run_dir=self._run_dir,
-                heartbeat=None,
-            )
+            EnvFactory(setup=setup, worker=worker, n_cars=config.cars, threads=threads, run_dir=self._run_dir)
             for worker in range(len(self._cars))
         ]
         policy = self._ray.put(self._policy)
@@ -204,8 +185,7 @@ class RayCollector(Collector):
             max(_START_TIMEOUT_S, self._hang_timeout_s),
         )
         self._where = [f"process {pid} on {address}" for address, pid in built]
-        if self._begun_from:
-            states = [self._begun_from[worker_name(worker)] for worker in range(len(self._cars))]
+        if states:
             self._ask(lambda worker: self._cars[worker].put_state.remote(states[worker]))
 
     def next_batch(self) -> TensorDictBase:
@@ -224,7 +204,7 @@ class RayCollector(Collector):
         if not self._began:
             return dict(self._begun_from)
         states = self._ask(lambda worker: self._cars[worker].take_state.remote())
-        return {worker_name(worker): state for worker, state in enumerate(states)}
+        return by_worker(states)
 
     def close(self) -> None:
         """End every worker."""

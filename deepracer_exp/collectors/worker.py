@@ -17,7 +17,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.rewards.prints import RewardPrints
-from deepracer_exp.runs.crash_dump import keep_state, write_crash_dump
+from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import REWARD_PRINTS
 
 
@@ -34,8 +34,12 @@ class EnvFactory:
     n_cars: int
     threads: int
     run_dir: Path
-    heartbeat: Path | None
-    """None: the environment lives in the training process."""
+    heartbeat: Path | None = None
+    """None: the environment does not live in a worker process of this machine."""
+    prints: RewardPrints | None = None
+    """Takes what reward functions print; None: the file in the run's folder."""
+    on_step: Callable[[], None] | None = None
+    """Called after every step; a worker process counts its own in `heartbeat` instead."""
 
     def __call__(self) -> RaceEnv:
         """Return the environment, with the process around it made ready."""
@@ -51,27 +55,36 @@ class EnvFactory:
             self.n_cars,
             threads=self.threads,
             first_car=self.worker * self.n_cars,
-            prints=self._prints(),
+            prints=self.prints or RewardPrints(self.run_dir / REWARD_PRINTS),
         )
         if self.heartbeat is None:
-            return _StateKeepingEnv(race, on_step=self._sign_of_life())
+            return _StateKeepingEnv(race, self.on_step)
         beats, worker = np.memmap(self.heartbeat, np.int64, "r+"), self.worker
         beats[worker] = 0
 
         def beat() -> None:
             beats[worker] += 1
 
-        return _WorkerEnv(race, beat, self.run_dir, worker)
+        def end(error: RunFailed) -> None:
+            write_crash_dump(self.run_dir, error, worker)
+            sys.stderr.flush()
+            # No traceback from here: the training process finds the dump, prints its line and holds the exit code.
+            os._exit(RunFailed.exit_code)
 
-    def _prints(self) -> RewardPrints:
-        return RewardPrints(self.run_dir / REWARD_PRINTS)
-
-    def _sign_of_life(self) -> Callable[[], None] | None:
-        return None
+        return _StateKeepingEnv(race, beat, end)
 
 
 class _StateKeepingEnv(RaceEnv):
     """A RaceEnv whose state can be taken and put back, and whose failure carries the cars' state."""
+
+    def __init__(
+        self,
+        race: Race,
+        on_step: Callable[[], None] | None,
+        on_failure: Callable[[RunFailed], None] = lambda error: None,
+    ):
+        super().__init__(race, on_step)
+        self._on_failure = on_failure
 
     def take_state(self) -> dict[str, Any]:
         """Return the cars and the process's stream of random numbers, with which actions are sampled."""
@@ -86,23 +99,7 @@ class _StateKeepingEnv(RaceEnv):
         try:
             return super()._step(tensordict)
         except RunFailed as error:
-            keep_state(error, self.race)
+            if not hasattr(error, "arrays"):
+                error.arrays = self.race.state_arrays()  # type: ignore[attr-defined]
+            self._on_failure(error)
             raise
-
-
-class _WorkerEnv(_StateKeepingEnv):
-    """An environment whose failure is put on disk for the training process to find; then the worker is gone."""
-
-    def __init__(self, race: Race, beat: Callable[[], None], run_dir: Path, worker: int):
-        super().__init__(race, on_step=beat)
-        self._run_dir = run_dir
-        self._worker = worker
-
-    def _step(self, tensordict):  # type: ignore[no-untyped-def]
-        try:
-            return super()._step(tensordict)
-        except RunFailed as error:
-            write_crash_dump(self._run_dir, error, worker=self._worker)
-            sys.stderr.flush()
-            # No traceback from here: the training process prints the one line and holds the exit code.
-            os._exit(RunFailed.exit_code)

@@ -8,17 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.env.race import Race
-from deepracer_exp.errors import RunFailed
 from deepracer_exp.files import atomic_write
 
 from .files import CRASH_DUMPS
-
-
-def keep_state(error: RunFailed, race: Race) -> None:
-    """Give an error that has no `arrays` the cars' state as it is now."""
-    if not hasattr(error, "arrays"):
-        error.arrays = race.state_arrays()  # type: ignore[attr-defined]
 
 
 def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = None) -> None:

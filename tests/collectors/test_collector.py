@@ -60,9 +60,9 @@ def test_processes_are_as_many_as_asked_for_or_as_there_are_cores():
     ids=["in_process", "sync", "async"],
 )
 def test_a_batch_has_cars_first_and_time_last_in_whole_steps_of_all_cars(collect, overrides, shape):
-    batches = iter(collect(*overrides))
+    collection = collect(*overrides)
     for turn in range(3):
-        batch = next(batches)
+        batch = collection.next_batch()
         assert batch.batch_size == shape
         trace = batch["next", "trace"].numpy()
         cars = trace[:, :, PACKED["car"]]
@@ -78,8 +78,7 @@ def test_a_batch_has_cars_first_and_time_last_in_whole_steps_of_all_cars(collect
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_the_cars_of_the_workers_drive_with_the_weights_published_last(collect, mode):
     collection = collect(f"collector={mode}", "collector.processes=2")
-    batches = iter(collection)
-    next(batches)
+    collection.next_batch()
     chosen = 3
     with torch.no_grad():
         for parameter in collection.networks.policy.parameters():
@@ -87,18 +86,18 @@ def test_the_cars_of_the_workers_drive_with_the_weights_published_last(collect, 
         last_bias = [p for p in collection.networks.policy.parameters() if p.ndim == 1][-1]
         last_bias[chosen] = 100.0
     collection.publish_policy()
-    batch = next(batches)
+    batch = collection.next_batch()
     for _ in range(0 if mode == "sync" else 50):  # what was on its way is driven by earlier weights
         if (batch["action"] == chosen).all():
             break
-        batch = next(batches)
+        batch = collection.next_batch()
     assert (batch["action"] == chosen).all()
 
 
 def test_nothing_is_left_when_it_is_closed(collect, tmp_path):
     before = set(multiprocessing.active_children())
     with collect("collector=sync", "collector.processes=2") as collection:
-        next(iter(collection))
+        collection.next_batch()
         assert len(set(multiprocessing.active_children()) - before) == 2
         assert (tmp_path / ".heartbeat").exists()
     assert set(multiprocessing.active_children()) == before
@@ -108,7 +107,7 @@ def test_nothing_is_left_when_it_is_closed(collect, tmp_path):
 def test_no_worker_is_waited_for_when_an_error_leaves_the_block(collect):
     before = set(multiprocessing.active_children())
     collection = collect("collector=async", "collector.processes=2")
-    next(iter(collection))
+    collection.next_batch()
     began = time.monotonic()
     with pytest.raises(ZeroDivisionError), collection:
         raise ZeroDivisionError

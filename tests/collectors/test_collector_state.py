@@ -60,11 +60,11 @@ class Driver:
         collection.publish_policy()
 
     def collect(self, collection: LocalCollector, turns: range) -> list:
-        batches, source = [], iter(collection)
+        batches = []
         for turn in turns:
             if turn:
                 self.learn(collection, turn)
-            batches.append(next(source).exclude("collector").clone())
+            batches.append(collection.next_batch().exclude("collector").clone())
         return batches
 
     def close(self) -> None:
