@@ -45,6 +45,23 @@ def reading(what: object, accepted: str = "") -> Iterator[None]:
         raise BadInput(f"{what}: {_reason(error)}{hint}") from error
 
 
+@contextmanager
+def writing(
+    what: object, accepted: str = "", failure: type[Exception] = BadInput, also: type[Exception] = OSError
+) -> Iterator[None]:
+    """Turn an OSError, and what else is named, while a file is written into `BadInput` or another failure.
+
+    `what` and `accepted` are those of `reading`.
+    """
+    try:
+        yield
+    except (OSError, also) as error:
+        hint = f"; accepted: {accepted}" if accepted else ""
+        raise failure(
+            f"{what}: cannot be written: {getattr(error, 'strerror', None) or error}{hint}"
+        ) from error
+
+
 def is_refused_memory(error: BaseException) -> bool:
     """Return whether an allocation was refused, for which torch raises a RuntimeError."""
     return isinstance(error, MemoryError) or "can't allocate memory" in str(error)

@@ -1,7 +1,7 @@
 """The results of runs side by side."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from deepracer_exp.config.stored import ABSENT as NOTHING
@@ -24,52 +24,43 @@ def last_value(record: RunRecord, column: str) -> float | None:
     return None if None in known else sum(known) / len(known)
 
 
-Result = tuple[str, Callable[[RunRecord], Any], str, int]
-
-
-def _moment(name: str) -> Callable[[RunRecord], Any]:
-    return lambda record: (record.summary.get(name) or {}).get("env_steps")
-
-
-def _last(name: str) -> Callable[[RunRecord], Any]:
-    return lambda record: last_value(record, name)
-
-
-def _best(name: str) -> Callable[[RunRecord], Any]:
-    def of(record: RunRecord) -> Any:
-        result = result_of(record.summary)
-        return getattr(result, name) if result is not None and result.evaluated else None
-
-    return of
-
-
-def _times(factor: float, value: Callable[[RunRecord], Any]) -> Callable[[RunRecord], Any]:
-    def scaled(record: RunRecord) -> Any:
-        found = value(record)
-        return None if found is None else factor * found
-
-    return scaled
-
-
-RESULTS: tuple[Result, ...] = (
-    ("end", lambda record: record.summary.get("reason") or "running, or was killed", "{}", 0),
-    ("control steps", _last("env_steps"), "{:,.0f}", 0),
-    ("minutes", _times(1 / 60, _last("wall_clock_s")), "{:.1f}", 0),
-    ("cost", lambda record: record.summary.get("cost"), "{:.2f}", 0),
-    ("best checkpoint", _best("iteration"), "{:06d}", 0),
-    *((name, _best(key), form, better) for name, key, form, better in FIGURES),
-    ("laps in training", _last("laps"), "{:,.0f}", 1),
-    ("completion in training, %", _last("completion"), "{:.1f}", 1),
-    ("complete laps in training, %", _times(100, _last("lap_share")), "{:.0f}", 1),
-    ("best lap in training, s", _last("best_lap_time_s"), "{:.2f}", -1),
-    ("mean lap in training, s", _last("mean_lap_time_s"), "{:.2f}", -1),
-    ("steps to the first lap", _moment("first_lap"), "{:,.0f}", -1),
-    ("steps until reliable", _moment("reliable"), "{:,.0f}", -1),
-    ("return", _last("mean_return"), "{:.1f}", 0),
-    ("entropy, nats", _last("entropy"), "{:.2f}", 0),
+RESULTS: tuple[tuple[str, str, str, int], ...] = (
+    ("end", "end", "{}", 0),
+    ("control steps", "last env_steps", "{:,.0f}", 0),
+    ("minutes", "minutes", "{:.1f}", 0),
+    ("cost", "cost", "{:.2f}", 0),
+    ("best checkpoint", "iteration", "{:06d}", 0),
+    *FIGURES,
+    ("laps in training", "last laps", "{:,.0f}", 1),
+    ("completion in training, %", "last completion", "{:.1f}", 1),
+    ("complete laps in training, %", "laps_percent in training", "{:.0f}", 1),
+    ("best lap in training, s", "last best_lap_time_s", "{:.2f}", -1),
+    ("mean lap in training, s", "last mean_lap_time_s", "{:.2f}", -1),
+    ("steps to the first lap", "first_lap", "{:,.0f}", -1),
+    ("steps until reliable", "reliable", "{:,.0f}", -1),
+    ("return", "last mean_return", "{:.1f}", 0),
+    ("entropy, nats", "last entropy", "{:.2f}", 0),
 )
 """The results that are compared: of the evaluation of the best checkpoint, and of the last iteration of the training.
-Each has a name, a value, a format, and whether a higher value is better (1), a lower one (-1), or neither (0)."""
+Each has a name, a key of `_values`, a format, and whether a higher value is better (1), a lower one (-1), or neither
+(0)."""
+
+
+def _values(record: RunRecord) -> dict[str, Any]:
+    """Return the results of a run by key; those that it does not have are missing or None."""
+    summary, result = record.summary, result_of(record.summary)
+    columns = {key.partition("/")[0] for key in record.rows[-1]}
+    last = {column: last_value(record, column) for column in columns}
+    seconds, share = last.get("wall_clock_s"), last.get("lap_share")
+    return {
+        "end": summary.get("reason") or "running, or was killed",
+        "cost": summary.get("cost"),
+        "minutes": None if seconds is None else seconds / 60,
+        "laps_percent in training": None if share is None else 100 * share,
+        **{moment: (summary.get(moment) or {}).get("env_steps") for moment in ("first_lap", "reliable")},
+        **(vars(result) if result is not None and result.evaluated else {}),
+        **{f"last {column}": value for column, value in last.items()},
+    }
 
 
 def results(records: Sequence[RunRecord]) -> list[tuple[str, list[str], int | None]]:
@@ -77,9 +68,9 @@ def results(records: Sequence[RunRecord]) -> list[tuple[str, list[str], int | No
 
     Results that no run has are left out.
     """
-    lines = []
-    for name, value, form, better in RESULTS:
-        values = [value(record) for record in records]
+    lines, found_of = [], [_values(record) for record in records]
+    for name, key, form, better in RESULTS:
+        values = [found.get(key) for found in found_of]
         if all(found is None for found in values):
             continue
         known = [found for found in values if found is not None]

@@ -3,9 +3,9 @@
 import argparse
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from deepracer_exp.errors import BadInput, count, reading
+from deepracer_exp.errors import BadInput, count, reading, writing
 from deepracer_exp.files import LOG_BYTES, open_user_file
 from deepracer_exp.runs.files import REPORT, is_run
 
@@ -69,23 +69,13 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         metavar="RUN | LOGS",
         help="runs or logs to compare it with",
     )
-    parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(
         "--reward",
         metavar="NAME | FILE",
         help="reward function, of the zoo or a file, to replay on its steps",
     )
     parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
-    parser.add_argument(
-        "--track",
-        metavar="NAME | ROUTE",
-        help="one of several tracks, or the route (.npy) of an unknown one",
-    )
-    parser.add_argument(
-        *("-o", "--output"),
-        metavar="FILE",
-        help="page to write (default: report.html of a run, else NAME-analysis.html)",
-    )
+    _add_page(parser, "report.html of a run, else NAME-analysis.html")
 
     parser = add_command(
         commands,
@@ -99,13 +89,15 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(parser, "checkpoint=NAME | runs_dir=DIR | tracking.uri=URI", many=True)
     parser.usage = "%(prog)s [-h] [--open] [--track NAME | ROUTE] [-o FILE] RUN LOGS [KEY=VALUE ...]"
+    _add_page(parser, "NAME-comparison.html")
+
+
+def _add_page(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(
         "--track", metavar="NAME | ROUTE", help="one of several tracks, or the route (.npy) of an unknown one"
     )
-    parser.add_argument(
-        "-o", "--output", metavar="FILE", help="page to write (default: NAME-comparison.html)"
-    )
+    parser.add_argument("-o", "--output", metavar="FILE", help=f"page to write (default: {default})")
 
 
 def _analyze(args: argparse.Namespace) -> int:
@@ -135,26 +127,28 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.reward_comparison import compare_rewards
     from deepracer_exp.evaluation.reward_replay import replay_reward
     from deepracer_exp.evaluation.reward_terms import run_terms
-    from deepracer_exp.runs.own_recording import read_log
+    from deepracer_exp.runs.files import read_config, sees_pictures
+    from deepracer_exp.runs.own_recording import is_own_run, read_log
 
     recording = read_log(place)
-    car = _car(place)
+    try:
+        config = read_config(place) if is_own_run(place) else {}
+    except BadInput:  # the page lists which files could not be read
+        config = {}
+    car = _car(config)
     view, terms = run_terms(prepare(recording, args.track), car)
     strip: list[Glimpse] = []
-    if _sees_pictures(place):
+    if sees_pictures(config):
         from deepracer_exp.evaluation.sight import run_glimpses
 
         view, strip = run_glimpses(view, place)
     others = [_light(prepare(read_log(other))) for other in beside]
     replay = None if reward is None else compare_rewards(view, replay_reward(view, reward, car))
-    out = Path(args.output) if args.output else _default_out(place, recording.name)
+    default = place / REPORT if is_own_run(place) else _page("analysis", recording.name)
+    out = Path(args.output or default)
     found = findings(view, target_s)
-    try:
+    with writing(f"--output {out}", "a file in a folder"):
         write_page(out, LogPage(view, found, others, replay, terms, strip))
-    except OSError as error:
-        raise BadInput(
-            f"--output {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
-        ) from error
 
     print(f"{view.name}: {headline(view)}")
     for number, one in enumerate(found, 1):
@@ -180,10 +174,8 @@ def _compare(args: argparse.Namespace) -> int:
     name, logs = given
     _check_output(args.output)
     chosen = stores.values.get("checkpoint")
-    try:
+    with reading(f"checkpoint={chosen}"):
         chosen = chosen and checked_checkpoint_name(chosen)
-    except ValueError as error:
-        raise BadInput(f"checkpoint={chosen}: {error}") from None
     place = _logs(logs)
     if place is None and not is_run(Path(name)) and _logs(name) is not None:
         raise BadInput(f"{name}: is no run; write {shlex.join(['deepracer-exp', 'compare', logs, name])}")
@@ -208,13 +200,9 @@ def _compare(args: argparse.Namespace) -> int:
     run = resolve(name, stores.runs_dir, stores.uri)
     with warnings_on_stderr():
         both = race_against_log(run, chosen, view, args.track, Console(stderr=True, highlight=False))
-    out = Path(args.output) if args.output else _page("comparison", view.name)
-    try:
+    out = Path(args.output or _page("comparison", view.name))
+    with writing(f"--output {out}", "a file in a folder"):
         write_against_log(out, run.path.name, both, view)
-    except OSError as error:
-        raise BadInput(
-            f"--output {out}: cannot be written: {error.strerror}; accepted: a file in a folder"
-        ) from error
 
     console, texts = table_console(), both.texts
     table = Table(box=None, pad_edge=False)
@@ -279,29 +267,15 @@ def _place(what: str, stores: Stores) -> Path:
         raise BadInput(f"{what}: no such file or folder, and no run: {why}") from None
 
 
-def _car(place: Path) -> "CarConfig":
+def _car(config: dict[str, Any]) -> "CarConfig":
     """Return the car of a run of ours; the service's has the dimensions of the default one."""
     from deepracer_exp.config.compose import compose_experiment
     from deepracer_exp.config.parse import parse_experiment
-    from deepracer_exp.runs.files import read_config
-    from deepracer_exp.runs.own_recording import is_own_run
 
     try:
-        if is_own_run(place):
-            return parse_experiment(read_config(place)).car
+        return parse_experiment(config).car if config else compose_experiment([])[0].car
     except BadInput:  # another version, whose cars had the same dimensions
-        pass
-    return compose_experiment([])[0].car
-
-
-def _sees_pictures(place: Path) -> bool:
-    from deepracer_exp.runs.files import read_config, sees_pictures
-    from deepracer_exp.runs.own_recording import is_own_run
-
-    try:
-        return is_own_run(place) and sees_pictures(read_config(place))
-    except BadInput:  # the page lists which files could not be read
-        return False
+        return compose_experiment([])[0].car
 
 
 def _light(view: "LogView") -> "LogView":
@@ -311,14 +285,6 @@ def _light(view: "LogView") -> "LogView":
     steps = view.recording.steps
     recording = replace(view.recording, steps=steps[steps["stream"] != "training"].copy())
     return replace(view, steps=view.steps.iloc[:0].copy(), recording=recording)
-
-
-def _default_out(place: Path, name: str) -> Path:
-    from deepracer_exp.runs.own_recording import is_own_run
-
-    if is_own_run(place):
-        return place / REPORT
-    return _page("analysis", name)
 
 
 def _page(kind: str, name: str) -> Path:

@@ -9,18 +9,12 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
 
-from .arguments import (
-    add_command,
-    add_run,
-    run_and_overrides,
-    runs_and_overrides,
-    split_stores,
-)
+from .arguments import add_command, add_run, run_and_overrides, runs_and_overrides, split_stores
 from .output import table_console, warnings_on_stderr
 from .startup import check_policy
 
 if TYPE_CHECKING:
-    pass
+    from deepracer_exp.config.evaluation import EvaluateConfig
 
 _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
@@ -110,17 +104,15 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_entry, compose_evaluation
-    from deepracer_exp.config.overrides import override_line
-
     if args.cfg:
+        from deepracer_exp.config.compose import compose_entry
+        from deepracer_exp.config.overrides import override_line
+
         runs, overrides = runs_and_overrides(args)
         named = [override_line("run", run) for run in runs]
         print(compose_entry("evaluate", [*overrides, *named]).yaml(), end="")
         return 0
-    run, overrides = run_and_overrides(args)
-    config, _ = compose_evaluation([*overrides, override_line("run", run)])
-    args.debug = config.debug
+    config, _ = _composed(args)
     if args.video is not None:
         _check_film("--video", Path(args.video))
         _choose_graphics()
@@ -137,6 +129,21 @@ def _evaluate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _composed(args: argparse.Namespace) -> "tuple[EvaluateConfig, bool]":
+    """Return the configuration of the command line, and whether the trials are those of the training."""
+    from deepracer_exp.config.compose import compose_evaluation
+    from deepracer_exp.config.overrides import group_of, override_line
+
+    run, overrides = run_and_overrides(args)
+    config, _ = compose_evaluation([*overrides, override_line("run", run)])
+    args.debug = config.debug
+    return config, not any(group_of(given) == "evaluation" for given in overrides)
+
+
+def _checkpoints_given(args: argparse.Namespace) -> list[str]:
+    return [given for given in run_and_overrides(args)[1] if given.startswith("checkpoint=")]
+
+
 _WATCH_EPILOG = """\
   deepracer-exp watch RUN                                   film the best lap of its best checkpoint
   deepracer-exp watch RUN checkpoint=last -o last.mp4
@@ -148,22 +155,16 @@ The page shows the laps that the training evaluates its policy by; evaluation=NA
 
 
 def _watch(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_evaluation
-    from deepracer_exp.config.overrides import group_of, override_line
-
-    run, overrides = run_and_overrides(args)
-    chosen = [given for given in overrides if given.startswith("checkpoint=")]
-    if args.live and (chosen or args.output is not None):
-        given = chosen[0] if chosen else f"--output {args.output}"
+    chosen = [*_checkpoints_given(args), *[f"--output {args.output}"] * (args.output is not None)]
+    if args.live and chosen:
         raise BadInput(
-            f"{given}: --live serves a page of the newest checkpoint; accepted: only without --live"
+            f"{chosen[0]}: --live serves a page of the newest checkpoint; accepted: only without --live"
         )
     if args.port is not None and not args.live:
         raise BadInput(f"--port {args.port}: accepted: only with --live")
     if args.output is not None:
         _check_film("--output", Path(args.output))
-    config, _ = compose_evaluation([*overrides, override_line("run", run)])
-    args.debug = config.debug
+    config, own_trials = _composed(args)
     if not args.live:
         check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation)
 
@@ -183,8 +184,6 @@ def _watch(args: argparse.Namespace) -> int:
     # Its first checkpoint may be still to come.
     stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     import_own_classes(stored.experiment, OF_POLICY)
-    own_trials = not any(group_of(given) == "evaluation" for given in overrides)
-
     protocol = stored.experiment.evaluation if own_trials else config.evaluation
     with LiveServer(args.port or 0) as server, warnings_on_stderr():
         print(server.url, flush=True)
@@ -234,20 +233,13 @@ def _choose_graphics() -> None:
 
 
 def _checkpoints(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_evaluation
-    from deepracer_exp.config.overrides import group_of, override_line
-
-    run, overrides = run_and_overrides(args)
-    chosen = [given for given in overrides if given.startswith("checkpoint=")]
-    if chosen:
+    if chosen := _checkpoints_given(args):
         raise BadInput(f"{chosen[0]}: all kept checkpoints are raced; `deepracer-exp evaluate` races one")
     if args.output is not None:
         page = Path(args.output)
         if page.suffix != ".html" or not page.absolute().parent.is_dir():
             raise BadInput(f"--output {page}: accepted: the name of a page (.html) in a folder")
-    config, _ = compose_evaluation([*overrides, override_line("run", run)])
-    own_trials = not any(group_of(given) == "evaluation" for given in overrides)
-    args.debug = config.debug
+    config, own_trials = _composed(args)
     check_policy(config.run, config.runs_dir, config.tracking.uri, None, config.evaluation)
 
     from rich.console import Console
@@ -286,11 +278,10 @@ def _replay(args: argparse.Namespace) -> int:
 
     from deepracer_exp.training.stopping_replay import replay, table
 
-    rules = [(_shown(lines), compose_experiment(lines)[0].stopping) for lines in expand_grid(overrides)]
-    replays = [replay(record, config, rule) for record in records for rule, config in rules]
+    rules = [
+        (" ".join(line.removeprefix("stopping").lstrip(".=") for line in lines), compose_experiment(lines)[0])
+        for lines in expand_grid(overrides)
+    ]
+    replays = [replay(record, config.stopping, rule) for record in records for rule, config in rules]
     table_console().print(table(replays))
     return 0
-
-
-def _shown(overrides: list[str]) -> str:
-    return " ".join(override.removeprefix("stopping").lstrip(".=") for override in overrides)

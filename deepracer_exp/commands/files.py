@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, writing
 
 from .arguments import add_command, add_overrides, add_run, run_and_overrides
 from .output import print_notes, table_console, warnings_on_stderr
@@ -318,10 +318,8 @@ def _show_track(name: str, output: str | None) -> None:
     is_file = Path(name).suffix in (".npy", ".yaml", ".yml")
     track = _track(override_line("track.file" if is_file else "track", name))
     if output is not None:
-        try:
+        with writing(f"--output {output}", "", BadInput, ValueError):  # an unknown ending
             draw_picture(track, output)
-        except (OSError, ValueError) as error:
-            raise BadInput(f"--output {output}: cannot be written: {error}") from error
     wide, high = shutil.get_terminal_size((COLUMNS, ROWS))
     print(
         f"{track.title} ({track.name}): {track.length_m:.2f} m, {track.width_m:.2f} m wide, "

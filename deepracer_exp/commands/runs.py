@@ -10,7 +10,7 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import TYPE_CHECKING, Any
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, reading, writing
 from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY, run_folders
 
 from .arguments import (
@@ -172,7 +172,7 @@ def _list(args: argparse.Namespace) -> int:
     for folder in sorted(folders, key=lambda one: (folders[one], one), reverse=True):
         try:
             summary = read_object(folder / SUMMARY)
-            state = str(summary["status"]) if "status" in summary else _state_without_end(folder)
+            state = str(summary.get("status") or _state_without_end(folder))
         except BadInput:  # one damaged run does not hide the others
             summary, state = {}, "unreadable"
         best = summary.get("best") or {}
@@ -244,10 +244,8 @@ def _compare(args: argparse.Namespace) -> int:
         from deepracer_exp.analysis.page import write_chart
 
         chart = learning_curves_compared(dict(zip(ascii_uppercase, records, strict=False)))
-        try:
+        with writing(f"--output {args.output}"):
             write_chart(Path(args.output), chart)
-        except OSError as error:
-            raise BadInput(f"--output {args.output}: cannot be written: {error}") from error
     console = table_console()
     for letter, record in zip(ascii_uppercase, records, strict=False):
         console.print(f"{letter}  {record.path}", soft_wrap=True)
@@ -322,6 +320,8 @@ def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
     """Return two lines: what the run is and achieved, and what it changed."""
     from rich.text import Text
 
+    from deepracer_exp.analysis.comparison import value_text
+
     asked_for = member.path == run.resolve()
     label = Text(member.name, style="bold reverse" if asked_for else "bold" if member.record else "dim")
     if asked_for:
@@ -330,33 +330,24 @@ def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
         label.append(f"  * {best[id(member)]}", style="not reverse bold green")
     facts = [f"generation {member.generation}"]
     if member.lineage is not None:
-        facts.append(f"from {member.lineage.checkpoint}")
-    if member.lineage is not None and member.lineage.registered is not None:
-        facts.append(member.lineage.registered)
-    facts += _result(member)
+        facts += [f"from {member.lineage.checkpoint}", *filter(None, [member.lineage.registered])]
+    if member.record is None:
+        facts.append("missing: its folder was removed")
+    elif (status := member.record.summary.get("status", "running or killed")) != "finished":
+        facts.append(str(status))
+    if member.result is not None:
+        facts.append(member.result.words())
     label.append("\n" + ", ".join(facts), style="not reverse not bold")
-    changes = [f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in member.changes.items()]
+    texts = [
+        [f"{value:g}" if isinstance(value, float) else value_text(value, 32) for value in both]
+        for both in member.changes.values()
+    ]
+    changes = [f"{key} {old} -> {new}" for key, (old, new) in zip(member.changes, texts, strict=True)]
     if len(changes) > _MOST_CHANGES:
         changes[_MOST_CHANGES:] = [f"and {len(changes) - _MOST_CHANGES} more"]
     if changes:
         label.append("\n" + ", ".join(changes), style="not reverse not bold dim")
     return label
-
-
-def _result(member: "Member") -> list[str]:
-    if member.record is None:
-        return ["missing: its folder was removed"]
-    status = member.record.summary.get("status", "running or killed")
-    facts = [] if status == "finished" else [str(status)]
-    if member.result is not None:
-        facts.append(member.result.words())
-    return facts
-
-
-def _value(value: object) -> str:
-    from deepracer_exp.analysis.comparison import value_text
-
-    return f"{value:g}" if isinstance(value, float) else value_text(value, 32)
 
 
 def _promote(args: argparse.Namespace) -> int:
@@ -375,10 +366,8 @@ def _promote(args: argparse.Namespace) -> int:
     if args.model is not None:
         check_model("--model", args.model)
     given = stores.values.get("checkpoint")
-    try:
+    with reading(f"checkpoint={given}"):
         checkpoint = given and checked_checkpoint_name(given)
-    except ValueError as error:
-        raise BadInput(f"checkpoint={given}: {error}") from None
     run = resolve(name, stores.runs_dir, stores.uri)
 
     from deepracer_exp.env.observation import feature_names, observation_shape
@@ -403,6 +392,8 @@ def _promote(args: argparse.Namespace) -> int:
 
 
 def _clean(args: argparse.Namespace) -> int:
+    from rich.filesize import decimal
+
     from deepracer_exp.runs.clean import remove, survey, total
 
     stores = read_stores(args.overrides)
@@ -423,7 +414,7 @@ def _clean(args: argparse.Namespace) -> int:
         print("nothing to remove")
     elif args.apply:
         removed = [item for item in found.removable if remove(item)]
-        print(f"removed {_bytes(total(removed))}")
+        print(f"removed {decimal(total(removed))}")
         for item in found.removable:
             if item not in removed:
                 print(f"kept: {item.run.relative_to(runs_dir)}: a training or a clone has started meanwhile")
@@ -447,6 +438,7 @@ def _overview(uri: str | None, runs_dir: Path) -> "tuple[StoreOverview | None, s
 
 
 def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Console") -> None:
+    from rich.filesize import decimal
     from rich.table import Table
 
     from deepracer_exp.runs.clean import SPARE_CHECKPOINTS, total
@@ -457,9 +449,9 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
     table.columns[0].justify = "right"
     for item in items:
         what = f"{item.what}: {_names(item)}" if item.what == SPARE_CHECKPOINTS else item.what
-        table.add_row(_bytes(item.size), what, str(item.run.relative_to(runs_dir)))
+        table.add_row(decimal(item.size), what, str(item.run.relative_to(runs_dir)))
     table.add_row()
-    table.add_row(_bytes(total(items)), "in all", "")
+    table.add_row(decimal(total(items)), "in all", "")
     console.print(table)
     console.print()
 
@@ -467,12 +459,6 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
 def _names(item: "Removable") -> str:
     names = [path.name for path in item.paths]
     return ", ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]} ({len(names)})"
-
-
-def _bytes(size: int) -> str:
-    from rich.filesize import decimal
-
-    return decimal(size)
 
 
 def _ui(args: argparse.Namespace) -> int:

@@ -7,7 +7,6 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from tensordict import TensorDict
 from torch import nn
 
 from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps
@@ -22,14 +21,13 @@ from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.recording import STEP_COLUMNS
 from deepracer_exp.deepracer.trace import to_table
 from deepracer_exp.deepracer.worlds import find_world
-from deepracer_exp.env.race import Race
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.tracks.track import Track
 
 from .evaluator import Evaluator
-from .race_protocol import RaceProtocol
+from .film import LapRecorder
 
 STREAM = "simulated"
 MOST_STARTS = 20
@@ -38,7 +36,6 @@ _TIME_LIMIT = 3.0
 """How much longer than the longest logged race a simulated one may take, ..."""
 _LEAST_S = 60.0
 """... and this long in any case."""
-_ROUNDING_S = 1e-9
 
 
 def race_against_log(
@@ -142,13 +139,8 @@ def race_as_logged(
         held_out=None,
     )
     evaluator = Evaluator(replace(experiment, track=config), protocol, threads=1)
-    rows: list[NDArray[np.float64]] = []
-
-    def record(race: Race, protocol: RaceProtocol, _: TensorDict) -> None:
-        rows.append(np.column_stack([race.trace, protocol.clock_s]))
-
-    attempts = evaluator(policy, record).groups[0].attempts
-    driven = np.array(rows)  # (steps, trials, columns and clock)
+    recorder = LapRecorder(evaluator)
+    attempts = evaluator(policy, recorder).groups[0].attempts
     kept = [
         one
         for trial in range(len(starts))
@@ -156,18 +148,16 @@ def race_as_logged(
     ]
     tables = []
     for number, attempt in enumerate(kept):
-        clock_s = driven[:, attempt.trial, -1]  # that of a finished trial stands still
-        after_s = attempt.begin_s + _ROUNDING_S if attempt.begin_s > 0 else -1.0
-        own = (clock_s > after_s) & (clock_s <= attempt.begin_s + attempt.time_s + _ROUNDING_S)
-        own &= np.diff(clock_s, prepend=-1.0) > 0
-        packed = driven[own, attempt.trial]
+        first = int(attempt.begin_s > 0)  # the first step of a flying lap is the last of the one before
+        own, packed = recorder.rows(attempt)
+        own, packed = own[first:], packed[first:]
         steps = to_table(packed[:, :-1], 0, [config.name]).to_pandas()
         tables.append(
             steps.assign(
                 stream=STREAM,
                 worker=0,
                 episode=number,
-                steps=np.flatnonzero(own) + 1,
+                steps=own + 1,
                 tstamp=packed[:, -1],
                 done=np.arange(len(steps)) == len(steps) - 1,
                 wall_clock=np.nan,

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,15 +15,15 @@ from rich.table import Table
 from deepracer_exp.analysis.charts.runs import speed_and_stability
 from deepracer_exp.analysis.page import write_chart
 from deepracer_exp.config.evaluation import EvaluateConfig
-from deepracer_exp.errors import BadInput, count
+from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.runs.result import CRITERIA
 
-from .evaluate import NOTHING, number
+from .evaluate import NOTHING, fit, number
 from .evaluator import Evaluator
-from .result import CONFIDENCE, HELD_OUT, USUAL, Evaluation, Group, Metric, Rank
+from .result import CONFIDENCE, HELD_OUT, USUAL, Evaluation, Metric, Rank
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -118,7 +117,9 @@ def lap_statistics(evaluation: Evaluation, metric: Metric) -> LapStatistics:
 
     def time_s(percent: int, condition: str = USUAL) -> float:
         groups = [group for group in evaluation.groups if group.condition == condition]
-        return float(np.mean([_percentile(group, percent) for group in groups])) if groups else math.nan
+        times = [group.lap_times_s for group in groups]
+        found = [np.percentile(some, percent) if len(some) else math.nan for some in times]
+        return float(np.mean(found)) if found else math.nan
 
     return LapStatistics(
         complete=100 * share["mean"],
@@ -134,11 +135,6 @@ def lap_statistics(evaluation: Evaluation, metric: Metric) -> LapStatistics:
         race_score_s=evaluation.race_score_s,
         rank=evaluation.rank(metric),
     )
-
-
-def _percentile(group: Group, percent: int) -> float:
-    times = group.lap_times_s
-    return float(np.percentile(times, percent)) if len(times) else math.nan
 
 
 def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str, str] | None:
@@ -166,31 +162,34 @@ def _words(found: LapStatistics) -> str:
 
 def comparison_table(results: Sequence[CheckpointResult], chosen: str, console: Console) -> Table:
     """Return the comparison as a table, one row per checkpoint, with as many columns as the console fits."""
-    hidden = () if _has_held_out(results) else (_HELD_OUT,)
-    endless = console.options.update(max_width=10_000)
-    for intervals, left_out in ((True, hidden), (True, hidden + _MINOR), (False, hidden + _MINOR)):
+
+    def lay_out(intervals: bool, left_out: Sequence[str]) -> Table:
         shown = Table(box=None, pad_edge=False)
         names = [name for name in _NAMES if name not in left_out]
-        shown.add_column("checkpoint", no_wrap=True)
-        for name in names:
-            shown.add_column(name, no_wrap=True, justify="left" if name == _LABELS else "right")
+        for name in ("checkpoint", *names):
+            shown.add_column(
+                name, no_wrap=True, justify="left" if name in ("checkpoint", _LABELS) else "right"
+            )
         for one in results:
             cells = _cells(one, intervals)
             style = "bold green" if one.name == chosen else "dim" if one.figures is None else ""
             shown.add_row(one.name, *(cells[name] for name in names), style=style)
-        if console.measure(shown, options=endless).maximum <= console.width:
-            break
-    return shown
+        return shown
+
+    return fit(console, lay_out, () if _has_held_out(results) else (_HELD_OUT,), _MINOR)
 
 
 def _has_held_out(results: Sequence[CheckpointResult]) -> bool:
     return any(one.figures is not None and math.isfinite(one.figures.held_out_completion) for one in results)
 
 
+def _labels(one: CheckpointResult) -> list[str]:
+    return [*one.labels, *["pinned"] * bool(one.pinned), *["bad"] * (one.figures is None)]
+
+
 def _cells(one: CheckpointResult, intervals: bool) -> dict[str, str]:
     """Return a checkpoint's cells by column."""
-    labels = [*one.labels, *["pinned"] * bool(one.pinned), *["bad"] * (one.figures is None)]
-    found = one.figures
+    labels, found = _labels(one), one.figures
     if found is None:
         return {name: NOTHING for name in _NAMES} | {_LABELS: ", ".join(labels)}
     share = f"{found.complete:.0f}"
@@ -209,16 +208,12 @@ def _cells(one: CheckpointResult, intervals: bool) -> dict[str, str]:
     }
 
 
-def _legend(held_out: bool) -> str:
-    return "; ".join(
-        [
-            f"laps: share of complete laps, with its {CONFIDENCE:.0%} interval in brackets",
-            "done: completion, the mean share of the lap driven",
-            *["held-out done: the same on held-out conditions"] * held_out,
-            "p25: a quarter of the laps are faster",
-            "score: race score, seconds per complete lap on all conditions, including failed laps",
-        ]
-    )
+_LEGEND = (
+    f"laps: share of complete laps, with its {CONFIDENCE:.0%} interval in brackets",
+    "done: completion, the mean share of the lap driven",
+    "p25: a quarter of the laps are faster",
+    "score: race score, seconds per complete lap on all conditions, including failed laps",
+)
 
 
 def show_checkpoints(
@@ -259,7 +254,8 @@ def show_checkpoints(
     # Lines are wrapped for a terminal, but not for a pipe, whose lines are searched.
     whole = not out.is_terminal
     out.print(comparison_table(found, best, out))
-    out.print(_legend(_has_held_out(found)), "", style="dim", soft_wrap=whole)
+    held_out = ["held-out done: the same on held-out conditions"] * _has_held_out(found)
+    out.print("; ".join([*_LEGEND[:2], *held_out, *_LEGEND[2:]]), "", style="dim", soft_wrap=whole)
     for one in found:
         if one.fault is not None:
             out.print(f"{one.name} is left out: {one.fault}", soft_wrap=whole)
@@ -268,20 +264,11 @@ def show_checkpoints(
     out.print(f"recommended: {best}: {why}", soft_wrap=whole)
     out.print(f"  use it with checkpoint={best} in evaluate, export and clone")
     if picture is not None:
-        rows = [_row(one, one.figures) for one in found if one.figures is not None]
-        try:
+        rows = [
+            {**vars(one.figures), "name": one.name, "labels": ", ".join(_labels(one))}
+            for one in found
+            if one.figures is not None
+        ]
+        with writing(picture):
             write_chart(Path(picture), speed_and_stability(run.path.name, pd.DataFrame(rows), best))
-        except (OSError, ValueError) as error:
-            raise BadInput(f"{picture}: cannot be written: {error}") from error
         out.print(f"\n{picture}: speed against stability", soft_wrap=True)
-
-
-def _row(one: CheckpointResult, found: LapStatistics) -> dict[str, Any]:
-    """Return a checkpoint as `speed_and_stability` takes it."""
-    return {
-        "name": one.name,
-        "labels": ", ".join([*one.labels, *["pinned"] * bool(one.pinned)]),
-        **{name: getattr(found, name) for name in ("lap_time_s", "complete", "low", "high")},
-        "held_out_lap_time_s": found.held_out_lap_time_s,
-        "held_out_complete": found.held_out_complete,
-    }

@@ -3,7 +3,7 @@
 import datetime
 import json
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from rich.table import Table
 from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
-from deepracer_exp.errors import RunFailed, count
+from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
@@ -24,17 +24,16 @@ from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
 from .evaluator import Evaluator
+from .film import LapRecorder, best_attempt
 from .real_car import compare, explain_controls, key_figures, losses_table
 from .result import CONFIDENCE, USUAL, Evaluation
 
 if TYPE_CHECKING:
-    from .video import LapVideo, View
-
+    from .video import View
 
 NOTHING = "\N{EN DASH}"
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s")
-_Row = tuple[str, str, dict[str, str]]
 
 
 def results_table(
@@ -48,28 +47,46 @@ def results_table(
     found = [(label, group.condition.replace("_", " "), group.statistics()) for label, group in groups]
     penalties = any(vars(config.penalty_s).values())
     hidden = (() if config.resets_per_lap else ("resets",)) + (() if penalties else ("penalty s",))
-    endless = console.options.update(max_width=10_000)
-    for intervals, left_out in ((True, hidden), (True, hidden + _MINOR), (False, hidden + _MINOR)):
+
+    def lay_out(intervals: bool, left_out: Sequence[str]) -> Table:
         rows = [(label, condition, _cells(numbers, intervals)) for label, condition, numbers in found]
-        shown = _lay_out(rows, left_out)
+        names = [name for name in rows[0][2] if name not in left_out]
+        notes = [
+            f"in brackets: {CONFIDENCE:.0%} interval of the mean, by bootstrap over the trials"
+        ] * intervals
+        notes += ["*: not trained on"] * bool(unseen)
+        shown = Table(box=None, pad_edge=False, caption="; ".join(notes), caption_justify="left")
+        for name in ("track", "on", *names):
+            shown.add_column(name, no_wrap=True, justify="right" if name in names else "left")
+        for label, condition, cells in rows:
+            whole = label == "all"
+            # Lap times of tracks of different lengths have no mean.
+            texts = [NOTHING if whole and name in _TIMES else cells[name] for name in names]
+            shown.add_row(label, condition, *texts, style="bold" * whole)
+        return shown
+
+    return fit(console, lay_out, hidden, _MINOR)
+
+
+def fit(
+    console: Console,
+    lay_out: Callable[[bool, Sequence[str]], Table],
+    hidden: tuple[str, ...],
+    minor: tuple[str, ...],
+) -> Table:
+    """Return the fullest table that fits a console.
+
+    Args:
+        console: to print on.
+        lay_out: makes it with or without intervals and without some columns.
+        hidden: columns left out in any case.
+        minor: columns left out first.
+    """
+    endless = console.options.update(max_width=10_000)
+    for intervals, left_out in ((True, hidden), (True, hidden + minor), (False, hidden + minor)):
+        shown = lay_out(intervals, left_out)
         if console.measure(shown, options=endless).maximum <= console.width:
             break
-    notes = [f"in brackets: {CONFIDENCE:.0%} interval of the mean, by bootstrap over the trials"] * intervals
-    notes += ["*: not trained on"] * bool(unseen)
-    shown.caption, shown.caption_justify = "; ".join(notes), "left"
-    return shown
-
-
-def _lay_out(rows: Sequence[_Row], left_out: Sequence[str]) -> Table:
-    names = [name for name in rows[0][2] if name not in left_out]
-    shown = Table(box=None, pad_edge=False)
-    for name in ("track", "on", *names):
-        shown.add_column(name, no_wrap=True, justify="right" if name in names else "left")
-    for label, condition, cells in rows:
-        whole = label == "all"
-        # Lap times of tracks of different lengths have no mean.
-        texts = [NOTHING if whole and name in _TIMES else cells[name] for name in names]
-        shown.add_row(label, condition, *texts, style="bold" * whole)
     return shown
 
 
@@ -95,13 +112,11 @@ def write_evaluation(
     if car is not None:
         content["real_car"] = key_figures(car)
     target = folder / EVALUATIONS
-    try:
+    with writing(target, failure=RunFailed):
         target.mkdir(exist_ok=True)
         # Microseconds, so that two within a second do not overwrite each other.
         name = now.strftime("%Y%m%d-%H%M%S-%f")
         return atomic_write(target / f"{name}.json", json.dumps(content, indent=2) + "\n")
-    except OSError as error:
-        raise RunFailed(f"{target}: the evaluation cannot be written: {error.strerror or error}") from error
 
 
 def _cells(found: Mapping[str, Any], intervals: bool) -> dict[str, str]:
@@ -146,12 +161,12 @@ def evaluate_run(
     stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, config.evaluation)
-    film = _film(evaluator, *video) if video is not None else None
+    recorder = LapRecorder(evaluator)
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
         highlight=False,
     )
-    evaluation = evaluator(stored.networks.policy, film.recorder if film is not None else None)
+    evaluation = evaluator(stored.networks.policy, recorder if video is not None else None)
     car = None
     if config.evaluation.real_car is not None:
         car = compare(run.experiment, config.evaluation, stored.networks.policy, evaluation)
@@ -164,12 +179,15 @@ def evaluate_run(
         for line in explain_controls(run.experiment, config.evaluation):
             out.print(f"  {line}", soft_wrap=True, highlight=False)
     out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
-    if film is not None:
-        film.write(evaluation, err)
-        out.print(f"  video    {film.file}", soft_wrap=True, highlight=False)
+    files = {file: EVALUATIONS}
+    if video is not None:
+        from .video import write_video  # imports MuJoCo's renderer
+
+        write_video(*video, recorder.lap(best_attempt(evaluation)), run.experiment.car, err)
+        out.print(f"  video    {video[0]}", soft_wrap=True, highlight=False)
+        files[video[0]] = FILMS
     tracking = run.experiment.tracking
     uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
-    files = {file: EVALUATIONS} | ({} if film is None else {film.file: FILMS})
     metrics = _metrics(evaluation, known)
     runs_dir = run.path.resolve().parents[1]
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
@@ -197,10 +215,3 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
         else:
             found[evaluate_metric("held_out_completion", label)] = group.completion
     return found
-
-
-def _film(evaluator: Evaluator, file: Path, view: "View") -> "LapVideo":
-    # Only videos need an encoder.
-    from .video import LapVideo
-
-    return LapVideo(evaluator, file, view)

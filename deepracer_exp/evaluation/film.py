@@ -2,12 +2,12 @@
 
 import io
 from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from imageio_ffmpeg import write_frames
 from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
@@ -17,7 +17,7 @@ from torch import nn
 
 from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.race import Race
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import RunFailed, writing
 from deepracer_exp.tracks.track import Track
 
 from .evaluator import Evaluator
@@ -58,7 +58,7 @@ class Lap:
 
 
 class LapRecorder:
-    """Records the poses of all trials while they are driven, and of one lap what the policy read and wrote."""
+    """Records the trace of all trials while they are driven, and of one lap what the policy read and wrote."""
 
     def __init__(self, evaluator: Evaluator, seen_in: Attempt | None = None) -> None:
         """Record the next evaluation.
@@ -74,7 +74,7 @@ class LapRecorder:
 
     def __call__(self, race: Race, protocol: RaceProtocol, acted: TensorDict) -> None:
         """Record one control step."""
-        self._steps.append(np.column_stack([race.trace[:, _COLUMNS], protocol.clock_s]))
+        self._steps.append(np.column_stack([race.trace, protocol.clock_s]))
         if self._seen_in is not None:
             trial = self._seen_in.trial
             before = self._steps[-2][trial, -1] if len(self._steps) > 1 else -1.0
@@ -86,16 +86,24 @@ class LapRecorder:
         """What the policy read and wrote in the lap `seen_in`, [n]."""
         return torch.stack(self._acted)
 
+    def rows(self, attempt: Attempt) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Return the steps of a lap and their numbers in the trial.
+
+        A flying lap begins with the last step of the one before.
+
+        Returns:
+            Numbers from 0, (n,); columns of the packed trace and the race clock, (n, columns + 1).
+        """
+        rows = np.array([step[attempt.trial] for step in self._steps])
+        own = np.flatnonzero(_within(attempt, np.r_[-1.0, rows[:-1, -1]], rows[:, -1]))
+        return own, rows[own]
+
     def lap(self, attempt: Attempt) -> Lap:
-        """Return the steps of a lap."""
+        """Return the poses of a lap."""
         trial, setup = self._evaluator.trials[attempt.trial], self._evaluator.race.setup
         track = setup.courses[trial.course].tracks[0]
-        rows = np.array([step[attempt.trial] for step in self._steps])
-        clock_s = rows[:, -1]
-        wanted = [
-            _within(attempt, before, now) for before, now in zip(np.r_[-1.0, clock_s], clock_s, strict=False)
-        ]
-        x_m, y_m, yaw_deg, steering_deg, speed_mps, progress, clock_s = rows[wanted].T
+        _, rows = self.rows(attempt)
+        x_m, y_m, yaw_deg, steering_deg, speed_mps, progress = rows[:, _COLUMNS].T
         return Lap(
             attempt=attempt,
             track=track,
@@ -106,13 +114,16 @@ class LapRecorder:
             steering_rad=np.radians(steering_deg),
             speed_mps=speed_mps,
             progress=progress,
-            time_s=clock_s - attempt.begin_s,
+            time_s=rows[:, -1] - attempt.begin_s,
         )
 
 
-def _within(lap: Attempt, before_s: float, now_s: float) -> bool:
-    """Return whether a step belongs to a lap; the clock of a finished trial stands still."""
-    return now_s > before_s and lap.begin_s - 1e-9 <= now_s <= lap.begin_s + lap.time_s + 1e-9
+def _within(
+    lap: Attempt, before_s: NDArray[np.float64] | float, now_s: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return whether steps belong to a lap; the clock of a finished trial stands still."""
+    after_begin, before_end = lap.begin_s - 1e-9 <= now_s, now_s <= lap.begin_s + lap.time_s + 1e-9
+    return (now_s > before_s) & after_begin & before_end
 
 
 def best_attempt(evaluation: Evaluation) -> Attempt:
@@ -155,17 +166,15 @@ def write_film(
     Raises:
         RunFailed: the file cannot be written.
     """
+    from imageio_ffmpeg import write_frames  # not everything that records laps films them
+
     writer = write_frames(str(file), size, fps=frames_per_s, quality=8, macro_block_size=16)
-    try:
+    with writing(file, failure=RunFailed), closing(writer):
         writer.send(None)
         for frame in with_progress(frames, "rendering", count, console=err, transient=True):
             writer.send(frame)
         for _ in range(round(_LINGER_S * frames_per_s)):
             writer.send(frame)
-    except OSError as error:
-        raise RunFailed(f"{file}: cannot be written: {error.strerror or error}") from error
-    finally:
-        writer.close()
 
 
 def png(image: Image.Image) -> bytes:

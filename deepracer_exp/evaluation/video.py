@@ -1,4 +1,4 @@
-"""Video of the best lap of an evaluation, rendered by MuJoCo."""
+"""Video of a lap, rendered by MuJoCo."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,12 +15,9 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
 from deepracer_exp.tracks.track import Track
 
-from .evaluator import Evaluator
-from .film import Lap, LapRecorder, best_attempt, png, write_film
-from .result import Evaluation
+from .film import Lap, png, write_film
 
 View = Literal["chase", "top"]
-VIEWS: tuple[View, ...] = ("chase", "top")
 
 WIDTH, HEIGHT = 960, 544
 """Multiples of 16, as video codecs want them."""
@@ -195,30 +192,21 @@ def draw_track(track: Track, pixels_per_m: float) -> Image.Image:
     return image.reduce(_FINER)
 
 
-class LapVideo:
-    """Records all trials while they are driven, then renders the best lap."""
+def write_video(file: Path, view: View, lap: Lap, car: CarConfig, err: Console) -> None:
+    """Render a lap as an .mp4 file, from behind the car or from above.
 
-    def __init__(self, evaluator: Evaluator, file: Path, view: View):
-        """Prepare a video of an evaluation, in an .mp4 file, from behind the car or from above."""
-        self.file, self._view, self._setup = file, view, evaluator.race.setup
-        self.recorder = LapRecorder(evaluator)
+    Raises:
+        RunFailed: the file cannot be written.
+    """
+    driven_m = np.cumsum(lap.speed_mps) / car.control_hz
+    with LapRenderer(lap.track, car, view, WIDTH, HEIGHT) as renderer:
 
-    def write(self, evaluation: Evaluation, err: Console) -> None:
-        """Render the fastest lap on the usual conditions, or the one with the most progress if none is complete.
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for at in range(len(lap)):
+                pose = lap.x_m[at], lap.y_m[at], lap.yaw_rad[at], lap.steering_rad[at]
+                yield _overlay(renderer.draw(*pose, driven_m[at]), lap, at)
 
-        Raises:
-            RunFailed: the file cannot be written.
-        """
-        lap, car = self.recorder.lap(best_attempt(evaluation)), self._setup.car
-        driven_m = np.cumsum(lap.speed_mps) / car.control_hz
-        with LapRenderer(lap.track, car, self._view, WIDTH, HEIGHT) as renderer:
-
-            def frames() -> Iterator[NDArray[np.uint8]]:
-                for at in range(len(lap)):
-                    pose = lap.x_m[at], lap.y_m[at], lap.yaw_rad[at], lap.steering_rad[at]
-                    yield _overlay(renderer.draw(*pose, driven_m[at]), lap, at)
-
-            write_film(self.file, frames(), len(lap), (WIDTH, HEIGHT), car.control_hz, err)
+        write_film(file, frames(), len(lap), (WIDTH, HEIGHT), car.control_hz, err)
 
 
 def _overlay(picture: NDArray[np.uint8], lap: Lap, at: int) -> NDArray[np.uint8]:

@@ -18,7 +18,7 @@ from deepracer_exp.config.driving import CameraConfig, LidarConfig, ObservationC
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.lidar import reach_of_rays
-from deepracer_exp.errors import RunFailed, count
+from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.runs.resolve import resolve
@@ -245,24 +245,18 @@ class _Distribution:
         half = 0.5 * (self._high - self._low)
         means = self._low + half * (acted["loc"].numpy().clip(-1, 1) + 1)
         deviations = half * acted["scale"].numpy()
-        names = (("steering", "°", 1), ("speed", " m/s", 2))
         draw.text((24, 8), "mean and standard deviation", font=_font(15), fill=_FAINT)
-        for row, (name, unit, digits) in enumerate(names):
+        begin, end = 24, self._width - 24
+        for row, (name, unit, digits) in enumerate((("steering", "°", 1), ("speed", " m/s", 2))):
             # Left is left: the steering's scale runs from its highest value down.
             ends = (self._high[row], self._low[row]) if row == 0 else (self._low[row], self._high[row])
-            begin, end, y = 24, self._width - 24, 74 + 80 * row
-
-            def place(
-                value: float, ends: tuple[float, float] = ends, begin: int = begin, end: int = end
-            ) -> float:
-                share = (value - ends[0]) / (ends[1] - ends[0]) if ends[0] != ends[1] else 0.5
-                return begin + (end - begin) * min(max(share, 0.0), 1.0)
-
-            mean, deviation = float(means[row]), float(deviations[row])
+            mean, deviation, y = float(means[row]), float(deviations[row]), 74 + 80 * row
+            marked, span = mean + deviation * np.array([-1, 0, 1]) - ends[0], ends[1] - ends[0]
+            shares = marked / span if span else np.full(3, 0.5)
+            low, middle, high = np.sort(begin + (end - begin) * shares.clip(0.0, 1.0))
             draw.rounded_rectangle((begin, y - 5, end, y + 5), 5, fill=_RULE)
-            low, high = sorted((place(mean - deviation), place(mean + deviation)))
             draw.rounded_rectangle((low, y - 5, high, y + 5), 5, fill=_BAR)
-            draw.ellipse((place(mean) - 10, y - 10, place(mean) + 10, y + 10), fill=_CHOSEN)
+            draw.ellipse((middle - 10, y - 10, middle + 10, y + 10), fill=_CHOSEN)
             words = f"{name} {mean:.{digits}f}{unit} ± {deviation:.{digits}f}"
             draw.text((self._width / 2, y - 32), words, font=_font(16), fill=_INK, anchor="ma")
             for x, value, anchor in ((begin, ends[0], "la"), (end, ends[1], "ra")):
@@ -295,10 +289,8 @@ def film_run(config: EvaluateConfig, file: Path | None, out: Console, err: Conso
     lap, acted = drive_best_lap(evaluator, policy)
     if file is None:
         file = run.path / FILMS / f"{stored.path.name}.mp4"
-        try:
+        with writing(file.parent, failure=RunFailed):
             file.parent.mkdir(exist_ok=True)
-        except OSError as error:
-            raise RunFailed(f"{file.parent}: cannot be made: {error.strerror or error}") from error
     setup = evaluator.race.setup
     frames = Frames(lap, acted, policy, setup.actions, setup.observation, setup.car.front_point_m)
     write_film(file, frames, len(lap), (WIDTH, HEIGHT), setup.car.control_hz, err)

@@ -1,7 +1,6 @@
 """The files that the AWS console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import LIDARS, LidarSectors, ModelMetadata, model_metadata_text
 from deepracer_exp.env.action_space import ActionSpace, metadata_of
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import writing
 
 CONSOLE_ACTIONS = (2, 30)
 CONSOLE_STEERING_DEG = (-30.0, 30.0)
@@ -52,27 +51,16 @@ def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
     }
 
 
-def write_texts(texts: Mapping[str, str], folder: Path) -> None:
+def write_files(files: Mapping[str, str | bytes], folder: Path) -> None:
     """Write files into a folder, replacing those of the same names.
 
     Raises:
         BadInput: the folder cannot be created or written.
     """
-    with writing():
-        for name, text in texts.items():
+    with writing(folder, "another folder with -o"):
+        for name, content in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def writing() -> Iterator[None]:
-    """Turn an OSError within the block into BadInput."""
-    try:
-        yield
-    except OSError as error:
-        raise BadInput(
-            f"{error.filename}: cannot be written: {error.strerror}; give another folder with -o"
-        ) from error
+            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def _action_notes(metadata: ModelMetadata) -> list[str]:

@@ -10,16 +10,15 @@ from typing import Any, TextIO
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import model_metadata_text
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.errors import BadInput, count
+from deepracer_exp.errors import BadInput, count, writing
 
-from .aws_files import hyperparameters_of, write_texts, writing
+from .aws_files import hyperparameters_of, write_files
 
 TRACE_HEADER = (
     "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
@@ -78,21 +77,16 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
         texts["reward_function.py"] = recording.reward_source
     if layout == "console":
         texts |= {"model_metadata.json": metadata, "hyperparameters.json": hyperparameters}
-    with writing():
+    log = folder / f"logs/training/training-{job}-robomaker.log"
+    with writing(folder, "another folder with -o"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise BadInput(f"--output {folder}: is not empty; accepted: a new or an empty folder")
-    write_texts(texts, folder)
-    log = folder / f"logs/training/training-{job}-robomaker.log"
-    with writing():
+        write_files(texts, folder)
         _write_trace(numbered, folder / _PLACES[layout]["trace"], log, head)
-    counts = (
-        (len(numbered.rows), "row"),
-        (len(numbered.episodes), "episode"),
-        (numbered.iterations, "iteration"),
-    )
-    what = ", ".join(count(number, noun) for number, noun in counts)
-    return [f"{what}, as {layout} has them", *_notes(numbered, experiment)]
+    rows, episodes = count(len(numbered.rows), "row"), count(len(numbered.episodes), "episode")
+    what = f"{rows}, {episodes}, {count(numbered.iterations, 'iteration')}, as {layout} has them"
+    return [what, *_notes(numbered, experiment)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,54 +106,42 @@ class _Numbered:
 
 
 def _number(steps: pd.DataFrame) -> _Numbered:
-    order = np.argsort(steps["episode"].to_numpy(), kind="stable")
-    rows = steps.iloc[order]
+    rows = steps.sort_values("episode", kind="stable")
     begin = np.flatnonzero(np.diff(rows["episode"].to_numpy(), prepend=-1) != 0)
     counts = np.diff(np.r_[begin, len(rows)])
-    end = begin + counts - 1
-    finished = rows["done"].to_numpy()[end]
-    if not finished.any():
-        raise BadInput("the run has no finished episode; the service's logs are made of these")
-    iteration = rows["iteration"].to_numpy()[end]
-    first = int(iteration[finished].min())
-    iteration = iteration - first
-    by_iteration = np.argsort(iteration, kind="stable")
-    chosen = by_iteration[finished[by_iteration]]
-    trial = pd.Series(iteration[chosen]).groupby(iteration[chosen]).cumcount().to_numpy() + 1
-    per_iteration = int(trial.max())
-    # Tools take the largest number in iteration 0 for the length of all iterations.
-    trial[np.flatnonzero(iteration[chosen] == 0)[-1]] = per_iteration
-    number = iteration[chosen].astype(np.int64) * per_iteration + trial - 1
-    at = _spans(begin[chosen], counts[chosen])
-    rows_of = np.repeat(np.arange(len(chosen)), counts[chosen])
-    first_row, last_row = rows.iloc[begin[chosen]], rows.iloc[end[chosen]]
+    first_row, last_row = rows.iloc[begin], rows.iloc[begin + counts - 1]
     episodes = pd.DataFrame(
         {
-            "number": number,
-            "trial": trial,
-            "iteration": iteration[chosen],
-            "steps": counts[chosen],
-            "reward": np.add.reduceat(rows["reward"].to_numpy(), begin)[chosen],
+            "iteration": last_row["iteration"].to_numpy(),
+            "steps": counts,
+            "reward": np.add.reduceat(rows["reward"].to_numpy(), begin),
             "begin_s": first_row["tstamp"].to_numpy(),
             "end_s": last_row["tstamp"].to_numpy(),
             "progress": last_row["progress"].to_numpy(),
             "status": last_row["episode_status"].astype(str).to_numpy(),
-        }
-    )
+        },
+        index=first_row["episode"],
+    )[last_row["done"].to_numpy()].sort_values("iteration", kind="stable")
+    if episodes.empty:
+        raise BadInput("the run has no finished episode; the service's logs are made of these")
+    first = int(episodes["iteration"].min())
+    iteration = episodes["iteration"].to_numpy(np.int64) - first
+    trial = episodes.groupby("iteration").cumcount().to_numpy() + 1
+    per_iteration = int(trial.max())
+    # Tools take the largest number in iteration 0 for the length of all iterations.
+    trial[np.flatnonzero(iteration == 0)[-1]] = per_iteration
+    episodes = episodes.assign(number=iteration * per_iteration + trial - 1, trial=trial, iteration=iteration)
+    finished = rows[rows["episode"].isin(episodes.index)]
+    own = episodes.loc[finished["episode"]]
+    finished = finished.assign(number=own["number"].array, trace_iteration=own["iteration"].array)
     return _Numbered(
-        rows=rows.iloc[at].assign(number=number[rows_of], trace_iteration=iteration[chosen][rows_of]),
+        rows=finished.sort_values("number", kind="stable"),
         episodes=episodes,
         per_iteration=per_iteration,
-        iterations=int(iteration[chosen].max()) + 1,
+        iterations=int(iteration.max()) + 1,
         first_iteration=first,
-        left_out=int(counts[~finished].sum()),
+        left_out=len(rows) - len(finished),
     )
-
-
-def _spans(begin: NDArray[np.intp], counts: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return the places of spans of rows, one after the other."""
-    before = np.cumsum(counts) - counts
-    return np.repeat(begin - before, counts) + np.arange(int(counts.sum()))
 
 
 def _job(name: str) -> str:
@@ -301,22 +283,15 @@ def _write_rows(rows: pd.DataFrame, trace: TextIO, log: TextIO, episodes: Iterat
 
 def _values(rows: pd.DataFrame) -> Iterator[tuple[Any, ...]]:
     """Return the rows as Python values, in the order of `TRACE_HEADER`."""
-    columns: list[list[Any]] = []
-    for name in TRACE_HEADER.split(","):
-        if name == "action":
-            columns.append(_actions(rows))
-        else:
-            columns.append(rows["number" if name == "episode" else name].tolist())
-    return zip(*columns, strict=True)
-
-
-def _actions(rows: pd.DataFrame) -> list[Any]:
-    """Return the number of each action, or [steering speed] for a continuous action space, as the service does."""
-    action = rows["action"].to_numpy()
-    if np.isnan(action).any():
-        both = zip(rows["steer"].tolist(), rows["throttle"].tolist(), strict=True)
-        return [f"[{steer} {throttle}]" for steer, throttle in both]
-    return action.astype(np.int64).tolist()
+    columns = {
+        name: rows["number" if name == "episode" else name].tolist() for name in TRACE_HEADER.split(",")
+    }
+    if rows["action"].isna().any():  # of a continuous action space, as the service has it
+        both = zip(columns["steer"], columns["throttle"], strict=True)
+        columns["action"] = [f"[{steer} {throttle}]" for steer, throttle in both]
+    else:
+        columns["action"] = rows["action"].astype(np.int64).tolist()
+    return zip(*columns.values(), strict=True)
 
 
 def _notes(numbered: _Numbered, experiment: Experiment) -> list[str]:

@@ -3,7 +3,7 @@
 import json
 import logging
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,16 @@ from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names, observation_shape
-from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.files import atomic_write
-from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.errors import BadInput, RunFailed, writing
+from deepracer_exp.files import atomic_write, read_text
+from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.runs.result import read_result
 from deepracer_exp.validation.console import console_findings
 
-from .aws_files import aws_files, write_texts, writing
+from .aws_files import aws_files, write_files
 from .aws_logs import write_aws_logs
 from .aws_model import aws_model
 from .car_archive import ENDING, car_archive, describe_commands, name_on_car
@@ -46,23 +46,23 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
         RunFailed: the ONNX file differs from the network.
     """
     run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
-    exports = run.path / EXPORTS
-    if config.format == "onnx":
-        checkpoint = run.choose_checkpoint(config.checkpoint)
-        return _onnx(run, checkpoint, Path(output or exports / "policy.onnx"), out)
-    if config.format == "car":
-        checkpoint = run.choose_checkpoint(config.checkpoint)
-        name = name_on_car(run.path.name) + ENDING
-        return _car(run, checkpoint, Path(output or exports / name), out)
-    if config.format == "aws-logs":
-        return _aws_logs(run, Path(output or exports / "aws-logs"), config.layout, out)
-    if config.format == "aws-model":
-        checkpoint = run.choose_checkpoint(config.checkpoint)
-        return _aws_model(run, checkpoint, Path(output or exports / "aws-model"), out)
-    return _aws(run, Path(output or exports / "aws"), out)
+    names = {"onnx": "policy.onnx", "car": name_on_car(run.path.name) + ENDING}
+    path = Path(output or run.path / EXPORTS / names.get(config.format, config.format))
+    if config.format in ("aws", "aws-logs"):
+        files, lines = _aws(run, path) if config.format == "aws" else _aws_logs(run, path, config.layout)
+    else:
+        write = {"onnx": _onnx, "car": _car, "aws-model": _aws_model}[config.format]
+        files, lines = write(run, run.choose_checkpoint(config.checkpoint), path)
+    for line in (*map(str, files), *(f"  {line}" for line in lines)):
+        out.print(line, soft_wrap=True)
+    return path
 
 
-def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
+_Written = tuple[Iterable[Path], list[str]]
+"""Files or folders, and lines on them."""
+
+
+def _onnx(run: StoredRun, checkpoint: str, path: Path) -> _Written:
     if path.is_dir():
         raise BadInput(f"--output {path}: is a folder; give a file, e.g. {path / 'policy.onnx'}")
     stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
@@ -74,7 +74,6 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
         "control_period_s": run.experiment.car.control_period_s,
     }
     observation = run.experiment.observation
-    features = feature_names(observation)
     observed = observation_shape(observation)
     reads = []
     if observation.camera is not None:
@@ -85,98 +84,75 @@ def _onnx(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
         facts["lidar"] = vars(observation.lidar)
         reads.append(f"lidar        {observation.lidar.size} readings")
     if not reads:
-        facts["features"] = features
-        reads.append(f"observation  {len(features)} features, named in the file's metadata")
+        facts["features"] = feature_names(observation)
+        reads.append(f"observation  {len(facts['features'])} features, named in the file's metadata")
     difference = write_onnx(DeployedPolicy(stored.networks, actions), observed, facts, path)
-    out.print(f"{path}", soft_wrap=True)
-    out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
-    for line in reads:
-        out.print(f"  {line}")
     what = f"probabilities of {actions.n} actions" if actions.n else "mean steering and speed, -1 to 1"
-    out.print(f"  policy       {what}")
-    out.print("  command      steering in degrees, positive to the left; speed in m/s")
     checked = CHECKED if observation.camera is None else CHECKED_PICTURES
-    out.print(
-        f"  checked      largest difference to the network {difference:.1e} on {checked:,} observations"
-    )
-    return path
+    return [path], [
+        _checkpoint(stored),
+        *reads,
+        f"policy       {what}",
+        "command      steering in degrees, positive to the left; speed in m/s",
+        f"checked      largest difference to the network {difference:.1e} on {checked:,} observations",
+    ]
 
 
-def _car(run: StoredRun, checkpoint: str, path: Path, out: Console) -> Path:
+def _checkpoint(stored: StoredPolicy) -> str:
+    return f"checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}"
+
+
+def _car(run: StoredRun, checkpoint: str, path: Path) -> _Written:
     if not path.name.endswith(ENDING) or path.is_dir():
         raise BadInput(
             f"--output {path}: accepted: a file whose name ends in {ENDING}, as the car's console wants it"
         )
     stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
-    actions = build_action_space(run.experiment.action_space)
-    archive = car_archive(stored.networks, run.experiment, actions)
+    archive = car_archive(stored.networks, run.experiment, build_action_space(run.experiment.action_space))
     _write(path, archive.content)
-    out.print(f"{path}", soft_wrap=True)
-    out.print(f"  checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}")
-    out.print(f"  model        {name_on_car(path.name)} on the car, {len(archive.content) / 1e6:.1f} MB")
-    out.print(f"  reads        {', '.join(archive.metadata.sensor)}")
-    for note in archive.notes:
-        out.print(f"  {note}", soft_wrap=True)
-    out.print("  What the car makes of the actions, with its maximum speed at 100 %:")
-    for line in describe_commands(archive.metadata):
-        out.print(f"  {line}", soft_wrap=True)
-    return path
+    return [path], [
+        _checkpoint(stored),
+        f"model        {name_on_car(path.name)} on the car, {len(archive.content) / 1e6:.1f} MB",
+        f"reads        {', '.join(archive.metadata.sensor)}",
+        *archive.notes,
+        "What the car makes of the actions, with its maximum speed at 100 %:",
+        *describe_commands(archive.metadata),
+    ]
 
 
 def _write(path: Path, content: bytes) -> None:
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(path, content)
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _aws_logs(run: StoredRun, folder: Path, layout: str, out: Console) -> Path:
+def _aws_logs(run: StoredRun, folder: Path, layout: str) -> _Written:
     recording = read_own_recording(run.path)
     notes = write_aws_logs(recording, run.experiment, folder, layout)
-    out.print(f"{folder}", soft_wrap=True)
-    for note in (*notes, *map(str, recording.problems)):
-        out.print(f"  {note}", soft_wrap=True)
-    return folder
+    return [folder], [*notes, *map(str, recording.problems)]
 
 
-def _aws_model(run: StoredRun, checkpoint: str, folder: Path, out: Console) -> Path:
+def _aws_model(run: StoredRun, checkpoint: str, folder: Path) -> _Written:
     stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
     result = read_result(run.path)
     score = result.completion if result and result.iteration == stored.counters["iteration"] else None
     files, notes = aws_model(run.experiment, stored, _reward(run), score)
-    with writing():
-        for name, content in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(content)
-    for name in sorted(files):
-        out.print(f"{folder / name}", soft_wrap=True)
-    for note in notes:
-        out.print(f"  {note}", soft_wrap=True)
-    return folder
+    write_files(files, folder)
+    return (folder / name for name in sorted(files)), notes
 
 
 def _reward(run: StoredRun) -> str:
-    source = run.path / REWARD
-    try:
-        return source.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(
-            f"{source}: cannot be read: {error}; this is the reward the run was trained with"
-        ) from error
+    return read_text(run.path / REWARD, "the reward function that the run was trained with")
 
 
-def _aws(run: StoredRun, folder: Path, out: Console) -> Path:
+def _aws(run: StoredRun, folder: Path) -> _Written:
     reward = _reward(run)
     texts, notes = aws_files(run.experiment, build_action_space(run.experiment.action_space), reward)
-    write_texts(texts, folder)
-    for name in texts:
-        out.print(f"{folder / name}", soft_wrap=True)
-    for note in notes:
-        out.print(f"  {note}", soft_wrap=True)
-    for finding in console_findings(reward):
-        out.print(f"  reward_function.py: the AWS console would reject it: {finding}", soft_wrap=True)
-    return folder
+    write_files(texts, folder)
+    refused = [
+        f"reward_function.py: the AWS console would reject it: {one}" for one in console_findings(reward)
+    ]
+    return (folder / name for name in texts), notes + refused
 
 
 class DeployedPolicy(nn.Module):

@@ -90,7 +90,7 @@ def draw_picture(track: Track, path: str | Path) -> None:
 
     line = track.floor.line_color
     border_pt = float(np.clip(0.035 * points_per_m, 1.2, 4.0))
-    axes.add_patch(PathPatch(_outline(track.road), facecolor=track.floor.road_color, edgecolor="none"))
+    axes.add_patch(PathPatch(outline(track.road), facecolor=track.floor.road_color, edgecolor="none"))
     for side in (track.inner, track.outer):
         axes.plot(*side.T, color=line, linewidth=border_pt, solid_joinstyle="round")
     axes.plot(
@@ -142,9 +142,9 @@ def _dense(line: np.ndarray, step_m: float) -> np.ndarray:
     return np.column_stack([np.interp(at, start_m, line[:, k]) for k in (0, 1)])
 
 
-def _outline(road: BaseGeometry) -> Outline:
-    """Return the road's rings as one path; rings run in opposite directions, so holes stay empty."""
-    polygons = [orient_polygons(part) for part in get_parts(road) if part.geom_type == "Polygon"]
+def outline(area: BaseGeometry) -> Outline:
+    """Return an area's rings as one path; rings run in opposite directions, so holes stay empty."""
+    polygons = [orient_polygons(part) for part in get_parts(area) if part.geom_type == "Polygon"]
     rings = [get_coordinates(ring) for polygon in polygons for ring in get_rings(polygon)]
     return Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
 

@@ -10,12 +10,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
-from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
 
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, writing
+from deepracer_exp.tracks.drawing import outline
 
 from .reward_grid import RewardGrid, Sampler, State
 from .situations import middle_speed_mps
@@ -59,7 +59,7 @@ def draw_reward_map(
     image = main.imshow(
         pixels, extent=extent, origin="lower", cmap=colors, norm=norm, interpolation="bilinear", zorder=1
     )
-    image.set_clip_path(PathPatch(_outline(track.road.buffer(_BESIDE_M)), transform=main.transData))
+    image.set_clip_path(PathPatch(outline(track.road.buffer(_BESIDE_M)), transform=main.transData))
     _draw_course(main, setup)
 
     bar = figure.colorbar(
@@ -83,10 +83,8 @@ def draw_reward_map(
     for k, line in enumerate(lines):
         down_in = 0.34 + 0.24 * k
         figure.text(0.035, top - down_in / height_in, line, fontsize=11, color=FAINT, va="center")
-    try:
+    with writing(f"--output {path}", "", BadInput, ValueError):  # an unknown ending
         figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise BadInput(f"--output {path}: cannot be written: {error}") from error
 
 
 def _track_pixels(
@@ -127,15 +125,6 @@ def _scale(of: RewardGrid, pixels: np.ndarray) -> tuple[Colormap, Normalize, str
     return PAY, Normalize(low, high), extend
 
 
-def _outline(area: shapely.Geometry) -> Outline:
-    """Return an area's rings as one path; inner rings run the other way, so holes stay empty."""
-    polygons = [
-        shapely.orient_polygons(part) for part in shapely.get_parts(area) if part.geom_type == "Polygon"
-    ]
-    rings = [shapely.get_coordinates(ring) for polygon in polygons for ring in shapely.get_rings(polygon)]
-    return Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
-
-
 def _draw_course(axes: Axes, setup: RaceSetup) -> None:
     track = setup.track
     for border in (track.inner, track.outer):
@@ -148,15 +137,9 @@ def _draw_course(axes: Axes, setup: RaceSetup) -> None:
     )
     # An arrow ahead of the start line shows which way round.
     pose = track.start_pose(np.array([0.35, 0.9]) / track.length_m)
-    arrow = axes.annotate(
-        "",
-        (float(pose.x[1]), float(pose.y[1])),
-        (float(pose.x[0]), float(pose.y[0])),
-        arrowprops={"arrowstyle": "-|>,head_width=0.35,head_length=0.7", "color": INK, "linewidth": 2.2},
-        zorder=5,
-    )
-    if arrow.arrow_patch is not None:
-        arrow.arrow_patch.set_path_effects([*halo])
+    tail, head = zip(pose.x.tolist(), pose.y.tolist(), strict=True)
+    look = {"arrowstyle": "-|>,head_width=0.35,head_length=0.7", "color": INK, "linewidth": 2.2}
+    axes.annotate("", head, tail, arrowprops={**look, "path_effects": halo}, zorder=5)
 
 
 def _draw_cuts(
@@ -167,13 +150,8 @@ def _draw_cuts(
     left, width, gap = 0.062, 0.19, 0.022
     for k, name in enumerate(("slow", "middle", "fast")):
         axes = figure.add_axes((left + k * (width + gap), bottom, width, height))
-        _draw_cut(
-            axes,
-            np.nanmean(of.reward[k], axis=0) if np.isfinite(of.reward[k]).any() else of.reward[k][0],
-            (of.offsets_m, np.degrees(of.headings_rad)),
-            colors,
-            norm,
-        )
+        mean = np.nanmean(of.reward[k], axis=0) if np.isfinite(of.reward[k]).any() else of.reward[k][0]
+        _draw_cut(axes, mean, (of.offsets_m, np.degrees(of.headings_rad)), colors, norm)
         # Left of the road is on the left.
         axes.set_xlim(*axes.get_xlim()[::-1])
         for border in (-half_m, half_m):
@@ -198,15 +176,8 @@ def _draw_cuts(
     axes.xaxis.set_major_formatter(lambda x, _: f"{abs(x):g}")
     axes.set_xlabel("left  ←  steering, degrees  →  right", color=FAINT, fontsize=9)
     axes.set_ylabel("speed, m/s", color=FAINT, fontsize=9)
-    figure.text(
-        0.035,
-        top * 0.93,
-        "By offset from the centre line and heading, mean over the lap",
-        fontsize=12,
-        fontweight="bold",
-        color=INK,
-        va="center",
-    )
+    title = "By offset from the centre line and heading, mean over the lap"
+    figure.text(0.035, top * 0.93, title, fontsize=12, fontweight="bold", color=INK, va="center")
 
 
 def _draw_cut(
@@ -225,5 +196,4 @@ def _draw_cut(
     )
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     axes.tick_params(length=0, labelcolor=FAINT, labelsize=9)
-    for side in axes.spines.values():
-        side.set_visible(False)
+    axes.spines[:].set_visible(False)

@@ -14,7 +14,7 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.routes import recognise
 from deepracer_exp.deepracer.worlds import UNITS_PER_M
-from deepracer_exp.errors import BadInput, RunFailed, count
+from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.runs.files import METRICS, read_metrics
 
 from .check import Check, look_closer, other_direction, read, try_named_situations
@@ -70,10 +70,8 @@ def validate_reward(
 
 def _default_picture(experiment: Experiment, check: Check) -> Path:
     folder = Path(experiment.runs_dir) / "validate"
-    try:
+    with writing(folder, "another runs_dir= or --output"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"{folder}: cannot be created: {error.strerror}; set runs_dir= or --output") from None
     return folder / f"{check.setup.reward.name}-{check.setup.track.name}.png"
 
 

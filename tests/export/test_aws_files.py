@@ -8,7 +8,7 @@ from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
 from deepracer_exp.deepracer.model_metadata import read_model_metadata
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.export.aws_files import aws_files, write_texts
+from deepracer_exp.export.aws_files import aws_files, write_files
 
 REWARD = "def reward_function(params):\n    return params['speed']\n"
 
@@ -27,7 +27,7 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
         "algorithm.loss_type='mean squared error'",
     )
     texts, notes = files(*overrides)
-    write_texts(texts, tmp_path / "aws")
+    write_files(texts, tmp_path / "aws")
     sent, _ = compose_experiment(overrides)
     back, _ = compose_experiment([f"custom_files={tmp_path / 'aws'}"])
     assert back.algorithm == sent.algorithm
@@ -58,7 +58,7 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
     ],
 )
 def test_exported_sensors_name_the_overrides_that_have_them(tmp_path, overrides):
-    write_texts(files(*overrides)[0], tmp_path)
+    write_files(files(*overrides)[0], tmp_path)
     named = sensor_overrides(read_model_metadata(tmp_path / "model_metadata.json"))
     assert named == list(overrides)
     note = f"the same sensors: {' '.join(overrides)}"
@@ -78,7 +78,7 @@ def test_exported_sensors_name_the_overrides_that_have_them(tmp_path, overrides)
 )
 def test_values_beyond_the_console_are_clipped_and_reported(tmp_path, override, key, value):
     texts, notes = files("algorithm.batch_size=64", override)
-    write_texts(texts, tmp_path)
+    write_files(texts, tmp_path)
     learning = read_hyperparameters(tmp_path / "hyperparameters.json")
     assert getattr(learning, key) == value
     assert learning.beyond_console() == ()
@@ -109,4 +109,4 @@ def test_an_action_space_beyond_the_console_is_kept_and_reported(overrides, word
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match=r"file.*cannot be written"):
-        write_texts(files()[0], tmp_path / "file")
+        write_files(files()[0], tmp_path / "file")

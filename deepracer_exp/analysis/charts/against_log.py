@@ -1,16 +1,17 @@
 """Simulated laps beside logged ones: both lines over the track, time, speed and steering along it, and the actions."""
 
+from dataclasses import replace
+
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from deepracer_exp.analysis.against_log import PLACES, AgainstLog, quantile
 from deepracer_exp.analysis.sectors import interval_times, sectors_of
-from deepracer_exp.analysis.statistics import Values
-from deepracer_exp.tracks.track import Track
 
-from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark
-from .maps import map_panel
-from .style import BLUE, FAINT, ORANGE, PALE, VERMILION
+from .figure import Chart, Layer, Panel, band, bars, in_rows, line
+from .laps import time_lost_panel
+from .maps import beside, map_panel
+from .style import BLUE, ORANGE, VERMILION
 
 SIDES = {"log": ORANGE, "simulated": BLUE}
 _PER_CENT = 100.0 * PLACES
@@ -33,7 +34,8 @@ def lines_compared(both: AgainstLog) -> Chart:
         apart = np.insert(apart, np.flatnonzero(np.diff(laps.number)) + 1, np.nan, axis=0)
         layers.append(line(apart[:, 0], apart[:, 1], color, width=0.6))
     for (name, color), curves in zip(SIDES.items(), both.curves["offset_m"], strict=True):
-        path = _beside(both.course, quantile(curves, 0.5))
+        path = beside(both.course, PLACES, quantile(curves, 0.5))
+        path = np.vstack([path, path[:1]]) if both.course.closed else path
         layers.append(line(path[:, 0], path[:, 1], color, f"{name}, median", width=2.5))
     return Chart(
         name="lines_compared",
@@ -47,29 +49,15 @@ def lines_compared(both: AgainstLog) -> Chart:
 
 def along_the_track(both: AgainstLog) -> Chart:
     """Draw time, speed, steering and distance from the centre line along the course."""
-    sectors = [mark(100.0 * part.begin, part.name, PALE) for part in sectors_of(both.course)]
     bounds = np.append(PLACES, 1.0)
     spent = [interval_times(laps.steps, bounds) for laps in (both.logged, both.simulated)]
     panels = []
     if all(len(times) for times in spent):
         logged, simulated = (times.median().to_numpy() for times in spent)
         lost_s = np.r_[0.0, np.cumsum(simulated - logged)]
-        low, high = float(lost_s.min()), float(lost_s.max())
-        behind = [
-            *sectors,
-            mark(0.0, "", FAINT, horizontal=True),
-            line(100.0 * bounds, lost_s, VERMILION, width=2.5),
-        ]
-        # The names of the sectors stand above the line.
-        y_range = (low - 0.05 * (high - low), high + 0.7 * (high - low)) if high > low else None
-        panels.append(
-            Panel(
-                title="Time the simulated laps lose to the logged ones",
-                y_label="s",
-                layers=behind,
-                y_range=y_range,
-            )
-        )
+        delta = pd.DataFrame({"lap_position": bounds, "delta_s": lost_s})
+        title = "Time the simulated laps lose to the logged ones"
+        panels.append(time_lost_panel(title, delta, sectors_of(both.course), 100.0))
     for column, title, label in (
         ("track_speed_mps", "Speed along the track", "m/s"),
         ("steer", "Steering commanded, positive to the left", "degrees"),
@@ -80,7 +68,7 @@ def along_the_track(both: AgainstLog) -> Chart:
             layers.append(band(_PER_CENT, quantile(curves, 0.1), quantile(curves, 0.9), color))
             layers.append(line(_PER_CENT, quantile(curves, 0.5), color, name, width=2.5))
         panels.append(Panel(title=title, y_label=label, layers=layers))
-    panels[-1] = Panel(**{**vars(panels[-1]), "x_label": "per cent of the track from waypoint 0"})
+    panels[-1] = replace(panels[-1], x_label="per cent of the track from waypoint 0")
     return Chart(
         name="along_the_track",
         title="Along the track",
@@ -108,11 +96,3 @@ def actions_compared(both: AgainstLog) -> Chart | None:
         + _RANGES * both.actions.continuous,
         rows=[[Panel(layers=layers, x_names=names, x_label="action", y_label="% of the steps")]],
     )
-
-
-def _beside(course: Track, offset_m: Values) -> NDArray[np.float64]:
-    """Return the points (n, 2) at `PLACES` so many m to the left of the centre line; closed like the course."""
-    pose = course.start_pose(PLACES)
-    left = np.column_stack([-np.sin(pose.yaw_rad), np.cos(pose.yaw_rad)])
-    path = course.points_at(PLACES) + offset_m[:, None] * left
-    return np.vstack([path, path[:1]]) if course.closed else path

@@ -10,7 +10,7 @@ from deepracer_exp.analysis.sectors import sectors_of, times_by_sector
 from deepracer_exp.analysis.statistics import Values, means, quantiles, subsample
 
 from .figure import Chart, Layer, Panel, band, bars, colored_points, line, note, points
-from .maps import LEAST_STEPS, Grid, map_panel, waypoint_panel
+from .maps import LEAST_STEPS, Grid, beside, map_panel, waypoint_panel
 from .style import BLUE, CATEGORIES, INK, ORANGE, PALE, VERMILION
 
 GRIP_SHARE = 0.95
@@ -24,19 +24,8 @@ _ROWS = 200_000
 
 def lap_line(view: LogView) -> Chart | None:
     """Draw the fastest lap on the course, coloured by speed."""
-    columns = (
-        "X",
-        "Y",
-        "steps",
-        "closest_waypoint",
-        "progress",
-        "lap_position",
-        "tstamp",
-        "steer",
-        "throttle",
-    )
-    motion = ("track_speed_mps", "acceleration_mps2", "braking_mps2", "slide_deg", "reward")
-    lap = view.fastest_lap(*columns, *motion)
+    columns = ("X", "Y", "steps", "closest_waypoint", "progress", "steer", "throttle", "track_speed_mps")
+    lap = view.fastest_lap(*columns)
     if lap is None or view.course is None:
         return None
     row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()]
@@ -69,19 +58,12 @@ def sector_times(view: LogView) -> Chart | None:
     times = times_by_sector(view.steps, sectors)
     if not len(times):
         return None
-    table = pd.DataFrame(
-        {
-            "best_s": times.min(),
-            "median_s": times.median(),
-            "fastest_lap_s": times.loc[times.sum(axis=1).idxmin()],
-        }
-    )
-    lost = table.sub(table["best_s"], axis=0)
+    best_s, fastest_s = times.min(), times.loc[times.sum(axis=1).idxmin()]
     x = np.arange(len(sectors))
     panel = Panel(
         layers=[
-            bars(x, lost["median_s"], PALE, f"median of {len(times)} complete laps"),
-            points(x, lost["fastest_lap_s"], VERMILION, "fastest lap", size=12.0, symbol="diamond"),
+            bars(x, times.median() - best_s, PALE, f"median of {len(times)} complete laps"),
+            points(x, fastest_s - best_s, VERMILION, "fastest lap", size=12.0, symbol="diamond"),
         ],
         x_names=list(times),
         x_label="sector, in driving direction",
@@ -92,11 +74,11 @@ def sector_times(view: LogView) -> Chart | None:
     for number, sector in enumerate(sectors):
         places = view.course.points_at(np.linspace(sector.begin, sector.end, 60))
         lines.append(line(places[:, 0], places[:, 1], CATEGORIES[number % 6], width=5.0))
-        notes.append(note(places[30].tolist(), f"{sector.name}\n{table['best_s'][sector.name]:.2f} s"))
-    best_s, driven_s = table["best_s"].sum(), table["fastest_lap_s"].sum()
+        notes.append(note(places[30].tolist(), f"{sector.name}\n{best_s[sector.name]:.2f} s"))
     return Chart(
         name="sector_times",
-        title=f"Sectors: the best times of all add up to {best_s:.3f} s, the fastest lap took {driven_s:.3f} s",
+        title=f"Sectors: the best times of all add up to {best_s.sum():.3f} s, the fastest lap took "
+        f"{fastest_s.sum():.3f} s",
         caption="Sectors begin and end where the curvature of the centre line changes; the map shows the best "
         "time driven in each of them, in any complete lap. The height of a bar is what the median lap loses there, "
         "the diamond what even the fastest lap lost.",
@@ -170,7 +152,8 @@ def racing_line(view: LogView) -> Chart | None:
     waypoint = closest_waypoints(rows)
     away_m = rows["offset_m"] - ideal.at(rows["lap_position"], ideal.offset_m)
     low, middle, high = quantiles(waypoint, away_m, n, (0.1, 0.5, 0.9))
-    median = _beside(course.waypoints, quantiles(waypoint, rows["offset_m"], n, (0.5,))[0])
+    places = waypoint_positions(course)[:n]
+    median = beside(course, places, quantiles(waypoint, rows["offset_m"], n, (0.5,))[0][: len(places)])
     layers: list[Layer] = [
         line(at, np.zeros(n), VERMILION, "racing line", dashed=True),
         band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"),
@@ -275,11 +258,3 @@ def _grip(rows: pd.DataFrame) -> float:
 def _without_gaps(values: Values) -> Values:
     """Return values with the gaps filled in, which are waypoints that one lap jumped over."""
     return pd.Series(values).interpolate(limit_direction="both").to_numpy()
-
-
-def _beside(waypoints: Values, offset_m: Values) -> Values:
-    """Return the points (n, 2) so many m to the left of the first waypoints."""
-    ahead = np.gradient(waypoints, axis=0)
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
-    n = min(len(waypoints), len(offset_m))
-    return waypoints[:n] + offset_m[:n, None] * np.column_stack([-ahead[:n, 1], ahead[:n, 0]])

@@ -151,15 +151,7 @@ def lap_delta(view: LogView) -> Chart | None:
     unit, scale, sectors = "per cent", 100.0, []
     if view.course is not None:
         unit, scale, sectors = "m", view.course.length_m, sectors_of(view.course)
-    behind: list[Layer] = [
-        *(mark(scale * part.begin, part.name, PALE) for part in sectors),
-        mark(0.0, "", FAINT, horizontal=True),
-        line(scale * delta["lap_position"], delta["delta_s"], VERMILION, width=2.5),
-    ]
-    low, high = delta["delta_s"].min(), delta["delta_s"].max()
-    # The names of the sectors stand above the line.
-    y_range = (low - 0.05 * (high - low), high + 0.7 * (high - low)) if sectors and high > low else None
-    panels = [Panel(title="Time lost by the ordinary lap", y_label="s", layers=behind, y_range=y_range)]
+    panels = [time_lost_panel("Time lost by the ordinary lap", delta, sectors, scale)]
     drives = {"ordinary": (ordinary, ORANGE), "fastest": (fastest, BLUE)}
     driven = {name: _along(view, lap) for name, (lap, _) in drives.items()}
     for column, title, label in (
@@ -184,6 +176,19 @@ def lap_delta(view: LogView) -> Chart | None:
         rows=in_rows(panels, 1),
         share_x=True,
     )
+
+
+def time_lost_panel(title: str, delta: pd.DataFrame, sectors: Sequence[Sector], scale: float) -> Panel:
+    """Return a panel of `time_lost` along the course, where the lap position 1 is `scale`, and of its sectors."""
+    layers: list[Layer] = [
+        *(mark(scale * part.begin, part.name, PALE) for part in sectors),
+        mark(0.0, "", FAINT, horizontal=True),
+        line(scale * delta["lap_position"], delta["delta_s"], VERMILION, width=2.5),
+    ]
+    low, high = delta["delta_s"].min(), delta["delta_s"].max()
+    # The names of the sectors stand above the line.
+    y_range = (low - 0.05 * (high - low), high + 0.7 * (high - low)) if sectors and high > low else None
+    return Panel(title=title, y_label="s", layers=layers, y_range=y_range)
 
 
 def _ordinary_lap(episodes: pd.DataFrame, fastest: int) -> int:

@@ -113,6 +113,13 @@ def waypoint_panel(layers: Sequence[Layer], label: str, n: int, **more: Any) -> 
     return Panel(layers=layers, x_label="waypoint", y_label=label, x_range=(-1.0, float(n)), **more)
 
 
+def beside(course: Track, place: Values, offset_m: Values) -> Values:
+    """Return the points (n, 2) so many m to the left of the centre line at lap positions (n,)."""
+    pose = course.start_pose(place)
+    left = np.column_stack([-np.sin(pose.yaw_rad), np.cos(pose.yaw_rad)])
+    return course.points_at(place) + offset_m[:, None] * left
+
+
 def _road(rings: Sequence[Values], center: Values) -> list[go.layout.Shape]:
     """Return the road and its centre line as shapes, because traces stand above every heat map."""
     common = {"type": "path", "xref": "x", "yref": "y", "layer": "below"}

@@ -13,11 +13,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import PathPatch
-from matplotlib.path import Path as Outline
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
-from shapely import get_coordinates, get_parts, get_rings, orient_polygons
 
+from deepracer_exp.tracks.drawing import outline
 from deepracer_exp.tracks.track import Track
 
 LINE_COLUMNS = (
@@ -240,10 +239,7 @@ def _draw_road(axes: Axes, track: Track) -> None:
     x_range, y_range = _bounds(track)
     axes.set(xlim=x_range, ylim=y_range, aspect="equal", anchor="NW")
     axes.set_axis_off()
-    polygons = [orient_polygons(part) for part in get_parts(track.road) if part.geom_type == "Polygon"]
-    # Rings run in opposite directions, so that holes stay empty.
-    rings = [Outline(get_coordinates(ring), closed=True) for one in polygons for ring in get_rings(one)]
-    axes.add_patch(PathPatch(Outline.make_compound_path(*rings), facecolor=ROAD, edgecolor="none", zorder=1))
+    axes.add_patch(PathPatch(outline(track.road), facecolor=ROAD, edgecolor="none", zorder=1))
     for border in (track.inner, track.outer):
         axes.plot(*border.T, color=BORDER, linewidth=1.8, solid_joinstyle="round", zorder=2)
     axes.plot(*track.waypoints.T, color=CENTER, linewidth=1.0, dashes=(5, 4), zorder=2)
