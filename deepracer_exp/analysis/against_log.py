@@ -60,12 +60,7 @@ class Laps:
         return self.steps[(self.steps["episode_status"] != PREPARE).to_numpy()]
 
     def along(self, column: str, closed: bool) -> Values:
-        """Return the mean of a column over `_SMOOTHED` steps at `PLACES`, (laps, places); NaN where a lap did not pass.
-
-        Args:
-            column: of `steps`.
-            closed: whether the course is.
-        """
+        """Return the mean of a column over `_SMOOTHED` steps at `PLACES`, (laps, places); NaN where no lap passed."""
         found = np.full((len(self.episodes), len(PLACES)), np.nan)
         for lap, rows in self.steps.groupby(self.number):
             values = rows[column].rolling(_SMOOTHED, center=True, min_periods=1).mean().to_numpy(np.float64)
@@ -102,14 +97,7 @@ class Laps:
 
 
 def laps_on(course: Track, steps: pd.DataFrame, words: str, chosen: bool = False) -> Laps:
-    """Return laps on a course.
-
-    Args:
-        course: what was driven on.
-        steps: `recording.STEP_COLUMNS`, rows of each lap contiguous and in the order of time.
-        words: which laps they are.
-        chosen: whether they were chosen because they are complete.
-    """
+    """Return laps on a course; the rows of each (`recording.STEP_COLUMNS`) are contiguous and in the order of time."""
     rows = steps[list(STEP_COLUMNS)].reset_index(drop=True)
     first = first_rows(rows)
     rows = add_derived(rows, first, course, DISCOUNT)
@@ -128,10 +116,6 @@ def prepare_races(recording: Recording, track: str | None = None) -> LogView:
 
 def logged_laps(view: LogView, course: Track) -> Laps:
     """Return the laps of a log that a simulation is compared with: of its races, else the best of its training.
-
-    Args:
-        view: as `prepare_races` returns it.
-        course: that it was driven on.
 
     Raises:
         BadInput: a training without a complete lap.

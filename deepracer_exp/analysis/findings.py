@@ -61,12 +61,7 @@ class Finding:
 
 
 def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
-    """Apply all rules to a log; the most important findings are first.
-
-    Args:
-        view: the log.
-        target_s: lap time wanted; None: the fastest lap driven.
-    """
+    """Apply all rules to a log, the most important findings first; `target_s`: the lap time wanted, None: the best."""
     found: list[Finding | None] = []
     if view.trained:
         found += [_converged(view), _submit(view)]

@@ -32,6 +32,8 @@ _LEAST_WAYPOINTS = 20
 _ESTIMATE_NEAR = 0.1
 """Share by which an estimated centre line may be longer or shorter than the logged length."""
 _HALF_CAR_M = 0.1
+_JUMP = 20.0
+"""Per cent of progress between adjacent rows beyond which the car must have been reset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,11 +202,21 @@ def waypoint_positions(course: Track) -> NDArray[np.float64]:
 def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
     """Return the course in the direction in which progress grows in most of the first rows."""
     head = steps.iloc[: 10 * _SAMPLE].sort_values("episode", kind="stable")
-    gone = np.diff(forward.project(head[["X", "Y"]].to_numpy(np.float64)).ndist)
-    gone = (gone + 0.5) % 1.0 - 0.5 if forward.closed else gone
-    gained = np.diff(head["progress"].to_numpy(np.float64))
-    counted = (np.diff(head["episode"]) == 0) & (np.abs(gained) < 20.0) & np.isfinite(gone)
-    return backward if float(np.sum((gone * gained)[counted])) < 0.0 else forward
+    along = progress_along(forward, head, head["episode"].to_numpy(np.int64))
+    return backward if along.sum() < 0.0 else forward
+
+
+def progress_along(course: Track, steps: pd.DataFrame, episode: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return how far each row moved along a course since the row before, times the progress it gained by that, (n,).
+
+    It is positive where the course is driven in its own direction, and 0 in the first row of an episode (their numbers
+    are `episode`, contiguous) and where the car was reset.
+    """
+    gone = np.diff(course.project(steps[["X", "Y"]].to_numpy(np.float64)).ndist, prepend=np.nan)
+    gone = (gone + 0.5) % 1.0 - 0.5 if course.closed else gone
+    gained = np.diff(steps["progress"].to_numpy(np.float64), prepend=np.nan)
+    counted = (np.diff(episode, prepend=-1) == 0) & (np.abs(gained) < _JUMP) & np.isfinite(gone)
+    return np.where(counted, gone * gained, 0.0)
 
 
 def _unknown(name: str, rows: pd.DataFrame) -> str:

@@ -101,13 +101,7 @@ def write_page(path: Path, page: LogPage) -> Path:
 
 
 def write_against_log(path: Path, run: str, both: AgainstLog, view: LogView) -> Path:
-    """Write the page of simulated laps beside those of a log atomically.
-
-    Args:
-        path: of the page.
-        run: name of the run whose policy drove.
-        both: the laps.
-        view: of the log.
+    """Write the page of simulated laps, driven by the policy of `run`, beside those of a log atomically.
 
     Raises:
         OSError: it cannot be written.

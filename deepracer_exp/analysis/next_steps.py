@@ -77,14 +77,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def command_line(command: str, word: str, config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> str:
-    """Return a command for the run that `word` names, with the user's own classes that it needs, quoted for a shell.
-
-    Args:
-        command: its name.
-        word: any name of the run.
-        config: of the run.
-        groups: whose classes the command needs.
-    """
+    """Return a command for the run that `word` names, quoted for a shell, with the user's own classes of `groups`."""
     return shlex.join([COMMAND, command, word, *named_again(config, groups)])
 
 

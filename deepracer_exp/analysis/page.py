@@ -58,15 +58,7 @@ def png_uri(png: bytes) -> str:
 
 
 def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int = 0) -> Plot:
-    """Pack a figure.
-
-    Args:
-        figure: its layout has a height.
-        name: of the element and of the picture that a reader saves.
-        title: as text.
-        narrow: the same traces with a layout for a narrow screen.
-        least_width: pixels below which it scrolls in itself.
-    """
+    """Pack a figure, whose layout has a height; `narrow` holds the same traces, laid out for a narrow screen."""
     whole = figure.to_plotly_json()
     layout = narrow.layout.to_plotly_json()
     whole["narrow"] = {key: value for key, value in layout.items() if value != whole["layout"].get(key)}

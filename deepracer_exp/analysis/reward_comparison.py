@@ -45,12 +45,7 @@ class RewardComparison:
 
 
 def compare_rewards(view: LogView, replayed: "ReplayedRewards") -> RewardComparison:
-    """Describe how another reward function would rank the laps and the places of a course.
-
-    Args:
-        view: the recording on one course.
-        replayed: its steps under another reward function.
-    """
+    """Describe how another reward function would rank the laps and the places of a course."""
     laps, places = replayed.laps, replayed.waypoints
     if len(places):  # one direction: the one driven most
         places = places[places["reversed"] == places.groupby("reversed")["visits"].sum().idxmax()]

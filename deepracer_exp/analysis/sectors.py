@@ -145,13 +145,7 @@ def times_by_sector(steps: pd.DataFrame, sectors: Sequence[Sector]) -> pd.DataFr
 
 
 def time_lost(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> pd.DataFrame:
-    """Return how far one lap is behind another along the course, in seconds.
-
-    Args:
-        steps: of a `LogView`.
-        lap: its index in `LogView.episodes`.
-        other: likewise, of the lap that it is compared with.
-        places: number of intervals.
+    """Return how far one lap is behind another along the course; both are indices in `LogView.episodes`.
 
     Returns:
         `lap_position` and `delta_s`, the time lost since lap position 0, negative if the lap is ahead; at 1 it is the

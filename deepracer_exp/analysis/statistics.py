@@ -7,6 +7,8 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 Values = NDArray[np.float64]
+MOST_ROWS = 200_000
+"""Rows beyond which quantiles are those of an evenly spaced part of them."""
 RESAMPLES = 2000
 CONFIDENCE = 0.95
 

@@ -117,22 +117,21 @@ def add_derived(
     slide = _wrapped(np.degrees(np.arctan2(rear_dy, rear_dx)) - (yaw - turned / 2))
     # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
     center_turned = _wrapped(_since(center_deg, first))
-    columns = {
-        "delta_time_s": delta_time_s,
-        "delta_dist_m": delta_dist_m,
-        "track_speed_mps": track_speed_mps,
-        "progress_speed_pps": _since(progress, first) / np.where(first, np.nan, passed_s),
-        "acceleration_mps2": np.maximum(change, 0.0),
-        "braking_mps2": np.maximum(-change, 0.0),
-        "yaw_rate_dps": turned / passed_s,
-        "true_bearing_deg": bearing,
-        "slide_deg": np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), slide, np.nan),
-        "skew_deg": _wrapped(bearing - (center_deg - center_turned / 2)),
-        "lap_position": lap_position,
-        "offset_m": offset_m,
-        "discounted_future_reward": _discounted(np.nan_to_num(reward), first, discount),
-    }
-    return steps.assign(**columns)
+    return steps.assign(
+        delta_time_s=delta_time_s,
+        delta_dist_m=delta_dist_m,
+        track_speed_mps=track_speed_mps,
+        progress_speed_pps=_since(progress, first) / np.where(first, np.nan, passed_s),
+        acceleration_mps2=np.maximum(change, 0.0),
+        braking_mps2=np.maximum(-change, 0.0),
+        yaw_rate_dps=turned / passed_s,
+        true_bearing_deg=bearing,
+        slide_deg=np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), slide, np.nan),
+        skew_deg=_wrapped(bearing - (center_deg - center_turned / 2)),
+        lap_position=lap_position,
+        offset_m=offset_m,
+        discounted_future_reward=_discounted(np.nan_to_num(reward), first, discount),
+    )
 
 
 def _places(

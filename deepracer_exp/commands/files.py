@@ -14,13 +14,27 @@ from .output import print_notes, table_console, warnings_on_stderr
 from .startup import check_files, check_policy, start_workers_early
 
 if TYPE_CHECKING:
-    from deepracer_exp.deepracer.worlds import World
     from deepracer_exp.tracks.track import Track
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the commands."""
-    _add_validate(commands)
+    parser = add_command(
+        commands,
+        "validate",
+        _validate,
+        help="find out what a reward function pays for",
+        description=(
+            "Check a reward function as the AWS console does, call it in many situations on the track, draw what it "
+            "pays for, and warn of common mistakes."
+        ),
+        epilog=_VALIDATE_EPILOG,
+        runs_rewards=True,
+    )
+    add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
+    parser.add_argument("-o", "--output", help="picture to write (default: runs/validate/REWARD-TRACK.png)")
+    parser.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
+
     parser = add_command(
         commands,
         "import",
@@ -57,7 +71,17 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
-    _add_tracks(commands)
+
+    parser = add_command(
+        commands,
+        "tracks",
+        _tracks,
+        help="list the tracks, or draw one",
+        description="List the tracks with length, width and variants; with a name, draw that track.",
+    )
+    name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
+    name.completer = _names  # type: ignore[attr-defined]
+    parser.add_argument("-o", "--output", metavar="FILE", help="also write a picture of it")
 
 
 _IMPORT_EPILOG = """\
@@ -163,25 +187,6 @@ exit code: 0 it can be trained, even if there are warnings; 2 it cannot, or with
 """
 
 
-def _add_validate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "validate",
-        _validate,
-        help="find out what a reward function pays for",
-        description=(
-            "Check a reward function as the AWS console does, call it in many situations on the track, draw what it "
-            "pays for, and warn of common mistakes."
-        ),
-        epilog=_VALIDATE_EPILOG,
-        runs_rewards=True,
-    )
-    add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
-    parser.add_argument("-o", "--output", help="picture to write (default: runs/validate/REWARD-TRACK.png)")
-    parser.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
-
-
 def _validate(args: argparse.Namespace) -> int:
     # Before NumPy is imported: a reward function has one thread in a training, too, and on a busy machine the threads
     # of a small linear-algebra problem wait for one another.
@@ -189,13 +194,13 @@ def _validate(args: argparse.Namespace) -> int:
 
     from deepracer_exp.config.compose import compose_experiment
 
-    trials = [override.removeprefix("trial=") for override in args.overrides if override.startswith("trial=")]
-    overrides = [override for override in args.overrides if not override.startswith("trial=")]
-    seconds = _trial_seconds(trials[-1]) if trials else None
+    trials = [override for override in args.overrides if override.startswith("trial=")]
+    overrides = [override for override in args.overrides if override not in trials]
+    shorter = _trial_overrides(trials[-1]) if trials else []
     experiment, composition = compose_experiment(overrides)
     args.debug = experiment.debug
     print_notes(composition.notes)
-    trial = None if seconds is None else compose_experiment([*overrides, *_trial_overrides(seconds)])
+    trial = compose_experiment([*overrides, *shorter]) if shorter else None
     check_files(experiment)
     if trial is not None:
         start_workers_early(experiment.collector.forks)
@@ -207,23 +212,18 @@ def _validate(args: argparse.Namespace) -> int:
     return validate_reward(experiment, trial, args.output, args.strict, Console(), Console(stderr=True))
 
 
-def _trial_seconds(text: str) -> float:
-    """Return the seconds of `60s`, `2min` or `90`.
+def _trial_overrides(given: str) -> list[str]:
+    """Return the overrides for a training of `trial=60s`, `trial=2min` or `trial=90`; its run goes to `runs/validate/`.
 
     Raises:
         BadInput: it is none of them.
     """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min)?", text)
+    match = re.fullmatch(r"trial=(\d+(?:\.\d+)?)(s|min)?", given)
     seconds = float(match[1]) * (60 if match[2] == "min" else 1) if match else 0.0
     if not seconds:
         raise BadInput(
-            f"trial={text}: not a time; accepted: seconds or minutes above 0, e.g. trial=60s, trial=2min"
+            f"{given}: not a time; accepted: seconds or minutes above 0, e.g. trial=60s, trial=2min"
         )
-    return seconds
-
-
-def _trial_overrides(seconds: float) -> list[str]:
-    """Return the overrides for a short training; its run goes to `runs/validate/`."""
     return [
         *("name=validate", "tracking=off", "stopping=none", "checkpoints.every=null"),
         *("budget=default", "budget.env_steps=null", "budget.alerts=[]", f"budget.minutes={seconds / 60!r}"),
@@ -232,20 +232,6 @@ def _trial_overrides(seconds: float) -> list[str]:
 
 COLUMNS, ROWS = 100, 32
 """Largest size of a drawing, in characters and lines."""
-
-
-def _add_tracks(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "tracks",
-        _tracks,
-        help="list the tracks, or draw one",
-        description="List the tracks with length, width and variants; with a name, draw that track.",
-    )
-    name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
-    name.completer = _names  # type: ignore[attr-defined]
-    parser.add_argument("-o", "--output", metavar="FILE", help="also write a picture of it")
 
 
 def _names(**_: object) -> list[str]:
@@ -287,7 +273,7 @@ def _list_tracks() -> None:
             f"{length_m:.2f}",
             f"{width_m:.2f}",
             str(world.rows),
-            " ".join(map(_variant, others)),
+            " ".join(one.name.replace(one.family, "…", 1) for one in others),
         )
     for name in options("track"):
         if name not in worlds():
@@ -303,15 +289,7 @@ def _list_tracks() -> None:
 
 
 def _show_track(name: str, output: str | None) -> None:
-    """Draw a track in the terminal, and as a picture where one is asked for.
-
-    Args:
-        name: of a track, or a route file (.npy, .yaml).
-        output: the picture to write; its ending chooses the format.
-
-    Raises:
-        BadInput: there is no such track, or the picture cannot be written.
-    """
+    """Draw a track, or a route file (.npy, .yaml), in the terminal, and as a picture where one is asked for."""
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
 
@@ -350,7 +328,3 @@ def _measures(name: str) -> tuple[float, float]:
     center, inner, outer = np.split(world_rows(name), 3, axis=1)
     length_m = np.linalg.norm(np.diff(center, axis=0), axis=1).sum()
     return float(length_m), float(np.median(np.linalg.norm(outer - inner, axis=1)))
-
-
-def _variant(world: "World") -> str:
-    return world.name.replace(world.family, "…", 1)

@@ -93,7 +93,19 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         runs_rewards=True,
     )
     add_run(parser, "checkpoint=NAME | GROUP=OPTION | KEY=VALUE")
-    _add_sweep(commands)
+
+    parser = add_command(
+        commands,
+        "sweep",
+        _sweep,
+        help="search for the values that race best",
+        description="Train many cars, each with other values, and find the best.",
+        epilog=_SWEEP_EPILOG,
+        runs_rewards=True,
+        entry="sweep",
+    )
+    add_overrides(parser, "KEY=EXPRESSION | GROUP=OPTION | KEY=VALUE | report NAME | best NAME")
+    parser.add_argument("--cfg", action="store_true", help="print the composed sweep as YAML and stop")
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -270,22 +282,6 @@ exit code: 0 all trials are done; 2 bad input; 3 all trials failed, or the datab
 _WORDS = ("report", "best")
 _PRELOADED = "sweeps.worker"
 """What a fork server imports once for all workers."""
-
-
-def _add_sweep(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command."""
-    parser = add_command(
-        commands,
-        "sweep",
-        _sweep,
-        help="search for the values that race best",
-        description="Train many cars, each with other values, and find the best.",
-        epilog=_SWEEP_EPILOG,
-        runs_rewards=True,
-        entry="sweep",
-    )
-    add_overrides(parser, "KEY=EXPRESSION | GROUP=OPTION | KEY=VALUE | report NAME | best NAME")
-    parser.add_argument("--cfg", action="store_true", help="print the composed sweep as YAML and stop")
 
 
 def _sweep(args: argparse.Namespace) -> int:

@@ -41,12 +41,12 @@ _LEAST_S = 60.0
 def race_against_log(
     run: StoredRun, checkpoint: str | None, view: LogView, given: str | None, err: Console
 ) -> AgainstLog:
-    """Race a run's policy as the laps of a log were driven.
+    """Race a run's policy as the laps of a log, which `prepare_races` returned, were driven.
 
     Args:
         run: whose policy drives.
-        checkpoint: `best`, `last` or an iteration; None: the one of the alias that names the run, else the best.
-        view: of the log, as `prepare_races` returns it.
+        checkpoint: as for `StoredRun.choose_checkpoint`.
+        view: of the log.
         given: name or file of the course; None: that of the log.
         err: for progress.
 
@@ -74,11 +74,6 @@ def course_driven(
     """Return the course of a log, in the direction it was driven.
 
     It is the one given, else the world that the log names or that its positions show, else one of the experiment's.
-
-    Args:
-        view: of the log.
-        experiment: of the run that is to drive there.
-        given: name or file of a course.
 
     Raises:
         BadInput: it is none of them.

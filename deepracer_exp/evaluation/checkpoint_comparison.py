@@ -222,7 +222,7 @@ def show_checkpoints(
     """Evaluate a run's checkpoints under a protocol, print the comparison and recommend one.
 
     Args:
-        config: validated; its checkpoint is ignored.
+        config: its checkpoint is ignored.
         own_trials: use the trials of the training instead of those of `config`.
         picture: page of the figure; None: none.
         out: for results.

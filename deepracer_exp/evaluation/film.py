@@ -153,15 +153,9 @@ def write_film(
     frames_per_s: float,
     err: Console,
 ) -> None:
-    """Encode frames as an .mp4; the last one is shown for a second.
+    """Encode `count` frames, (height, width, 3), as an .mp4; the last one is shown for a second.
 
-    Args:
-        file: to write.
-        frames: (height, width, 3), at least one.
-        count: of the frames.
-        size: their width and height, multiples of 16 as video codecs want them.
-        frames_per_s: of the film.
-        err: shows the progress.
+    `size` is their width and height, multiples of 16 as video codecs want them.
 
     Raises:
         RunFailed: the file cannot be written.

@@ -44,11 +44,7 @@ class LivePage:
     """
 
     def __init__(self, run: StoredRun, protocol: EvaluationConfig) -> None:
-        """Build the cars; `update` draws.
-
-        Args:
-            run: it need not have a checkpoint yet.
-            protocol: of the laps.
+        """Build the cars; `update` draws. The run need not have a checkpoint yet.
 
         Raises:
             BadInput: a track or a condition is unknown or malformed.
@@ -142,12 +138,7 @@ def _png_of(figure: Figure) -> str:
 
 
 def serve_live(run: StoredRun, protocol: EvaluationConfig, server: LiveServer) -> None:
-    """Serve the page of a run until Ctrl-C, at the lowest priority.
-
-    Args:
-        run: its training may run, or be over.
-        protocol: of the laps.
-        server: open.
+    """Serve the page of a run, which may be over, until Ctrl-C, at the lowest priority.
 
     Raises:
         BadInput: a file of the run or the protocol cannot be used.

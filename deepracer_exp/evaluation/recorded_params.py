@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from deepracer_exp.analysis.log_course import progress_along
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.tracks.track import Track, Tracks
@@ -17,8 +18,6 @@ UNPAID = ("prepare", "pause", "park")
 """Statuses at which the service gives no reward and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
 _DIRECTION_ROWS = 60
 """Rows of an episode from which its driving direction is determined: 4 s."""
-_JUMP = 20.0
-"""Per cent of progress between adjacent rows beyond which the car must have been reset."""
 _DECIDED = {"in_progress": False, "off_track": True}
 """Statuses that determine `is_offtrack`; for the others it is computed from the wheels."""
 
@@ -54,7 +53,7 @@ class RecordedParams:
         self._tracks = Tracks(tracks)
         self.known = np.isfinite(steps[["X", "Y", "yaw", "progress"]].to_numpy()).all(axis=1)
         self.paid = self.known & ~steps["episode_status"].isin(UNPAID).to_numpy()
-        self.track_index: Ids = self._against(episode)
+        self.track_index: Ids = self._against(course, episode)
 
     @property
     def is_reversed(self) -> NDArray[np.bool_]:
@@ -113,25 +112,14 @@ class RecordedParams:
             off[open_] = ~on_road.any(axis=1)
         return off.astype(bool)
 
-    def _against(self, episode: NDArray[np.int64]) -> Ids:
+    def _against(self, course: Track, episode: NDArray[np.int64]) -> Ids:
         """Return 1 for the rows of episodes driven against the course's own direction, (n,)."""
-        steps, count = self._steps, len(self._steps)
-        begins = np.flatnonzero(np.diff(episode, prepend=-1) != 0)
-        within = np.arange(count) - np.repeat(begins, np.diff(np.r_[begins, count]))
+        within = np.arange(len(episode)) - np.searchsorted(episode, episode)
         rows = np.flatnonzero(self.known & (within < _DIRECTION_ROWS))
-        forward = np.zeros(len(rows), np.intp)
-        ndist = self._tracks.project(steps[["X", "Y"]].to_numpy(np.float64)[rows], forward).ndist
-        moved = np.diff(ndist, prepend=np.nan)
-        if self._tracks.closed[0]:
-            moved = (moved + 0.5) % 1.0 - 0.5
-        gained = np.diff(steps["progress"].to_numpy(np.float64)[rows], prepend=np.nan)
-        counted = np.diff(episode[rows], prepend=-1) == 0
-        counted &= np.abs(gained) < _JUMP
+        along = progress_along(course, self._steps.iloc[rows], episode[rows])
         # An episode that does not move counts as driven in the course's own direction.
-        along = np.bincount(
-            episode[rows[counted]], (moved * gained)[counted], minlength=int(episode.max(initial=0)) + 1
-        )
-        return (along < 0).astype(np.intp)[episode]
+        sums = np.bincount(episode[rows], along, minlength=int(episode.max(initial=0)) + 1)
+        return (sums < 0).astype(np.intp)[episode]
 
 
 def _other_way(track: Track) -> Track:

@@ -30,12 +30,8 @@ def run_terms(
 ) -> tuple[LogView, pd.DataFrame | None]:
     """Return a recorded training's view and the terms of its stored reward function, if it may be run.
 
-    A reward function is a program and a recording may come from anywhere, so only those of the reward zoo are run.
-
-    Args:
-        view: the training.
-        car: that drove; the service's has the dimensions of the default one.
-        just_trained: the training in this process has run the function already.
+    A reward function is a program and a recording may come from anywhere, so only those of the reward zoo are run, and
+    one that a training in this process has run already.
 
     Returns:
         The view, with another problem if the terms could not be computed; the terms as from `contributed_terms`.
@@ -120,8 +116,5 @@ def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
 
 def _some_episodes(steps: pd.DataFrame, most: int) -> pd.DataFrame:
     """Return evenly spaced whole episodes with about `most` steps in total."""
-    begin = np.flatnonzero(np.diff(steps["episode"].to_numpy(np.int64), prepend=-1) != 0)
-    every = -(-len(steps) // most)
-    chosen = np.arange(len(begin)) % every == every - 1 if len(begin) >= every else np.ones(len(begin), bool)
-    lengths = np.diff(np.r_[begin, len(steps)])
-    return steps[np.repeat(chosen, lengths)]
+    episodes, every = steps["episode"].unique(), -(-len(steps) // most)
+    return steps[steps["episode"].isin(episodes[every - 1 :: every])] if len(episodes) >= every else steps

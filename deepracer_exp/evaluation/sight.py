@@ -111,13 +111,7 @@ def picture_of(acted: TensorDict, camera: CameraConfig) -> Image.Image:
 
 
 def under_heat(picture: Image.Image, heat: NDArray[np.float32], size: tuple[int, int]) -> Image.Image:
-    """Return a picture, enlarged and dimmed, under the heat of its saliency.
-
-    Args:
-        picture: as `picture_of` returns it.
-        heat: as `saliency` returns it.
-        size: width and height to enlarge to, in pixels.
-    """
+    """Return a picture, enlarged to width and height in pixels and dimmed, under the heat of its `saliency`."""
     grey = np.asarray(picture.convert("L").resize(size, Image.Resampling.NEAREST), np.float32)[..., None]
     heat = np.asarray(Image.fromarray(heat).resize(size, Image.Resampling.BILINEAR)).clip(0, 1)
     share = _COVER * heat[..., None]
@@ -135,12 +129,7 @@ def glimpses(
 ) -> list[Glimpse]:
     """Return what a policy saw and decided at places evenly spread over a lap.
 
-    Args:
-        lap: of n steps.
-        acted: what the policy read and wrote in these, [n].
-        policy: that drove.
-        actions: what it chooses from.
-        camera: what it sees through.
+    `acted` is what it read and wrote in the n steps of the lap, [n].
     """
     found = []
     steering_deg, speed_mps = actions.commands(acted["action"].numpy())

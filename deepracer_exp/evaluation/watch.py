@@ -57,13 +57,8 @@ class Frames:
     ) -> None:
         """Draw what stays the same.
 
-        Args:
-            lap: of n steps.
-            acted: what the policy read and wrote in these, [n].
-            policy: that drove.
-            actions: what it chooses from.
-            observation: what it sees through.
-            front_point_m: of the car, ahead of its origin.
+        `acted` is what the policy read and wrote in the n steps of the lap, [n]; `front_point_m` that of the car,
+        ahead of its origin.
         """
         self._lap, self._acted, self._policy, self._camera = lap, acted, policy, observation.camera
         self._left = 0 if self._camera is None else _EYE[0]
@@ -267,11 +262,7 @@ class _Distribution:
 def film_run(config: EvaluateConfig, file: Path | None, out: Console, err: Console) -> None:
     """Race a run's checkpoint under a protocol and film its best lap on the usual conditions.
 
-    Args:
-        config: validated; its held-out conditions are left out.
-        file: .mp4 to write; None: named after the checkpoint, in the run's folder.
-        out: for the result.
-        err: for progress.
+    `file` is the .mp4 to write; None: named after the checkpoint, in the run's folder.
 
     Raises:
         BadInput: the run, the checkpoint, a track or a condition cannot be used.

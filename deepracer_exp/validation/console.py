@@ -86,15 +86,13 @@ def console_findings(text: str) -> list[ConsoleFinding]:
     found: list[ConsoleFinding] = []
     if len(text) > LONGEST:
         found.append(ConsoleFinding(0, f"{len(text):,} characters of code; at most {LONGEST:,} are accepted"))
-    tree = ast.parse(text)
-    found += _imports(tree)
-    found += _builtins(tree)
-    found += _words(text)
-    return sorted({*found, *style_findings(text)})
+    return sorted({*found, *_imports_and_builtins(ast.parse(text)), *_words(text), *style_findings(text)})
 
 
-def _imports(tree: ast.Module) -> Iterator[ConsoleFinding]:
+def _imports_and_builtins(tree: ast.Module) -> Iterator[ConsoleFinding]:
     for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and node.id in BUILTINS:
+            yield ConsoleFinding(node.lineno, f"use of {node.id}, which is forbidden")
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -106,12 +104,6 @@ def _imports(tree: ast.Module) -> Iterator[ConsoleFinding]:
                 yield ConsoleFinding(node.lineno, f"import of {name}; allowed are {', '.join(IMPORTS)}")
         if node not in tree.body:
             yield ConsoleFinding(node.lineno, "an import that is not at the top of the file")
-
-
-def _builtins(tree: ast.Module) -> Iterator[ConsoleFinding]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Name) and node.id in BUILTINS:
-            yield ConsoleFinding(node.lineno, f"use of {node.id}, which is forbidden")
 
 
 def _words(text: str) -> Iterator[ConsoleFinding]:

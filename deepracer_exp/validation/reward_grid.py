@@ -75,7 +75,8 @@ def sample_reward_grid(setup: RaceSetup, rewards: Sampler, detail: float) -> Rew
         """Return an odd number of points, so that the middle is one of them."""
         return max(5, round(n * detail)) // 2 * 2 + 1
 
-    ndist = (np.arange(max(4, round(_PLACES * detail))) + 0.5) / max(4, round(_PLACES * detail))
+    places = max(4, round(_PLACES * detail))
+    ndist = (np.arange(places) + 0.5) / places
     speeds_mps = np.array([low[1], middle_speed_mps(setup), high[1]])
     headings_rad = np.radians(np.linspace(-HEADINGS_DEG, HEADINGS_DEG, points(_HEADINGS)))
     beyond_m = setup.track.width_m / 2 + OFF_ROAD_M

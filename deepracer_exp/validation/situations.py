@@ -78,16 +78,9 @@ def poses(
     *,
     lateness: ArrayLike = 1.0,
 ) -> Poses:
-    """Return poses with the number of steps it takes to get there.
+    """Return poses with the number of steps it takes to get there; the arguments are broadcast together.
 
-    Args:
-        setup: the track and the car.
-        ndist: see `Poses`; all arguments are broadcast together.
-        offset_m: see `Poses`.
-        heading_error_rad: see `Poses`.
-        speed_mps: see `Poses`.
-        steering_deg: see `Poses`.
-        lateness: steps taken so far relative to driving at the commanded speed.
+    `lateness` is the number of steps taken so far relative to driving at the commanded speed.
     """
     values = np.broadcast_arrays(ndist, offset_m, heading_error_rad, speed_mps, steering_deg, lateness)
     ndist_, offset_m_, error_rad, speed, steering, late = (np.array(v, np.float64).ravel() for v in values)
@@ -160,9 +153,8 @@ def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
     # The second step is the first that is rewarded; in the first the car stood on the start line.
     start = poses(setup, setup.car.front_point_m / track.length_m, 0.0, 0.0, speed, lateness=0.0)
     line = np.array([1.0 if not track.closed else 0.05 / track.length_m])
-    finish = replace(poses(setup, line, 0.0, 0.0, speed), progress_before=np.array([99.5]))
-    lap_steps = track.length_m / speed / setup.car.control_period_s
-    finish = replace(finish, steps=np.array([2 + int(lap_steps)]))
+    steps = np.array([2 + int(track.length_m / speed / setup.car.control_period_s)])
+    finish = replace(poses(setup, line, 0.0, 0.0, speed), progress_before=np.array([99.5]), steps=steps)
     backwards = setup.on(against)
     return [
         NamedSituation("start", situations(setup, start), None),
@@ -203,12 +195,7 @@ def _off_track(setup: RaceSetup, speed_mps: float) -> Poses:
     )
     at = poses(setup, ndist, side * away_m, 0.0, speed_mps)
     first = int(np.argmax(situations(setup, at).columns["is_offtrack"]))
-    return pick(at, np.array([first]))
-
-
-def pick(at: Poses, which: np.ndarray) -> Poses:
-    """Return selected poses."""
-    return Poses(**{name: values[which] for name, values in vars(at).items()})
+    return Poses(**{name: values[first : first + 1] for name, values in vars(at).items()})
 
 
 def sample(setup: RaceSetup, n: int) -> Poses:

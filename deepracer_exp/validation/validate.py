@@ -47,7 +47,12 @@ def validate_reward(
     check = read(experiment)
     setup = check.setup
     out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
-    _print_console_findings(out, check)
+    _line(
+        out,
+        f"AWS console: would {'reject' if check.console else 'accept'} it",
+        "yellow" * bool(check.console),
+    )
+    _print_first(out, list(map(str, check.console)))
     waypoints = setup.track.waypoints
     same = recognise(waypoints, np.arange(len(waypoints)))[:1]
     if not same or same[0].distance_m > 1 / UNITS_PER_M:
@@ -78,14 +83,6 @@ def _default_picture(experiment: Experiment, check: Check) -> Path:
 def _line(out: Console, text: str, style: str | None = None) -> None:
     """Print one line without markup; a terminal may wrap it, a file gets it whole."""
     out.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
-
-
-def _print_console_findings(out: Console, check: Check) -> None:
-    if not check.console:
-        _line(out, "AWS console: would accept it")
-        return
-    _line(out, "AWS console: would reject it", "yellow")
-    _print_first(out, list(map(str, check.console)))
 
 
 def _print_situations(out: Console, check: Check) -> None:

@@ -7,7 +7,7 @@ from deepracer_exp.analysis.log_course import waypoint_positions
 from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_waypoints
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
 from deepracer_exp.analysis.sectors import sectors_of, times_by_sector
-from deepracer_exp.analysis.statistics import Values, means, quantiles, subsample
+from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
 
 from .figure import Chart, Layer, Panel, band, bars, colored_points, line, note, points
 from .maps import LEAST_STEPS, Grid, beside, map_panel, waypoint_panel
@@ -18,8 +18,6 @@ GRIP_SHARE = 0.95
 LEAST_GRIP_MPS2 = 0.5
 SLIDE_LEAST_MPS = 0.3
 """Below this speed the direction of travel is mostly noise."""
-_ROWS = 200_000
-"""Rows beyond which quantiles are those of an evenly spaced part of them."""
 
 
 def lap_line(view: LogView) -> Chart | None:
@@ -94,7 +92,7 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
     if not len(rows):
         return None
     n = view.waypoint_count
-    at, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), _ROWS)
+    at, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
     lap = view.fastest_lap(*columns)
     panels: dict[str, list[Layer]] = {"track_speed_mps": [], "steer": []}
     for column, layers in panels.items():
@@ -148,7 +146,7 @@ def racing_line(view: LogView) -> Chart | None:
         return None
     ideal, n = minimum_curvature_line(course), view.waypoint_count
     at = np.arange(n)
-    rows = rows.iloc[subsample(len(rows), _ROWS)]
+    rows = rows.iloc[subsample(len(rows), MOST_ROWS)]
     waypoint = closest_waypoints(rows)
     away_m = rows["offset_m"] - ideal.at(rows["lap_position"], ideal.offset_m)
     low, middle, high = quantiles(waypoint, away_m, n, (0.1, 0.5, 0.9))

@@ -18,12 +18,9 @@ _LEGEND_ROW, _TITLE_ROW = 21.0, 24.0
 
 
 def draw(chart: Chart, width: float = WIDTH) -> go.Figure:
-    """Draw a chart as wide as its page; its caption is for the text around it.
+    """Draw a chart as wide as its page, in pixels; its caption is for the text around it.
 
-    Args:
-        chart: what to draw.
-        width: pixels for which it is laid out: `WIDTH`, or less with all panels below each other. The traces are the
-            same.
+    Below `WIDTH` all panels stand below each other; the traces are the same.
     """
     narrow = width < WIDTH
     shape = [[panel] for row in chart.rows for panel in row] if narrow else chart.rows

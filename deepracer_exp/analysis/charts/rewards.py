@@ -5,7 +5,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
-from deepracer_exp.analysis.statistics import histogram, means, quantiles, subsample
+from deepracer_exp.analysis.statistics import MOST_ROWS, histogram, means, quantiles, subsample
 
 from .actions import action_classes
 from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
@@ -18,8 +18,6 @@ STEP_HZ = 15.0
 _THIRDS = ("first third of the iterations", "second third", "last third")
 _ACTIONS = 3
 """Actions that have a map of their own."""
-_ROWS = 200_000
-"""Rows beyond which quantiles are those of an evenly spaced part of them."""
 _COMMON = 20
 _MOST_EPISODES = 1500
 
@@ -34,7 +32,7 @@ def reward_map(view: LogView) -> Chart | None:
     cells = {grid: grid.of(rows["X"], rows["Y"]) for grid in (fine, coarse)}
     inside = cells[fine][cells[fine] >= 0]
     mean = means(cells[fine], reward, fine.count)
-    of_steps = mean[inside[subsample(len(inside), _ROWS)]]
+    of_steps = mean[inside[subsample(len(inside), MOST_ROWS)]]
     of_steps = of_steps[np.isfinite(of_steps)]
     if not len(of_steps):
         return None
@@ -81,7 +79,7 @@ def value_map(view: LogView) -> Chart | None:
         return None
     future = rows["discounted_future_reward"].to_numpy(np.float64)
     cells = Grid.over(view.course, 12_000).means(rows, future, "future reward, discounted")
-    n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), _ROWS)
+    n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
     low, high = quantiles(waypoint[part], future[part], n, (0.1, 0.9))
     layers = [
         band(np.arange(n), low, high, BLUE, "10th to 90th percentile"),
@@ -106,7 +104,7 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
     rows = view.driven("closest_waypoint", "reward", "discounted_future_reward")
     if not len(rows):
         return None
-    n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), _ROWS)
+    n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
     at = np.arange(n)
     panels = []
     for column, label in (
@@ -137,9 +135,7 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
 def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
     """Draw what the terms of the reward function contribute, by waypoint and over the training.
 
-    Args:
-        view: the recording.
-        terms: one column for each term, in units of the reward; the index holds labels of rows of `view.steps`.
+    `terms` has a column for each term, in units of the reward; its index holds labels of rows of `view.steps`.
     """
     if terms.empty:
         return None

@@ -55,13 +55,9 @@ def episodes(trace: pd.DataFrame) -> pd.DataFrame:
 
 
 def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
-    """Draw the best episode of each track: its fastest complete lap, or the episode that drove farthest.
+    """Draw the best episode of each track of a trace: its fastest complete lap, or the episode that drove farthest.
 
-    Lines are coloured by measured speed, on one scale.
-
-    Args:
-        trace: rows as `runs.trace.read_trace` gives them.
-        tracks: the courses by their names in the trace; one that was not driven on is shown empty.
+    Lines are coloured by measured speed, on one scale; a track that was not driven on is shown empty.
     """
     shown = []
     for name, track in tracks.items():

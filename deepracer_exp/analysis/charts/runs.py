@@ -101,30 +101,22 @@ def _on_grid(iterations: pd.DataFrame, column: str, grid: Values) -> Values:
 
 
 def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> list[Panel]:
-    names, places, best_s, medians_s = list(groups), [], [], []
-    for number, some in enumerate(groups.values()):
-        own_s = [float(view.episodes["lap_time_s"].min()) for view in some]
-        places += list(number + 0.5 * ((np.arange(len(some)) + 0.5) / len(some) - 0.5))
-        best_s += own_s
-        medians_s.append(float(np.median(own_s)))
-    if not np.isfinite(best_s).any():
+    best_s = [[float(view.episodes["lap_time_s"].min()) for view in some] for some in groups.values()]
+    if not np.isfinite(np.concatenate(best_s)).any():
         return []
+    places = [at + 0.5 * ((np.arange(len(own)) + 0.5) / len(own) - 0.5) for at, own in enumerate(best_s)]
+    n = len(groups)
     layers = [
         # Below the points, which it may coincide with.
-        points(np.arange(len(names)), medians_s, ORANGE, "median", symbol="diamond", size=16),
-        points(places, best_s, BLUE, "a run", size=8),
+        points(np.arange(n), list(map(np.median, best_s)), ORANGE, "median", symbol="diamond", size=16),
+        points(np.concatenate(places), np.concatenate(best_s), BLUE, "a run", size=8),
     ]
-    x_range = (-0.5, len(names) - 0.5)
-    title = "Best lap of each run"
-    return [Panel(title=title, y_label="lap time, s", x_names=names, x_range=x_range, layers=layers)]
+    axis: dict[str, Any] = {"x_names": list(groups), "x_range": (-0.5, n - 0.5), "y_label": "lap time, s"}
+    return [Panel(title="Best lap of each run", layers=layers, **axis)]
 
 
 def generations(views: Sequence[LogView]) -> Chart | None:
-    """Draw a run and the clones of it on one axis of iterations.
-
-    Args:
-        views: of all runs; those that are not related are left out, unless the first is a recording of several rounds.
-    """
+    """Draw a run and the clones of it, or the rounds of the first recording, on one axis of iterations."""
     parts: list[tuple[str, pd.DataFrame]] = []
     offset = 0
     for view in _clone_chain(views) or views[:1]:
@@ -226,11 +218,7 @@ def evaluation_results(view: LogView) -> dict[str, float]:
 
 
 def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
-    """Draw the learning curves of our own runs over each other, and their lap times.
-
-    Args:
-        records: the runs by a short label, each with at least one iteration.
-    """
+    """Draw the learning curves of our own runs, by a short label, over each other, and their lap times."""
     panels: list[Panel] = []
     for column, title, unit in (
         ("completion", "Completion, mean", "per cent of the lap"),

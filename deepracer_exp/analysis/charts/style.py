@@ -49,12 +49,7 @@ _TITLE_LETTER = 11.3
 
 
 def base_layout(title: str, width: float = WIDTH) -> dict[str, Any]:
-    """Return what the layouts of all figures have in common.
-
-    Args:
-        title: escaped for Plotly where that is needed; it is broken into lines that fit.
-        width: of the figure, pixels.
-    """
+    """Return what the layouts of all figures have in common; the title is broken into lines that fit the width."""
     letters = round(width / _TITLE_LETTER)
     lines = [line for part in title.split("\n") for line in textwrap.wrap(part, letters) or [""]]
     return {
