@@ -224,11 +224,10 @@ class AgainstLog:
         """The table as texts."""
         rows = []
         for name, *values in self.table.itertuples(index=False):
-            digits = 1 if name.endswith("%") else 2
-            forms = (f".{digits}f", f".{digits}f", f"+.{digits}f")
+            form = ".1f" if name.endswith("%") else ".2f"
             texts = (
-                format(value, form) if np.isfinite(value) else NONE
-                for value, form in zip(values, forms, strict=True)
+                f"{value:{sign}{form}}" if np.isfinite(value) else NONE
+                for value, sign in zip(values, ("", "", "+"), strict=True)
             )
             rows.append((name, *texts))
         return Table(("", "log", "simulated", "difference"), tuple(rows), 1)

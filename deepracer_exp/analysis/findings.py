@@ -41,6 +41,7 @@ FIGURES = {
     "overfits": "training_progress",
 }
 """The chart that shows what a rule found."""
+_Numbers = dict[str, float | int | str]
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _converged(view: LogView) -> Finding:
             f"{rule.patience + 1} are needed."
         )
         return Finding("converged", sentence, {"iterations": driven})
-    values: dict[str, float | int | str] = {
+    values: _Numbers = {
         "completion": found.completion,
         "completion_before": found.completion_before,
         "completion_best": found.completion_best,
@@ -161,7 +162,7 @@ def _submit(view: LogView) -> Finding:
     best, evaluated = candidates(view.iterations), evaluated_candidates(view.recording)
     thresholds = {"least_laps": chosen.LEAST_LAPS, "dense": chosen.DENSE}
     laps = int(view.iterations["complete"].sum())
-    values: dict[str, float | int | str]
+    values: _Numbers
     if len(best):
         first = best.iloc[0]
         low, high = map(float, wilson(first["complete"], first["episodes"]))
@@ -238,8 +239,8 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
         f"{', the fastest of them' if target_s is None else ''}: the chance of such a lap is {_share(low)} to "
         f"{_share(high)}"
     )
-    values: dict[str, float | int | str] = {"target_s": target, "laps": laps, "faster": faster}
-    values |= {"low": low, "high": high, "mean_s": mean_s, "complete": complete}
+    values: _Numbers = {"target_s": target, "laps": laps, "faster": faster, "low": low, "high": high}
+    values |= {"mean_s": mean_s, "complete": complete}
     if sd_s > 0:
         normal = float(norm.cdf(target, mean_s, sd_s))
         sentence += f"; a normal fit (mean {mean_s:.2f} s, deviation {sd_s:.2f} s) says {_share(normal)}"
@@ -342,11 +343,8 @@ def _steering(places: Sequence[OffTrackPlace]) -> Finding:
     values = {
         f"{name}, waypoint {one.waypoint}": times for one in places for name, times in one.judgements.items()
     }
-    thresholds = {
-        "unusual": off_track.UNUSUAL,
-        "slide_deg": off_track.SLIDE_DEG,
-        "steers_deg": off_track.STEERS_DEG,
-    }
+    thresholds = {"unusual": off_track.UNUSUAL, "slide_deg": off_track.SLIDE_DEG}
+    thresholds |= {"steers_deg": off_track.STEERS_DEG}
     return Finding("steering", f"Before it runs off, {'; '.join(words)}.", values, thresholds)
 
 
@@ -359,12 +357,9 @@ def _overfits(view: LogView) -> Finding | None:
     found = overfitting(view.iterations, view.recording.stopping)
     if found is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
-    values: dict[str, float | int | str] = {"best": found.best, "now": found.now}
-    values |= {"best_iteration": found.best_iteration}
-    sentence = (
-        f"No sign of overfitting: completion in the {found.evaluated} is {found.now:.0f} % "
-        f"(best {found.best:.0f} %)."
-    )
+    values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
+    sentence = f"No sign of overfitting: completion in the {found.evaluated} is {found.now:.0f} % "
+    sentence += f"(best {found.best:.0f} %)."
     if found.decision is not None:
         sentence = (
             f"It overfits: completion in the {found.evaluated} fell from {found.best:.0f} % around iteration "

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.runs.files import run_folders
 
 RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
@@ -149,10 +149,13 @@ def read_stores(overrides: Iterable[str], keys: Sequence[str] = ()) -> Stores:
         key, equals, value = word.partition("=")
         if not equals or key not in accepted:
             raise BadInput(f"{word}: no such key{nearest(key, accepted)}; accepted: {', '.join(accepted)}")
-        values[key] = _unquoted(value)
+        quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+        values[key] = value[1:-1] if quoted else value
     given = {key: value for key, value in values.items() if value not in ("", "null")}
-    runs_dir = given.pop("runs_dir", "runs")
-    return Stores(_path(runs_dir), given.pop("tracking.uri", None), given)
+    text = given.pop("runs_dir", "runs")
+    with reading(f"runs_dir={text}"):
+        runs_dir = Path(text).expanduser()
+    return Stores(runs_dir, given.pop("tracking.uri", None), given)
 
 
 def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
@@ -160,18 +163,6 @@ def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
     words = list(overrides)
     stores = [word for word in words if word.partition("=")[0] in STORES]
     return read_stores(stores), [word for word in words if word not in stores]
-
-
-def _unquoted(value: str) -> str:
-    quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
-    return value[1:-1] if quoted else value
-
-
-def _path(text: str) -> Path:
-    try:
-        return Path(text).expanduser()
-    except RuntimeError as error:  # no such user
-        raise BadInput(f"runs_dir={text}: {error}") from None
 
 
 def complete_runs(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:

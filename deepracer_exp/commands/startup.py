@@ -125,12 +125,7 @@ def check_sweep(request: "SweepRequest") -> None:
 
 
 def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.worker") -> None:
-    """Start the server that workers are forked from; it imports torch while this process does.
-
-    Args:
-        wanted: whether there will be workers.
-        module: imported once by the server, for all workers.
-    """
+    """Start the server that workers are forked from; it imports torch, in `module`, while this process does."""
     if not wanted or not sys.platform.startswith("linux"):
         return
     import multiprocessing

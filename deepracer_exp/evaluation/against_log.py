@@ -43,12 +43,7 @@ def race_against_log(
 ) -> AgainstLog:
     """Race a run's policy as the laps of a log, which `prepare_races` returned, were driven.
 
-    Args:
-        run: whose policy drives.
-        checkpoint: as for `StoredRun.choose_checkpoint`.
-        view: of the log.
-        given: name or file of the course; None: that of the log.
-        err: for progress.
+    `given` is the name or the file of the course; None: that of the log.
 
     Raises:
         BadInput: the log has no lap to compare, its course is unknown, or the checkpoint cannot be used.

@@ -219,14 +219,9 @@ _LEGEND = (
 def show_checkpoints(
     config: EvaluateConfig, own_trials: bool, picture: str | None, out: Console, err: Console
 ) -> None:
-    """Evaluate a run's checkpoints under a protocol, print the comparison and recommend one.
+    """Evaluate a run's checkpoints, print the comparison, recommend one, and draw them on the page `picture`.
 
-    Args:
-        config: its checkpoint is ignored.
-        own_trials: use the trials of the training instead of those of `config`.
-        picture: page of the figure; None: none.
-        out: for results.
-        err: for progress.
+    The trials are those of the training (`own_trials`) or of `config`.
 
     Raises:
         BadInput: the run, all its checkpoints, a track or a condition cannot be used, or a file cannot be written.

@@ -74,14 +74,7 @@ def fit(
     hidden: tuple[str, ...],
     minor: tuple[str, ...],
 ) -> Table:
-    """Return the fullest table that fits a console.
-
-    Args:
-        console: to print on.
-        lay_out: makes it with or without intervals and without some columns.
-        hidden: columns left out in any case.
-        minor: columns left out first.
-    """
+    """Return the fullest table that fits a console: with intervals or without, first without the minor columns."""
     endless = console.options.update(max_width=10_000)
     for intervals, left_out in ((True, hidden), (True, hidden + minor), (False, hidden + minor)):
         shown = lay_out(intervals, left_out)

@@ -51,13 +51,7 @@ def replay_reward(
 
     The params are rebuilt from the recorded poses (see `RecordedParams`). A module with `reward_batch` is called with
     many steps at once; any other one step by step, episode by episode in the order of time, with one set of module
-    globals for each stream and worker, as in a process of the service.
-
-    Args:
-        view: of a recording.
-        source: the module.
-        car: that drove; the service's has the dimensions of the default one.
-        time_limit_s: CPU seconds per call.
+    globals for each stream and worker, as in a process of the service. The time limit is in CPU seconds per call.
 
     Raises:
         BadInput: the function cannot be loaded; it raised, hung or returned no finite number, with the episode and

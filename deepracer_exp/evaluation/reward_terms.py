@@ -57,14 +57,8 @@ def contributed_terms(
     """Compute the terms of a module's reward at the steps of a training.
 
     The module provides a function `terms(params)` that returns a dict of numbers whose sum is the reward.
-    Whole episodes are evaluated, in the order of time, with one set of module globals.
-
-    Args:
-        view: the training, on a known course.
-        source: the module.
-        car: that drove.
-        most: approximate number of steps to evaluate.
-        time_limit_s: CPU seconds per call.
+    Whole episodes are evaluated, in the order of time, with one set of module globals: about `most` steps. The time
+    limit is in CPU seconds per call.
 
     Returns:
         One row per step, indexed as in `view.steps`, one column per term in reward units, 0 where a step lacks the

@@ -22,11 +22,7 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tupl
     """Return the texts of an experiment's files by name, and a note on each value changed or beyond the console.
 
     Values are clipped to the console's ranges. The action space is kept, because another one makes another car.
-
-    Args:
-        experiment: of the run.
-        actions: its action space.
-        reward: text of the reward function, with its constants filled in.
+    `reward` is the text of the reward function, with its constants filled in.
     """
     metadata = replace(metadata_of(actions), **sensor_keys(experiment.observation))
     learning, changed = _hyperparameters(experiment)

@@ -52,12 +52,6 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     hyperparameters.json; the last episode of the first iteration has number n - 1. A run keeps only the means of its
     evaluations, so the metrics file has one item for each.
 
-    Args:
-        recording: of the run, from `read_own_recording`.
-        experiment: its configuration.
-        folder: new or empty.
-        layout: `console` or `deepracer-for-cloud`.
-
     Raises:
         BadInput: no episode is finished, or the folder is not empty or cannot be written.
     """

@@ -44,11 +44,8 @@ def aws_model(
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return the contents of a model's files by name, and notes.
 
-    Args:
-        experiment: of the run.
-        stored: its checkpoint.
-        reward: text of the reward function, with its constants filled in.
-        score: mean progress of its evaluation in per cent, None if it was not evaluated.
+    `reward` is the text of the reward function, with its constants filled in, `score` the mean progress of the
+    checkpoint's evaluation in per cent.
 
     Raises:
         BadInput: the service has no such network or sensors.

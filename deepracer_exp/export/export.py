@@ -197,13 +197,9 @@ class DeployedPolicy(nn.Module):
 def write_onnx(
     model: DeployedPolicy, observed: ObservationShape, facts: Mapping[str, Any], path: Path
 ) -> float:
-    """Write the file and return its largest difference from the network, on `CHECKED` observations.
+    """Write the file atomically and return its largest difference from the network, on `CHECKED` observations.
 
-    Args:
-        model: the policy.
-        observed: the shape of what it reads.
-        facts: metadata of the file, JSON types.
-        path: the file, written atomically.
+    `facts` are metadata of the file, JSON types.
 
     Raises:
         BadInput: the required packages are not installed, or the file cannot be written.

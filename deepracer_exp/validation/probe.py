@@ -56,9 +56,7 @@ class Probe:
     def rewards(self, situations: Situations, before: Situations | None = None) -> NDArray[np.float64]:
         """Return the reward of each situation in order, (n,); NaN where the call failed.
 
-        Args:
-            situations: n situations.
-            before: n situations, each passed to the function just before its counterpart; None: nothing.
+        Each of the n situations `before` is passed to the function just before its counterpart.
         """
         if before is None:
             answers = self._answers(situations.params())[: len(situations)]
@@ -136,10 +134,6 @@ def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
 
     Only functions of which some line was executed are considered; error handling is left out: handlers, `raise`,
     `assert`.
-
-    Args:
-        text: the module.
-        lines: numbers of the executed lines.
     """
     missed: list[tuple[int, int]] = []
     for function in ast.walk(ast.parse(text)):

@@ -92,9 +92,8 @@ def _ranges(steer: Values, speed: Values) -> Values:
 
 
 def _angle(steering_deg: float) -> str:
-    if abs(steering_deg) < 0.05:
-        return "straight"
-    return f"{'left' if steering_deg > 0 else 'right'} {abs(steering_deg):.3g}°"
+    side = "left" if steering_deg > 0 else "right"
+    return "straight" if abs(steering_deg) < 0.05 else f"{side} {abs(steering_deg):.3g}°"
 
 
 def action_use_by_section(view: LogView) -> Chart | None:
