@@ -114,10 +114,11 @@ def waypoint_panel(layers: Sequence[Layer], label: str, n: int, **more: Any) -> 
 
 
 def beside(course: Track, place: Values, offset_m: Values) -> Values:
-    """Return the points (n, 2) so many m to the left of the centre line at lap positions (n,)."""
-    pose = course.start_pose(place)
-    left = np.column_stack([-np.sin(pose.yaw_rad), np.cos(pose.yaw_rad)])
-    return course.points_at(place) + offset_m[:, None] * left
+    """Return the points (n, 2) so many m to the left of the centre line at neighbouring lap positions (n,)."""
+    center = course.points_at(place)
+    ahead = np.gradient(center, axis=0)
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    return center + offset_m[:, None] * np.column_stack([-ahead[:, 1], ahead[:, 0]])
 
 
 def _road(rings: Sequence[Values], center: Values) -> list[go.layout.Shape]:
