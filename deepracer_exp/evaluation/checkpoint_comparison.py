@@ -21,9 +21,9 @@ from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.resolve import StoredRun, resolve
 from deepracer_exp.runs.result import CRITERIA
 
-from .evaluate import NOTHING, fit, number
+from .evaluate import fit
 from .evaluator import Evaluator
-from .result import CONFIDENCE, HELD_OUT, USUAL, Evaluation, Metric, Rank
+from .result import CONFIDENCE, HELD_OUT, NOTHING, USUAL, Evaluation, Metric, Rank, number
 
 logger = logging.getLogger("deepracer_exp")
 

@@ -2,7 +2,6 @@
 
 import datetime
 import json
-import math
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,12 +25,11 @@ from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 from .evaluator import Evaluator
 from .film import LapRecorder, best_attempt
 from .real_car import compare, explain_controls, key_figures, losses_table
-from .result import CONFIDENCE, USUAL, Evaluation
+from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number
 
 if TYPE_CHECKING:
     from .video import View
 
-NOTHING = "\N{EN DASH}"
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s")
 
@@ -126,11 +124,6 @@ def _cells(found: Mapping[str, Any], intervals: bool) -> dict[str, str]:
         "penalty s": _mean(found["penalty_s"], 1, intervals),
         "score s": number(found["race_score_s"], 2),
     }
-
-
-def number(value: float | None, digits: int) -> str:
-    """Return a number with so many digits, a dash for None and NaN."""
-    return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:

@@ -13,12 +13,11 @@ from deepracer_exp.deepracer.car_controls import full_scale, throttle
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 
 from .evaluator import Evaluator
-from .result import USUAL, Evaluation
+from .result import NOTHING, USUAL, Evaluation, number
 
 SIMULATOR, CAR = "simulator", "car"
 """Names of what is compared, beside the parts of `RealCarConfig`."""
 _PARTS = tuple(field.name for field in fields(RealCarConfig))
-_NOTHING = "\N{EN DASH}"
 CURES = {
     "picture": "pictures (blur, pixel_noise)",
     "timing": "action_delay_steps, observation_dropout",
@@ -72,16 +71,15 @@ def losses_table(evaluations: Mapping[str, Evaluation]) -> Table:
     shown.add_column("in sim2real against it")
     names = {SIMULATOR: "nothing", CAR: "all"}
     for name, one in found.items():
-        lost_s = None
-        if one["lap_time_s"] is not None and base["lap_time_s"] is not None and name != SIMULATOR:
-            lost_s = one["lap_time_s"] - base["lap_time_s"]
+        lap_s, base_s = one["lap_time_s"], base["lap_time_s"]
+        lost_s = None if name == SIMULATOR or None in (lap_s, base_s) else lap_s - base_s
         shown.add_row(
             names.get(name, name),
             f"{100 * one['lap_share']:.0f}",
-            _NOTHING if name == SIMULATOR else f"{100 * (base['lap_share'] - one['lap_share']):.0f}",
+            NOTHING if name == SIMULATOR else f"{100 * (base['lap_share'] - one['lap_share']):.0f}",
             f"{100 * one['completion']:.1f}",
-            _NOTHING if one["lap_time_s"] is None else f"{one['lap_time_s']:.2f}",
-            _NOTHING if lost_s is None else f"{lost_s:+.2f}",
+            number(lap_s, 2),
+            NOTHING if lost_s is None else f"{lost_s:+.2f}",
             CURES.get(name, ""),
         )
     return shown
@@ -97,15 +95,12 @@ def explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[s
     top_mps = controls.full_throttle_mps or scale.speed_mps
     half_mps = top_mps * float(throttle(0.5 * scale.speed_mps, scale.speed_mps))
     lines = [
-        f"steering: {scale.steering_deg:g} degrees are full lock, {controls.full_lock_deg:g} degrees on the car"
-        + (
-            f": {controls.full_lock_deg / scale.steering_deg:.2g} times as much"
-            if scale.steering_deg > 0 and scale.steering_deg != controls.full_lock_deg
-            else ""
-        ),
+        f"steering: {scale.steering_deg:g} degrees are full lock, {controls.full_lock_deg:g} degrees on the car",
         f"speed: {scale.speed_mps:g} m/s are full throttle, {top_mps:g} m/s on the car; half of it becomes "
         f"{half_mps:g} m/s",
     ]
+    if 0 < scale.steering_deg != controls.full_lock_deg:
+        lines[0] += f": {controls.full_lock_deg / scale.steering_deg:.2g} times as much"
     if -actions.low[0] > scale.steering_deg > 0:
         lines.append(
             f"the servo refuses steering beyond {-scale.steering_deg:g} degrees and keeps the last angle"

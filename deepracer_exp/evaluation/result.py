@@ -1,5 +1,6 @@
 """Results of an evaluation: the attempted laps by track and condition, with their statistics."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -17,6 +18,7 @@ Interval = tuple[float, float]
 USUAL, HELD_OUT = "usual", "held_out"
 """Names of the conditions."""
 CONFIDENCE = 0.95
+NOTHING = "\N{EN DASH}"
 _RESAMPLES = 9999
 
 
@@ -169,6 +171,11 @@ class Evaluation:
                 for group in self.groups
             ]
         }
+
+
+def number(value: float | None, digits: int) -> str:
+    """Return a number with so many digits, a dash for None and NaN."""
+    return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
 def _together(groups: Sequence[Group], track: str, condition: str) -> Group:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.driving import LidarConfig, ObservationConfig
+from deepracer_exp.config.driving import LidarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.deepracer.car_controls import full_scale, steering_share, throttle
@@ -96,8 +96,15 @@ def car_archive(networks: "ActorCritic", experiment: Experiment, actions: Action
             f"steering from {actions.low[0]:g} to {actions.high[0]:g} degrees is written as -{lock_deg:g} to "
             f"{lock_deg:g}, and the outputs are rescaled to give the same angles: the car divides by the high end alone"
         )
-    assert isinstance(network, CNNConfig)  # or to_service had refused it
-    graph = policy_graph(tensors, _shapes(observation, metadata.sensor), network.strides, bounds)
+    # Or `check_car` and `to_service` had refused it.
+    assert observation.camera is not None
+    assert isinstance(network, CNNConfig)
+    channels, height, width = observation.camera.shape
+    shapes: list[tuple[int, ...]] = [(height, width, channels)]
+    if observation.lidar is not None:
+        shapes.append((observation.lidar.size,))
+    inputs = dict(zip(metadata.sensor, shapes, strict=True))
+    graph = policy_graph(tensors, inputs, network.strides, bounds)
     check_weights(graph, tensors)
     values = json.loads(model_metadata_text(metadata))
     try:
@@ -133,16 +140,6 @@ def _rescaled(tensors: Tensors, rescaling: Rescaling) -> Tensors:
         f"{HEAD}/policy_mean/kernel": (kernel * rescaling.factor).astype(np.float32),
         f"{HEAD}/policy_mean/bias": (bias * rescaling.factor + rescaling.shift).astype(np.float32),
     }
-
-
-def _shapes(observation: ObservationConfig, sensors: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the graph's inputs by sensor."""
-    assert observation.camera is not None
-    channels, height, width = observation.camera.shape
-    shapes: list[tuple[int, ...]] = [(height, width, channels)]
-    if observation.lidar is not None:
-        shapes.append((observation.lidar.size,))
-    return dict(zip(sensors, shapes, strict=True))
 
 
 def check_weights(graph: bytes, tensors: Tensors) -> None:
