@@ -214,7 +214,7 @@ class Errors(NamedTuple):
 def errors(predicted: Floats, windows: Windows) -> Errors:
     """Hold predicted poses, (M, steps, 3), against the recorded ones."""
     off = predicted - windows.truth
-    return Errors(off[..., 0], off[..., 1], _turn(off[..., 2]))
+    return Errors(off[..., 0], off[..., 1], np.pi - np.remainder(np.pi - off[..., 2], 2.0 * np.pi))
 
 
 def replay(car: CarConfig, windows: Windows, observer: Observer = OBSERVER) -> Floats:
@@ -308,9 +308,3 @@ def _replay(cars, drives, observer, substeps, pose, commands, duration_s, first,
             left += observer[1] * off_left
             rate += observer[2] * off_left + observer[3] * turn / lasted
             drive["steering_rad"] += observer[4] * off_left + observer[5] * turn / lasted
-
-
-def _turn(angle: Floats) -> Floats:
-    """Return the angle brought into (-pi, pi]."""
-    turn: Floats = np.pi - np.remainder(np.pi - angle, 2.0 * np.pi)
-    return turn

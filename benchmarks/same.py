@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.runs.trace import read_trace
@@ -24,7 +23,8 @@ def different_rows(one: Sequence[Row], other: Sequence[Row]) -> str | None:
     """Say where two runs' metrics differ first, None where they are the same."""
     for number, (left, right) in enumerate(zip(one, other, strict=False), 1):
         for key in {**left, **right}:
-            if key not in TIMES and not _same(left.get(key), right.get(key)):
+            # JSON text holds every bit of a number, and takes NaN for the same as NaN.
+            if key not in TIMES and json.dumps(left.get(key)) != json.dumps(right.get(key)):
                 return f"row {number}: {key} is {left.get(key)} and {right.get(key)}"
     return None if len(one) == len(other) else f"{len(one)} and {len(other)} rows"
 
@@ -47,7 +47,7 @@ def different_traces(one: Path, other: Path) -> str | None:
     left, right = (read_trace(run / "trace") for run in (one, other))
     if len(left) != len(right):
         return f"{len(left)} and {len(right)} rows"
-    return next((name for name in left if not _same_columns(left[name], right[name])), None)
+    return next((name for name in left if not left[name].equals(right[name])), None)
 
 
 def different_points(rows: Sequence[Row], history: History) -> str | None:
@@ -71,15 +71,6 @@ def different_points(rows: Sequence[Row], history: History) -> str | None:
 
 def _points(key: str, points: Sequence[tuple[int, float]]) -> "Counter[Any]":
     return Counter(step for step, _ in points) if key in map(metric_name, TIMES) else Counter(points)
-
-
-def _same(one: Any, other: Any) -> bool:
-    # JSON text holds every bit of a number, and takes NaN for the same as NaN.
-    return json.dumps(one) == json.dumps(other)
-
-
-def _same_columns(one: "pd.Series[Any]", other: "pd.Series[Any]") -> bool:
-    return one.equals(other)
 
 
 def _agent(folder: Path) -> dict[str, bytes]:

@@ -6,24 +6,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .agents.ppo import PPO, Algorithm
     from .agents.schedules import Schedule
-    from .api import (
-        Callback,
-        ComposedExperiment,
-        Evaluation,
-        RaceEnv,
-        RunTables,
-        Trainer,
-        TrainResult,
-        compose,
-        evaluate,
-        load_policy,
-        make_env,
-        read_run,
-        train,
-    )
+    from .api import ComposedExperiment, RunTables, compose, evaluate, load_policy, make_env, read_run, train
     from .env.observation import ObservationPart
+    from .env.race_env import RaceEnv
+    from .evaluation.result import Evaluation
     from .runs.convergence import Decision, StoppingRule
     from .tracking.tracker import Tracker
+    from .training.trainer import Callback, Trainer, TrainResult
 
 __version__ = "0.1.0"
 __all__ = [
@@ -49,20 +38,22 @@ __all__ = [
     "read_run",
     "train",
 ]
-_BASES = {
-    "PPO": "agents.ppo",
-    "Algorithm": "agents.ppo",
-    "Decision": "runs.convergence",
-    "ObservationPart": "env.observation",
-    "Schedule": "agents.schedules",
-    "StoppingRule": "runs.convergence",
-    "Tracker": "tracking.tracker",
+_MODULES = {
+    "agents.ppo": ("PPO", "Algorithm"),
+    "agents.schedules": ("Schedule",),
+    "env.observation": ("ObservationPart",),
+    "env.race_env": ("RaceEnv",),
+    "evaluation.result": ("Evaluation",),
+    "runs.convergence": ("Decision", "StoppingRule"),
+    "tracking.tracker": ("Tracker",),
+    "training.trainer": ("Callback", "Trainer", "TrainResult"),
 }
-"""Modules of what classes of the user's own derive from; worker processes import no more than these."""
+"""Where the classes are; worker processes import no more than those that classes of the user's own derive from."""
 
 
 def __getattr__(name: str) -> Any:
     # Not before they are asked for: torch takes seconds to import, and the command line answers before that.
     if name in __all__:
-        return getattr(import_module(f"deepracer_exp.{_BASES.get(name, 'api')}"), name)
+        module = next((module for module, names in _MODULES.items() if name in names), "api")
+        return getattr(import_module(f"deepracer_exp.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -23,23 +23,7 @@ from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.run import run_training
-from deepracer_exp.training.trainer import Callback, Trainer, TrainResult
-
-__all__ = [
-    "Callback",
-    "ComposedExperiment",
-    "Evaluation",
-    "RaceEnv",
-    "RunTables",
-    "TrainResult",
-    "Trainer",
-    "compose",
-    "evaluate",
-    "load_policy",
-    "make_env",
-    "read_run",
-    "train",
-]
+from deepracer_exp.training.trainer import Callback, TrainResult
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import torch
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 
+from deepracer_exp.deepracer.log_archive import natural
 from deepracer_exp.deepracer.model_metadata import CAMERAS, LIDARS
 from deepracer_exp.errors import BadInput
 
@@ -171,7 +172,7 @@ def _match(
     found = {name: given.pop(name) for name in targets if name in given}
     for name, shape in targets.items():
         if name not in found:
-            alike = (one for one in sorted(given, key=_natural) if _unnumbered(one) == _unnumbered(name))
+            alike = (one for one in sorted(given, key=natural) if _unnumbered(one) == _unnumbered(name))
             match = next((one for one in alike if given[one].shape == shape), None)
             if match is not None:
                 found[name] = given.pop(match)
@@ -193,10 +194,6 @@ def _unnumbered(name: str) -> str:
     """Return a tensor's name without the number of its layer, `.../Conv2d_4/kernel` -> `.../conv2d/kernel`."""
     *scope, layer, kind = name.split("/")
     return "/".join([*scope, layer.lower().rstrip("0123456789_"), kind])
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _scope(name: str) -> str:

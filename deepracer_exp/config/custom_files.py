@@ -15,7 +15,6 @@ from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperp
 from deepracer_exp.deepracer.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
-    Action,
     ModelMetadata,
     read_model_metadata,
 )
@@ -87,7 +86,8 @@ class CustomFiles:
             return {}
         low, high = self.metadata.low, self.metadata.high
         if low is None or high is None:
-            actions = [_action_entry(action) for action in self.metadata.actions]
+            listed = self.metadata.actions
+            actions = [{"steering_angle": one.steering_deg, "speed": one.speed_mps} for one in listed]
             return {"kind": "discrete", "actions": actions}
         return {
             "kind": "continuous",
@@ -299,10 +299,6 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
 def _first(own: Mapping[str, str], *keys: str) -> str | None:
     """Return the first of these overrides that the user gave."""
     return next((own[key] for key in keys if key in own), None)
-
-
-def _action_entry(action: Action) -> dict[str, float]:
-    return {"steering_angle": action.steering_deg, "speed": action.speed_mps}
 
 
 def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, str]]:

@@ -127,66 +127,60 @@ class AlgorithmConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConstantLR:
-    """The learning rate stays as it is after the warm-up."""
-
-    kind: Literal["constant"]
+class _WarmedUp:
     by: By
     warmup: NonNegative
     """Length of a linear rise from zero at the start."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinearLR:
+class ConstantLR(_WarmedUp):
+    """The learning rate stays as it is after the warm-up."""
+
+    kind: Literal["constant"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearLR(_WarmedUp):
     """A straight line down to `end_factor` over `length`."""
 
     kind: Literal["linear"]
-    by: By
-    warmup: NonNegative
     length: Positive
     end_factor: NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)
-class CosineLR:
+class CosineLR(_WarmedUp):
     """Half a cosine down to `end_factor` over `length`."""
 
     kind: Literal["cosine"]
-    by: By
-    warmup: NonNegative
     length: Positive
     end_factor: NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)
-class StepLR:
+class StepLR(_WarmedUp):
     """Multiplied by `factor` after every `length`."""
 
     kind: Literal["step"]
-    by: By
-    warmup: NonNegative
     length: Positive
     factor: Positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExponentialLR:
+class ExponentialLR(_WarmedUp):
     """Multiplied by `factor` over each `length`, continuously."""
 
     kind: Literal["exponential"]
-    by: By
-    warmup: NonNegative
     length: Positive
     factor: Positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptiveKLLR:
+class AdaptiveKLLR(_WarmedUp):
     """Raised while the policy moves less than `target_kl` an iteration, lowered while it moves more."""
 
     kind: Literal["adaptive_kl"]
-    by: By
-    warmup: NonNegative
     target_kl: Positive
     step_factor: Annotated[float, Field(gt=1, allow_inf_nan=False)]
     """Factor of one rise or fall."""

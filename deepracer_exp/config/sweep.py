@@ -214,8 +214,8 @@ class _TrainOverrides:
         key = parsed.key_or_group
         if key == "name":
             raise BadInput(f"{override}: the study's name is the experiment of its runs; write study=NAME")
-        searched = key in self.space
-        self._forget(key)
+        searched = self.space.pop(key, None) is not None
+        self.base = [line for line in self.base if parse_sweep(line).key_or_group != key]
         if parsed.is_sweep_override():
             _check_searched(key, override)
             self.space[key] = plain_expression(parsed, override.partition("=")[2])
@@ -226,10 +226,6 @@ class _TrainOverrides:
         elif not (parsed.is_delete() and searched):
             self.base.append(override)
         return key
-
-    def _forget(self, key: str) -> None:
-        self.space.pop(key, None)
-        self.base = [line for line in self.base if parse_sweep(line).key_or_group != key]
 
 
 def _is_of_the_sweep(override: str) -> bool:

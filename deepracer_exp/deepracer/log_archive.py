@@ -21,7 +21,7 @@ from .recording import LogProblem, readable
 _ACCEPTED = "trace CSVs or logs of the service"
 
 _KIND = re.compile(r"(?:^|[-_.])(training|evaluation|leaderboard)(?=[-_.]|$)", re.IGNORECASE)
-_FOLDERS = {"training": "training", "evaluation": "evaluation", "leaderboard": "leaderboard"}
+_FOLDERS = ("training", "evaluation", "leaderboard")
 _DRFC_EVALUATION = re.compile(r"evaluation-\d{14}")
 _WORKER = re.compile(r"(?:TrainingMetrics_|(?:worker|robomaker|simulation)[-_.]?)(\d{1,3})(?=\D|$)")
 _STAMP = re.compile(r"\d{14}|\d{4}-\d\d-\d\dT[\d:.]+Z")
@@ -54,6 +54,11 @@ class LogFile:
     def open(self) -> IO[bytes]:
         """Open it for reading."""
         return self.opener(*self.given)
+
+    def head(self, most_bytes: int) -> bytes:
+        """Return what it begins with."""
+        with self.open() as stream:
+            return stream.read(most_bytes)
 
     @property
     def name(self) -> str:

@@ -101,7 +101,7 @@ def read_model(path: str, checkpoint: str) -> StoredModel:
 
 
 def _read(files: _Files, checkpoint: str) -> StoredModel:
-    weights = [name for name in files.sizes if _is_weights(name)]
+    weights = [name for name in files.sizes if name.endswith((INDEX, ".pb"))]  # as in `commands.files`
     whole = [
         name for name in weights if name.endswith(INDEX) and f"{name[: -len(INDEX)]}{DATA}" in files.sizes
     ]
@@ -126,10 +126,6 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
     small = {name: files.read(at, SETTINGS_BYTES) for name, at in found.items() if at is not None}
     has_logs = any(map(_LOGS.search, files.sizes))
     return StoredModel(tensors, where, stem, not whole, small, has_logs, (note,) if note else ())
-
-
-def _is_weights(name: str) -> bool:
-    return name.endswith((INDEX, ".pb"))  # as in `commands.files`
 
 
 def _nearest(names: Mapping[str, int], wanted: str) -> str | None:

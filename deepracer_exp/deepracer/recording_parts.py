@@ -79,9 +79,8 @@ class Parts:
     @property
     def left_out(self) -> bool:
         """Whether steps were left out because there were too many."""
-        return any(trace.steps.left_out for trace in self.traces) or any(
-            log.steps.left_out for _, log in self.logs
-        )
+        found = (*(trace.steps for trace in self.traces), *(log.steps for _, log in self.logs))
+        return any(steps.left_out for steps in found)
 
     def add(self, other: "Parts") -> None:
         """Add the content of other files."""
@@ -157,14 +156,9 @@ class _StepLimit:
     def problems(self) -> list[LogProblem]:
         """Return what was left out of each file."""
         return [
-            LogProblem(
-                str(file.path),
-                None,
-                sim_trace.left_out_reason(steps.left_out),
-                lines=steps.left_out,
-            )
+            LogProblem(str(file.path), None, sim_trace.left_out_reason(count), lines=count)
             for _, file, steps in sorted(self._steps, key=lambda one: one[0])
-            if steps.left_out
+            if (count := steps.left_out)
         ]
 
     def _put(self, where: tuple[int, Place, int], file: LogFile, steps: StepTables) -> None:
@@ -207,12 +201,10 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
     if name.lower().endswith(".csv"):
         return _read_csv(parts, file)
     if _METADATA.fullmatch(name):
-        with file.open() as stream:
-            parts.metadata.append((file, read_model_metadata(file.path, stream.read(SETTINGS_BYTES + 1))))
+        parts.metadata.append((file, read_model_metadata(file.path, file.head(SETTINGS_BYTES + 1))))
         return True
     if _HYPERPARAMETERS.fullmatch(name):
-        with file.open() as stream:
-            _read_hyperparameters(parts, file, stream.read(SETTINGS_BYTES + 1))
+        _read_hyperparameters(parts, file, file.head(SETTINGS_BYTES + 1))
         return True
     if name.endswith(".json") and not _BESIDE.fullmatch(name):
         with file.open() as stream:
@@ -221,14 +213,11 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         parts.refuse(file, [(None, reason) for reason in metrics.refused])
         return True
     if name.startswith("reward_function") and name.endswith(".py"):
-        with file.open() as stream:
-            parts.reward.append((file, stream.read(SETTINGS_BYTES).decode("utf-8", "replace")))
+        parts.reward.append((file, file.head(SETTINGS_BYTES).decode("utf-8", "replace")))
         return True
     params = _PARAMS.fullmatch(name)
     if params is not None:
-        with file.open() as stream:
-            world = _world(file, stream.read(SETTINGS_BYTES + 1))
-        if world:
+        if world := _world(file, file.head(SETTINGS_BYTES + 1)):
             parts.worlds[params[1]] = world
         return True
     return _read_log(parts, file) if alone or LOG.search(name) else False

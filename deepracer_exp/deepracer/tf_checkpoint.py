@@ -213,8 +213,8 @@ def _block(rows: list[tuple[bytes, bytes]]) -> bytes:
 
 
 def _entry(name: str, value: memoryview) -> Entry:
-    dtype = shard = offset = size = crc = 0
-    shape: list[int] = []
+    numbers = dict.fromkeys((1, 3, 4, 5), 0)
+    crc, shape = 0, list[int]()
     for number, content in read_fields(value):
         if number == 2 and isinstance(content, memoryview):
             shape = [_dimension(part) for kind, part in read_fields(content) if kind == 2]
@@ -222,13 +222,11 @@ def _entry(name: str, value: memoryview) -> Entry:
                 raise ValueError(f"{name}: has a shape that is not known")
         elif number == 6 and isinstance(content, memoryview):
             (crc,) = struct.unpack("<I", content)
-        elif number in (1, 3, 4, 5) and isinstance(content, int):
-            dtype, shard, offset, size = (
-                content if number == place else old
-                for place, old in ((1, dtype), (3, shard), (4, offset), (5, size))
-            )
+        elif number in numbers and isinstance(content, int):
+            numbers[number] = content
         else:
             raise ValueError(f"{name}: is stored in a way that the service does not use")
+    dtype, shard, offset, size = numbers.values()
     if shard:
         raise ValueError(f"{name}: is in another data file")
     if dtype == _FLOAT and 4 * math.prod(shape) != size:
@@ -237,12 +235,8 @@ def _entry(name: str, value: memoryview) -> Entry:
 
 
 def _dimension(content: int | memoryview) -> int:
-    sizes = (
-        [size for number, size in read_fields(content) if number == 1]
-        if isinstance(content, memoryview)
-        else []
-    )
-    size = sizes[0] if sizes else 0
+    fields = read_fields(content) if isinstance(content, memoryview) else ()
+    size = next((size for number, size in fields if number == 1), 0)
     if not isinstance(size, int) or not 0 < size < 2**31:
         raise ValueError(f"a dimension of {size}")
     return size

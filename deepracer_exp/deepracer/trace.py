@@ -97,11 +97,7 @@ def to_table(packed: NDArray[np.float64], iteration: int, tracks: Sequence[str])
     if packed.ndim != 2 or packed.shape[1] != len(PACKED_COLUMNS):
         raise ValueError(f"packed rows of shape {packed.shape}; accepted: (n, {len(PACKED_COLUMNS)})")
     rows = len(packed)
-    extra = {
-        "pause_duration": 0.0,
-        "obstacle_crash_counter": 0,
-        "iteration": iteration,
-    }
+    extra = {"pause_duration": 0.0, "obstacle_crash_counter": 0, "iteration": iteration}
     columns = []
     for name, kind, _ in _COLUMNS:
         values = packed[:, PACKED[name]] if name in PACKED else np.full(rows, extra[name])

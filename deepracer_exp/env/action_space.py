@@ -135,13 +135,7 @@ def _levels(name: str, bounds: SteeringRange | SpeedRange, levels: int) -> NDArr
 
 def metadata_of(actions: ActionSpace) -> ModelMetadata:
     """Return an action space as model metadata, with the service's default camera, which our policies lack."""
-    discrete = isinstance(actions, DiscreteActions)
-    listed: tuple[Action, ...] = ()
     if isinstance(actions, DiscreteActions):
-        pairs = zip(actions.steering_deg.tolist(), actions.speed_mps.tolist(), strict=True)
-        listed = tuple(Action(steering_deg, speed_mps) for steering_deg, speed_mps in pairs)
-    return ModelMetadata(
-        actions=listed,
-        low=None if discrete else Action(*actions.low.tolist()),
-        high=None if discrete else Action(*actions.high.tolist()),
-    )
+        listed = map(Action, actions.steering_deg.tolist(), actions.speed_mps.tolist())
+        return ModelMetadata(actions=tuple(listed))
+    return ModelMetadata(low=Action(*actions.low.tolist()), high=Action(*actions.high.tolist()))

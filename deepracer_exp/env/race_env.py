@@ -14,6 +14,8 @@ from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
 
+_FLAGS = ("done", "terminated", "truncated")
+
 
 class RaceEnv(EnvBase):
     """A `Race` as a TorchRL environment of batch size [N].
@@ -54,10 +56,7 @@ class RaceEnv(EnvBase):
             trace=Unbounded((n_cars, len(PACKED)), dtype=torch.float64),
             shape=(n_cars,),
         )
-        flags = {
-            key: Categorical(2, shape=(n_cars, 1), dtype=torch.bool)
-            for key in ("done", "terminated", "truncated")
-        }
+        flags = {key: Categorical(2, shape=(n_cars, 1), dtype=torch.bool) for key in _FLAGS}
         self.full_done_spec = Composite(flags, shape=(n_cars,))
         self._no = torch.zeros(n_cars, 1, dtype=torch.bool)
 
@@ -71,17 +70,7 @@ class RaceEnv(EnvBase):
         done = following.get("done")
         if done.any():
             self.race.reset(np.flatnonzero(done.numpy()))
-        root = TensorDict._new_unsafe(
-            {
-                **self._seen(),
-                "done": self._no.clone(),
-                "terminated": self._no.clone(),
-                "truncated": self._no.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
-        return tensordict, root
+        return tensordict, self._begun()
 
     def resume_from(self, state: Mapping[str, Any]) -> None:
         """Restore a `Race.state_dict`; the next reset of all cars keeps that state.
@@ -100,10 +89,13 @@ class RaceEnv(EnvBase):
             self._resumed = False
         else:
             self.race.reset(ids)
-        return TensorDict(
-            {**self._seen(), **self._flags(self._no)},
-            batch_size=self.batch_size,
-            device=self.device,
+        return self._begun()
+
+    def _begun(self) -> TensorDict:
+        """Return what is seen where no episode has ended."""
+        flags = {key: self._no.clone() for key in _FLAGS}
+        return TensorDict._new_unsafe(
+            {**self._seen(), **flags}, batch_size=self.batch_size, device=self.device
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -128,9 +120,6 @@ class RaceEnv(EnvBase):
 
     def _seen(self) -> dict[str, torch.Tensor]:
         return {key: torch.from_numpy(values) for key, values in self.race.seen.items()}
-
-    def _flags(self, value: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {key: value.clone() for key in ("done", "terminated", "truncated")}
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

@@ -124,7 +124,7 @@ class Track:
         rows = checked_rows(rows)
         closed = bool((rows[0] == rows[-1]).all())
         road = _road_area(rows[:, :2], rows[:, 2:4], rows[:, 4:], closed)
-        counter_clockwise = not closed or _is_counter_clockwise(rows[:, :2])
+        counter_clockwise = not closed or bool(shapely.is_ccw(shapely.LinearRing(rows[:, :2])))
         if reversed:
             rows = rows[::-1]
         waypoints, inner, outer = (_frozen(rows[:, k : k + 2]) for k in (0, 2, 4))
@@ -325,10 +325,6 @@ def _frozen(array: np.ndarray) -> np.ndarray:
     array = np.array(array, order="C")
     array.flags.writeable = False
     return array
-
-
-def _is_counter_clockwise(ring: np.ndarray) -> bool:
-    return bool(shapely.is_ccw(shapely.LinearRing(ring)))
 
 
 def _road_area(center: np.ndarray, inner: np.ndarray, outer: np.ndarray, closed: bool) -> BaseGeometry:
