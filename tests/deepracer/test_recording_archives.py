@@ -180,17 +180,17 @@ def test_logs_that_were_packed_one_by_one_are_read(pack, alone, tmp_path):
     assert recording.steps["episode"].tolist() == sorted([0, 1] * 6 if alone else [0, 1, 2, 3] * 6)
 
 
-def test_a_model_for_the_car_is_no_log_and_a_incomplete_archive_is_reported(tmp_path):
+def test_a_model_for_the_car_is_no_log_and_an_incomplete_archive_is_reported(tmp_path):
     made.write_folder(made.drfc_single(), tmp_path)
     made.write_archive({"agent/model.pb": "weights"}, tmp_path / "carfile.tar.gz")
     assert not read_recording(tmp_path).problems
-    torn = tmp_path / "week-one.tar.gz"
+    incomplete = tmp_path / "week-one.tar.gz"
     model = tmp_path / "my-model.tar.gz"
     made.write_archive({"a.pb": "weights" * 9999, "z/0-iteration.csv": "x" * 9999}, model)
     model.write_bytes(model.read_bytes()[:90])
-    made.write_archive(made.console(), torn)
-    torn.write_bytes(torn.read_bytes()[:20])
+    made.write_archive(made.console(), incomplete)
+    incomplete.write_bytes(incomplete.read_bytes()[:20])
     recording = read_recording(tmp_path)
     assert len(made.training(recording)) == made.ROWS["drfc_single"]
-    for path in (torn, model):
+    for path in (incomplete, model):
         assert str(path) in "\n".join(map(str, recording.problems))

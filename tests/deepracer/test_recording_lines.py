@@ -127,7 +127,7 @@ def test_incomplete_lines_are_listed_with_their_numbers_and_the_others_are_read(
     lines[7] = lines[7].replace("False", "Fal", 1)
     lines[9] = lines[9][:40]
     lines[-1] = lines[-1].rsplit(",", 1)[0]
-    log = tmp_path / "torn.log"
+    log = tmp_path / "incomplete.log"
     log.write_text("some noise\n" + "\n".join(lines))
     recording = read_recording(log)
     assert len(recording.steps) == len(ROWS) - 4

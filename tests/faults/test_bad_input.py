@@ -68,14 +68,14 @@ def _route(folder: Path, name: str, kind: str) -> str:
             path.write_text("once round the block\n")
         case "empty":
             path.write_bytes(b"")
-        case "torn":
+        case "incomplete":
             np.save(path, np.zeros((10, 6)))
             path.write_bytes(path.read_bytes()[:200])
     return str(path)
 
 
 @pytest.mark.parametrize(
-    "kind", ["missing", "shape", "nan", "text array", "pickled", "plain pickle", "text", "empty", "torn"]
+    "kind", ["missing", "shape", "nan", "text array", "pickled", "plain pickle", "text", "empty", "incomplete"]
 )
 def test_a_route_that_is_none_is_refused_with_its_name(train_here, tmp_path, kind):
     path = _route(tmp_path, "route.npy", kind)

@@ -96,7 +96,7 @@ def put_folder_beside(path: Path) -> None:
     shutil.copytree(own(path, "state.tdz").parent, path / "components" / "0002-more")
 
 
-TEARS: dict[str, Callable[[Path], None]] = {
+DAMAGES: dict[str, Callable[[Path], None]] = {
     "truncated archive": lambda path: os.truncate(own(path, "state.tdz"), 500),
     "empty archive": lambda path: os.truncate(own(path, "state.tdz"), 0),
     "archive flipped": lambda path: flip(own(path, "state.tdz")),
@@ -135,31 +135,31 @@ def refusal(folder: Path, name: str, **how: bool) -> str:
     return str(refused.value)
 
 
-@pytest.mark.parametrize("tear", TEARS)
-def test_the_newest_intact_checkpoint_replaces_a_corrupt_one(folder, tear, caplog):
-    for name, torn, newest in (("best", "000020", "000040"), ("last", "000040", "000030")):
-        TEARS[tear](folder / torn)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_the_newest_intact_checkpoint_replaces_a_corrupt_one(folder, damage, caplog):
+    for name, corrupt, newest in (("best", "000020", "000040"), ("last", "000040", "000030")):
+        DAMAGES[damage](folder / corrupt)
         caplog.clear()
         assert intact_checkpoint(folder, name) == (folder / newest).resolve()
         (message,) = [record.message for record in caplog.records if record.name == "deepracer_exp"]
         assert f"checkpoint={name}" in message
-        assert torn in message or f"/{name}:" in message
+        assert corrupt in message or f"/{name}:" in message
         assert f"{newest}, the newest intact one" in message
         assert "\n" not in message
 
 
-@pytest.mark.parametrize("tear", TEARS)
-def test_a_folder_without_an_intact_checkpoint_is_refused(folder, tear):
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_folder_without_an_intact_checkpoint_is_refused(folder, damage):
     for name in ("000010", "000020", "000030", "000040"):
         # 30 holds only a policy, so nothing of a training can be corrupt there.
-        (TEARS[tear] if "training" not in tear else TEARS["archive flipped"])(folder / name)
+        (DAMAGES[damage] if "training" not in damage else DAMAGES["archive flipped"])(folder / name)
     for name in ("best", "last"):
         assert "is intact" in refusal(folder, name)
 
 
-@pytest.mark.parametrize("tear", TEARS)
-def test_a_checkpoint_given_by_number_is_never_replaced(folder, tear):
-    TEARS[tear](folder / "000020")
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_checkpoint_given_by_number_is_never_replaced(folder, damage):
+    DAMAGES[damage](folder / "000020")
     refusal(folder, "20")
     assert intact_checkpoint(folder, "10").name == "000010"
 

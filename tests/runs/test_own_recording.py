@@ -94,15 +94,15 @@ def test_the_action_space_is_that_of_the_environment(trained, space):
     assert recording.steps["action"].isna().all() == (space == "continuous")
 
 
-def test_a_incomplete_file_of_the_trace_is_left_out_and_reported(folder):
-    torn = folder / "trace" / "00002-iteration.parquet"
-    torn.write_bytes(torn.read_bytes()[:-100])
+def test_an_incomplete_file_of_the_trace_is_left_out_and_reported(folder):
+    incomplete = folder / "trace" / "00002-iteration.parquet"
+    incomplete.write_bytes(incomplete.read_bytes()[:-100])
     recording = read_own_recording(folder)
     assert set(recording.steps["iteration"]) == {1, 3, 4}
     (problem,) = recording.problems
-    assert problem.file == str(torn)
+    assert problem.file == str(incomplete)
     assert problem.reason.startswith("left out: ")
-    assert torn not in recording.files
+    assert incomplete not in recording.files
 
 
 def test_a_file_of_another_kind_among_the_trace_is_left_out_and_reported(folder):

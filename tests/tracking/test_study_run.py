@@ -176,13 +176,13 @@ def test_a_store_that_comes_late_gets_the_newest_progress_only(store, monkeypatc
 
 
 def test_a_store_that_never_answers_blocks_nothing(free_port, caplog):
-    nobody = Store(f"http://127.0.0.1:{free_port}", None)
-    run = StudyRun(nobody, "spring", ["race_score"], SPACE, BASE)
+    unreachable = Store(f"http://127.0.0.1:{free_port}", None)
+    run = StudyRun(unreachable, "spring", ["race_score"], SPACE, BASE)
     run.update(progress())
     assert not run.finish("FINISHED", 1.0)
     assert run.run_id is None
     assert "could not be marked FINISHED" in caplog.text
-    assert open_trial_run(nobody, "spring", 7, "0" * 32, []) is None
+    assert open_trial_run(unreachable, "spring", 7, "0" * 32, []) is None
     assert "trial 7 has no run there" in caplog.text
 
 

@@ -95,8 +95,8 @@ def test_other_runs_are_looked_at_again_while_this_one_continues(run, monkeypatc
 def test_what_is_no_run_and_what_is_incomplete_count_nothing(run):
     (run.parent / "notes.txt").write_text("of mine")
     (run.parent / "empty").mkdir()
-    (run.parent / "torn").mkdir()
-    (run.parent / "torn" / "summary.json").write_text('{"env_steps": 99')
+    (run.parent / "incomplete").mkdir()
+    (run.parent / "incomplete" / "summary.json").write_text('{"env_steps": 99')
     (run / "metrics.jsonl").write_text('{"env_steps": 900, "wall_clock_s": 9.0}\n')  # this run's own
     assert Budget(limits(experiment_env_steps=1000), run).used(100, 0, 0.0)[1] == 0.1
 

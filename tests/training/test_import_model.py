@@ -35,7 +35,7 @@ METADATA = {
     "neural_network": "DEEP_CONVOLUTIONAL_NETWORK_DEEP",  # the smallest file
     "version": "4",
 }
-# Whoever runs it leaves a file.
+# Running it leaves a file.
 REWARD = "open('it_was_run', 'w')\n\n\ndef reward_function(params):\n    return 1.0\n"
 SMALL = {
     "reward_function.py": REWARD.encode(),

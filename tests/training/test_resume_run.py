@@ -99,7 +99,7 @@ def test_what_was_written_after_the_checkpoint_is_written_again(trained, cut, ca
     assert_same_run(run, whole(trained))
 
 
-def test_a_incomplete_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trained, cut, call):
+def test_an_incomplete_last_checkpoint_is_replaced_by_the_newest_intact_one_loudly(trained, cut, call):
     run = cut()
     archives = (run / "checkpoints" / "000003").rglob("state.tdz")
     (archive,) = (path for path in archives if "training" in path.parent.name)
