@@ -1,6 +1,8 @@
 """Override expressions to a validated experiment; Hydra composes here and nowhere else."""
 
+import copy
 import difflib
+import functools
 import itertools
 import json
 import math
@@ -181,6 +183,15 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     )
 
 
+@functools.lru_cache(maxsize=512)
+def _parsed(text: str) -> DictConfig:
+    """Parse an option; most are composed again and again, and parsing was a third of the work."""
+    config = OmegaConf.load(StringIO(text))
+    if not isinstance(config, DictConfig):
+        raise ValueError("has no keys")
+    return config
+
+
 class OptionFiles(FileConfigSource):
     """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
 
@@ -200,10 +211,7 @@ class OptionFiles(FileConfigSource):
             )
 
         def load(text: str) -> ConfigResult:
-            config = OmegaConf.load(StringIO(text))
-            if not isinstance(config, DictConfig):
-                raise ValueError("has no keys")
-            header = self._get_header_dict(text[:512])
+            config, header = copy.deepcopy(_parsed(text)), self._get_header_dict(text[:512])
             return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
 
         return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
