@@ -241,6 +241,18 @@ def test_a_straight_line_off_the_middle_bends_by_the_formulas_amount(race_of, k1
     assert columns == pytest.approx(expected, abs=0.15)
 
 
+def test_each_of_two_cameras_shows_its_own_picture_through_the_lens(race_of):
+    bent = (f"randomization.pictures={NOTHING}", "+randomization.pictures.lens_k1=[0.2,0.2]")
+    pair, straight = race_of("observation=stereo", *bent), race_of("observation=stereo")
+    start, road = pair._batch.read(), np.zeros(1, np.intp)
+    for eye, seen, plain in zip(pair._pictures._lenses, pair.pixels[0], straight.pixels[0], strict=True):
+        alone = race_of("observation=camera", *bent)
+        alone._pictures._lenses = [eye]
+        assert np.array_equal(alone._pictures.first(np.arange(1), start, road)[0, 0], seen)
+        assert not np.array_equal(seen, plain)
+    assert not np.array_equal(*pair.pixels[0])
+
+
 def test_a_lens_changes_no_other_draw(race_of):
     plain, bent = (
         race_of(*VARIED, f"randomization.pictures.lens_k1=[{k1},{k1}]", n_cars=4) for k1 in (0, 0.1)
