@@ -33,10 +33,18 @@ class Tab:
 
     def __init__(self, commands: int, answers: int) -> None:
         self._commands, self._answers = os.fdopen(commands, "wb", 0), os.fdopen(answers, "rb")
-        self._number, self._session, self._rest = 0, None, b""
+        self._number, self._rest = 0, b""
+        self._target: str | None = None
+        self.renew()
+
+    def renew(self) -> None:
+        """Be a new page, which knows nothing of the one before."""
+        before, self._session = self._target, None
+        self._target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        if before is not None:
+            self.call("Target.closeTarget", targetId=before)
+        self._session = self.call("Target.attachToTarget", targetId=self._target, flatten=True)["sessionId"]
         self.events: list[dict[str, Any]] = []
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
 
@@ -127,7 +135,7 @@ class Tab:
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer
                 return answer["result"]
-            if "method" in answer:
+            if "method" in answer and answer.get("sessionId") == self._session is not None:
                 self.events.append(answer)
 
     def _next(self) -> dict[str, Any]:
@@ -164,3 +172,18 @@ def browser(folder: Path) -> Iterator[Tab]:
         except subprocess.TimeoutExpired:
             started.kill()
             started.wait()
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    """The one browser of all tests: starting one takes seconds."""
+    with browser(tmp_path_factory.mktemp("chromium")) as tab:
+        yield tab
+
+
+@pytest.fixture
+def tab(chromium: Tab) -> Tab:
+    """A page of its own, for a reader who prefers light."""
+    chromium.renew()
+    chromium.prefer("light")
+    return chromium

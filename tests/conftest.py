@@ -22,9 +22,10 @@ from hypothesis import settings
 
 from deepracer_exp.cli import main
 
+from .browser import chromium, tab
 from .postgres import postgres, postgres_server
 
-__all__ = ["postgres", "postgres_server"]
+__all__ = ["chromium", "postgres", "postgres_server", "tab"]
 
 # A deadline is a timed test: it fails on a busy machine.
 settings.register_profile("no_deadline", deadline=None)

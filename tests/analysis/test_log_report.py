@@ -15,7 +15,7 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_comparison import compare_rewards
 from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
-from tests.browser import browser, needs_chromium
+from tests.browser import needs_chromium
 from tests.page_html import Html
 
 from .made_up import Drive, made_up_recording
@@ -119,40 +119,39 @@ def test_nothing_that_a_log_holds_becomes_part_of_the_page(recording):
 
 
 @needs_chromium
-def test_a_browser_draws_every_figure_without_a_complaint_and_asks_for_nothing(path, recording, tmp_path):
+def test_a_browser_draws_every_figure_without_a_complaint_and_asks_for_nothing(
+    path, recording, tmp_path, tab
+):
     dirty = write_report(nasty(recording, NASTY), tmp_path / "dirty.html")
-    with browser(tmp_path / "profile") as tab:
-        for file in (path, dirty):
-            tab.open(file)
-            tab.draw_all()
-            assert tab.evaluate("document.querySelectorAll('[data-state=failed]').length") == 0
-            assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") > 10
-            assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        assert tab.complaints == []
-        assert tab.asked_for <= {"file", "data", "blob"}
-        assert not [event for event in tab.events if event["method"] == "Page.javascriptDialogOpening"]
-        assert not tab.evaluate(
-            "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
-        )
+    for file in (path, dirty):
+        tab.open(file)
+        tab.draw_all()
+        assert tab.evaluate("document.querySelectorAll('[data-state=failed]').length") == 0
+        assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") > 10
+        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert tab.complaints == []
+    assert tab.asked_for <= {"file", "data", "blob"}
+    assert not [event for event in tab.events if event["method"] == "Page.javascriptDialogOpening"]
+    assert not tab.evaluate(
+        "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
+    )
 
 
 @needs_chromium
-def test_the_policy_of_the_page_refuses_scripts_and_addresses(path, tmp_path):
-    with browser(tmp_path / "profile") as tab:
-        tab.open(path)
-        added = "const s = document.createElement('script'); s.textContent = 'window.got = 1'; document.body.append(s)"
-        tab.evaluate(added)
-        assert tab.evaluate("window.got === undefined")
-        assert tab.evaluate("fetch('data:,x').then(() => 'sent', () => 'refused')") == "refused"
+def test_the_policy_of_the_page_refuses_scripts_and_addresses(path, tab):
+    tab.open(path)
+    added = "const s = document.createElement('script'); s.textContent = 'window.got = 1'; document.body.append(s)"
+    tab.evaluate(added)
+    assert tab.evaluate("window.got === undefined")
+    assert tab.evaluate("fetch('data:,x').then(() => 'sent', () => 'refused')") == "refused"
 
 
 @needs_chromium
-def test_figures_are_drawn_when_they_come_into_sight(path, tmp_path):
-    with browser(tmp_path / "profile") as tab:
-        tab.open(path, height=500)
-        assert tab.evaluate("document.querySelector('[data-plot=waypoint_map]').dataset.state === undefined")
-        tab.evaluate("document.querySelector('[data-plot=waypoint_map]').scrollIntoView()")
-        tab.wait_for("document.querySelector('[data-plot=waypoint_map]').dataset.state === 'drawn'")
+def test_figures_are_drawn_when_they_come_into_sight(path, tab):
+    tab.open(path, height=500)
+    assert tab.evaluate("document.querySelector('[data-plot=waypoint_map]').dataset.state === undefined")
+    tab.evaluate("document.querySelector('[data-plot=waypoint_map]').scrollIntoView()")
+    tab.wait_for("document.querySelector('[data-plot=waypoint_map]').dataset.state === 'drawn'")
 
 
 @pytest.mark.parametrize(

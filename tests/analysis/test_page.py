@@ -7,7 +7,7 @@ import pytest
 
 from deepracer_exp.analysis.log_report import write_report as write_log_report
 from sweeps.report import write_study_page as write_sweep_report
-from tests.browser import Tab, browser, needs_chromium
+from tests.browser import needs_chromium
 from tests.page_html import Html
 from tests.sweeps.studies import season as study
 
@@ -27,18 +27,6 @@ def page(request, folder) -> Path:
     if request.param == "training":
         return write_log_report(recording(), path)
     return write_sweep_report(study(folder / "runs", 60), path)
-
-
-@pytest.fixture(scope="module")
-def chromium(folder):
-    with browser(folder / "profile") as tab:
-        yield tab
-
-
-@pytest.fixture
-def tab(chromium) -> Tab:
-    chromium.prefer("light")
-    return chromium
 
 
 def test_the_contents_lead_to_every_section_and_every_figure(page):

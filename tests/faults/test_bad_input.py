@@ -75,7 +75,8 @@ def _route(folder: Path, name: str, kind: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "kind", ["missing", "shape", "nan", "text array", "pickled", "plain pickle", "text", "empty", "incomplete"]
+    "kind",
+    ["missing", "shape", "nan", "text array", "pickled", "plain pickle", "text", "empty", "incomplete"],
 )
 def test_a_route_that_is_none_is_refused_with_its_name(train_here, tmp_path, kind):
     path = _route(tmp_path, "route.npy", kind)

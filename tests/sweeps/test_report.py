@@ -5,7 +5,7 @@ from optuna.distributions import FloatDistribution
 
 from deepracer_exp.errors import BadInput
 from sweeps.report import study_page, study_summary, write_study_page
-from tests.browser import browser, needs_chromium
+from tests.browser import needs_chromium
 from tests.page_html import Html
 
 from .studies import add, new_study, season, write_metrics
@@ -42,18 +42,17 @@ def test_the_next_steps_name_the_classes_of_the_winner_again(tmp_path):
 
 
 @needs_chromium
-def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, tmp_path):
+def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, tmp_path, tab):
     path = write_study_page(study, tmp_path / "report.html")
-    with browser(tmp_path / "profile") as tab:
-        tab.open(path)
-        tab.draw_all()
-        assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") == 5
-        assert not tab.evaluate("document.body.innerText.includes('WebGL')")
-        assert not tab.evaluate(
-            "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
-        )
-        assert tab.complaints == []
-        assert tab.asked_for <= {"file", "data", "blob"}
+    tab.open(path)
+    tab.draw_all()
+    assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") == 5
+    assert not tab.evaluate("document.body.innerText.includes('WebGL')")
+    assert not tab.evaluate(
+        "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"
+    )
+    assert tab.complaints == []
+    assert tab.asked_for <= {"file", "data", "blob"}
 
 
 @pytest.mark.slow
