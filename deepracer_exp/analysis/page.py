@@ -109,7 +109,8 @@ def render(package: str, template: str, plots: Sequence[Plot], is_live: bool = F
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["themed"] = _themed
+    # The colour of a figure for CSS.
+    environment.filters["themed"] = lambda color: f"light-dark({color}, {DARK.get(color.lower(), color)})"
     script = (files(__package__) / "page.js").read_text(encoding="utf-8")
     return environment.get_template(template).render(
         policy=_policy(script, get_plotlyjs()) + ("; connect-src 'self'" if is_live else ""),
@@ -120,11 +121,6 @@ def render(package: str, template: str, plots: Sequence[Plot], is_live: bool = F
         script=Markup(script),  # our own file
         **values,
     )
-
-
-def _themed(color: str) -> str:
-    """Return a colour of a figure for CSS."""
-    return f"light-dark({color}, {DARK.get(color.lower(), color)})"
 
 
 def _policy(*scripts: str) -> str:

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
     from deepracer_exp.training.trainer import TrainResult
 
-_FILES = {
-    REPORT: "findings and figures",
-    BEST_LAP: "the fastest lap",
-    LEARNING: "the learning curves",
-}
+_FILES = {REPORT: "findings and figures", BEST_LAP: "the fastest lap", LEARNING: "the learning curves"}
 
 
 def table_console(piped_width: int = 200) -> "Console":
@@ -57,6 +53,7 @@ def print_start() -> None:
 
 def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
     """Print how a run ended, where its results are, and what to do next."""
+    from deepracer_exp.analysis.next_steps import COMMAND, next_steps
     from deepracer_exp.runs.result import result_of
 
     summary = outcome.summary
@@ -81,7 +78,13 @@ def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
     if tracked_in is not None:
         where = "" if tracked_in == "runs" else f" {shlex.quote(f'runs_dir={tracked_in}')}"
         print(f"  compare runs  {_command()} ui{where}")
-    _print_next_steps(outcome)
+    steps = next_steps(outcome.folder, summary)
+    shown = [(line.replace(COMMAND, _command(), 1), what) for line, what in steps]
+    width = max((len(line) for line, _ in shown), default=0)
+    if shown:
+        print("\n  next")
+    for line, what in shown:
+        print(f"    {line:{width}}  # {what}")
 
 
 def print_results(outcomes: "Sequence[TrainResult]") -> None:
@@ -89,20 +92,6 @@ def print_results(outcomes: "Sequence[TrainResult]") -> None:
     print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
         print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
-
-
-def _print_next_steps(outcome: "TrainResult") -> None:
-    from deepracer_exp.analysis.next_steps import COMMAND, next_steps
-
-    steps = [
-        (line.replace(COMMAND, _command(), 1), what)
-        for line, what in next_steps(outcome.folder, outcome.summary)
-    ]
-    if steps:
-        print("\n  next")
-    width = max((len(line) for line, _ in steps), default=0)
-    for line, what in steps:
-        print(f"    {line:{width}}  # {what}")
 
 
 def _command() -> str:

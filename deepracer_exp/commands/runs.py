@@ -448,17 +448,15 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
     table = Table("size", "what", "run", box=None, pad_edge=False)
     table.columns[0].justify = "right"
     for item in items:
-        what = f"{item.what}: {_names(item)}" if item.what == SPARE_CHECKPOINTS else item.what
+        what, names = item.what, [path.name for path in item.paths]
+        if what == SPARE_CHECKPOINTS:
+            shown = ", ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]} ({len(names)})"
+            what += f": {shown}"
         table.add_row(decimal(item.size), what, str(item.run.relative_to(runs_dir)))
     table.add_row()
     table.add_row(decimal(total(items)), "in all", "")
     console.print(table)
     console.print()
-
-
-def _names(item: "Removable") -> str:
-    names = [path.name for path in item.paths]
-    return ", ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]} ({len(names)})"
 
 
 def _ui(args: argparse.Namespace) -> int:

@@ -56,13 +56,14 @@ def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDAr
     """
     height, width = camera.height, camera.width
     masks = torch.from_numpy(_masks(height, width))  # (places, height, width)
-    places, cameras = len(masks), 2 if camera.stereo_m else 1
+    places, cameras, colors = len(masks), 2 if camera.stereo_m else 1, 3 if camera.color == "rgb" else 1
+    eye_of = torch.arange(camera.shape[0]) // colors % cameras  # of each channel
     pixels = acted["pixels"].float()
     blurred = torch.from_numpy(gaussian_filter(pixels.numpy(), (0, _BLUR * width, _BLUR * width)))
     scores = torch.empty(cameras, places)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for eye in range(cameras):
-            own = _channels_of(eye, camera)[:, None, None]  # (channels, 1, 1)
+            own = (eye_of == eye).float()[:, None, None]  # (channels, 1, 1)
             mixed = pixels + (blurred - pixels) * masks[:, None] * own
             seen = acted.expand(places + 1).clone()
             seen["pixels"] = torch.cat([pixels[None], mixed]).round().byte()
@@ -78,13 +79,6 @@ def _decision(out: TensorDict, acted: TensorDict) -> Tensor:
     if "loc" in out:
         return out["loc"]
     return out["logits"].log_softmax(-1)[..., acted["action"].item(), None]
-
-
-def _channels_of(eye: int, camera: CameraConfig) -> Tensor:
-    """Return 1 for the channels of a camera, 0 for those of the other, [channels]."""
-    colors = 3 if camera.color == "rgb" else 1
-    cameras = 2 if camera.stereo_m else 1
-    return (torch.arange(camera.shape[0]) // colors % cameras == eye).float()
 
 
 @cache

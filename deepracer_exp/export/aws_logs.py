@@ -56,7 +56,9 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
         BadInput: no episode is finished, or the folder is not empty or cannot be written.
     """
     numbered = _number(recording.steps)
-    job = _job(recording.name)
+    # The service names its jobs so: the time in 14 digits, a hyphen, the rest.
+    dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", recording.name)
+    job = f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{recording.name}"
     learning = replace(hyperparameters_of(experiment), num_episodes_between_training=numbered.per_iteration)
     metadata = model_metadata_text(metadata_of(build_action_space(experiment.action_space)))
     hyperparameters = hyperparameters_text(learning)
@@ -136,12 +138,6 @@ def _number(steps: pd.DataFrame) -> _Numbered:
         first_iteration=first,
         left_out=len(rows) - len(finished),
     )
-
-
-def _job(name: str) -> str:
-    """Return a run's name as the service names its jobs: the time in 14 digits, a hyphen, the rest."""
-    dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", name)
-    return f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{name}"
 
 
 def _head(world: str, metadata: str, hyperparameters: str) -> str:
