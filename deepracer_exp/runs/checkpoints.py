@@ -146,7 +146,12 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
         build_action_space(experiment.action_space).n,
         torch.Generator(),
     )
-    counters = _load(path, AGENT, _NetworksOf(networks), "does not fit the run's config.yaml")
+    stored, problem = State({}), "does not fit the run's config.yaml"
+    counters = _load(path, AGENT, stored, problem)
+    try:
+        networks.load_state_dict(stored.values["networks"])
+    except (KeyError, RuntimeError) as error:
+        raise BadInput(f"{path}: {problem}: {_one_line(error)}") from error
     for key, value in networks.state_dict().items():
         if not torch.isfinite(value).all():
             raise BadInput(f"{path}: {key} is not finite; choose another checkpoint")
@@ -189,19 +194,6 @@ class State:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Replace the values."""
         self.values = state
-
-
-class _NetworksOf:
-    """Loads the networks of an agent's state and skips the optimizer."""
-
-    def __init__(self, networks: ActorCritic):
-        self._networks = networks
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"networks": self._networks.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._networks.load_state_dict(state["networks"])
 
 
 def _load(path: Path, component: str, target: Any, problem: str) -> dict[str, Any]:

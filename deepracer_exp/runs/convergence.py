@@ -5,7 +5,7 @@ iterations, for reports: of a run of ours with the values of its own rule, of ot
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +31,12 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 """One line of metrics.jsonl."""
+_Found = tuple[str, dict[str, float]]
+"""Why a rule applies, in words, and what it compared."""
 
 EVALUATED = ("eval_completion", "held_out_completion")
 """Columns that only the rows of evaluated iterations have."""
+_ALWAYS = ("completion", "mean_return", "laps_per_1000_steps", "entropy")
 _STEPS = 1000  # laps are counted per so many control steps: iterations differ in length
 
 
@@ -146,172 +149,6 @@ class ReliableRule(StoppingRule):
         return _decision("reliable", why, {"lap_share": share}, self._config)
 
 
-class TrendRule(StoppingRule):
-    """The rules `plateau` and `entropy`, which look at moving averages."""
-
-    def __init__(self, config: PlateauStopping | EntropyStopping, action_count: int | None):
-        """Set up the rule.
-
-        Args:
-            config: the stopping group.
-            action_count: number of discrete actions, None for a continuous action space.
-        """
-        self._config = config
-        self._action_count = action_count
-        self._entropy_at_start: float | None = None
-        self._before = (0, 0)
-        window = config.window
-        names = ("entropy", "completion", "mean_return", "laps_per_1000_steps", *EVALUATED)
-        self._seen = {name: _Average(window) for name in names}
-        self._race_scores_s: list[float] = []  # infinite where none is known
-        self._rows = 0
-
-    def observe(self, row: Row) -> Decision | None:
-        """Add the row to the averages and apply the rule."""
-        config = self._config
-        self._rows += 1
-        for name, value in self._watched(row).items():
-            self._seen[name].add(value)
-        score_s = row.get("eval_race_score_s")
-        self._race_scores_s.append(math.inf if score_s is None else score_s)
-        return self._plateau(config) if isinstance(config, PlateauStopping) else self._entropy(config)
-
-    def _watched(self, row: Row) -> dict[str, float | None]:
-        entropy = row.get("entropy")
-        if self._entropy_at_start is None:
-            self._entropy_at_start = entropy
-        (laps, steps), self._before = self._before, (row["laps"], row["env_steps"])
-        share = None
-        if entropy is not None and self._entropy_at_start is not None:
-            share = entropy_share(entropy, self._entropy_at_start, self._action_count)
-        return {
-            "entropy": share,
-            "laps_per_1000_steps": _STEPS * (row["laps"] - laps) / max(row["env_steps"] - steps, 1),
-            **{name: row.get(name) for name in ("completion", "mean_return", *EVALUATED)},
-        }
-
-    def _plateau(self, config: PlateauStopping) -> Decision | None:
-        series = self._seen[config.metric]
-        if self._rows <= max(config.warmup, config.patience) or not series.known(config.patience):
-            return None
-        before, since = series.bests(config.patience)
-        if since > before + config.gain * series.range:
-            return None
-        return _decision(
-            "plateau",
-            f"{config.metric} has not grown for {count(config.patience, 'iteration')}",
-            {f"{config.metric}_before": before, f"{config.metric}_since": since},
-            config,
-        )
-
-    def _entropy(self, config: EntropyStopping) -> Decision | None:
-        rules: tuple[tuple[Any, Any], ...] = (
-            (config.collapsed, self._collapsed),
-            (config.not_learning, self._not_learning),
-            (config.overfitting, self._overfitting),
-            (config.converged, self._converged),
-        )
-        for rule, verdict in rules:
-            # Patience begins with the first average, so that there is something before it to compare with.
-            if rule is not None and self._rows > max(rule.warmup, rule.patience):
-                decision = verdict(rule)
-                if decision is not None:
-                    return decision
-        return None
-
-    def _collapsed(self, rule: CollapsedRule) -> Decision | None:
-        entropy, completion = self._seen["entropy"], self._seen["completion"]
-        if not (entropy.known(rule.patience) and completion.known(rule.patience)):
-            return None
-        highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
-        if highest >= rule.entropy_floor or best >= rule.completion_poor:
-            return None
-        return _decision(
-            "collapsed",
-            f"entropy at {highest:.1%} with {best:.0f} % completion",
-            {"entropy": highest, "completion": best},
-            rule,
-        )
-
-    def _not_learning(self, rule: NotLearningRule) -> Decision | None:
-        entropy, completion = self._seen["entropy"], self._seen["completion"]
-        if not (entropy.known(rule.patience) and completion.known(rule.patience)):
-            return None
-        lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
-        start = completion.first
-        moved = best - start > rule.completion_gain
-        if lowest <= rule.entropy_near or moved or best >= rule.completion_poor:
-            return None
-        return _decision(
-            "not_learning",
-            f"entropy still at {lowest:.1%}, completion {start:.1f} % at the start and {best:.1f} % since",
-            {"entropy": lowest, "completion_start": start, "completion": best},
-            rule,
-        )
-
-    def _overfitting(self, rule: OverfittingRule) -> Decision | None:
-        held_out, returns = self._seen["held_out_completion"], self._seen["mean_return"]
-        if not (held_out.known(rule.patience) and returns.known(rule.patience)):
-            return None
-        before, since = held_out.bests(rule.patience)
-        lowest_return = returns.best - rule.return_drop * returns.range
-        if since > before - rule.held_out_drop or returns.now < lowest_return:
-            return None
-        return _decision(
-            "overfitting",
-            f"held-out completion fell from {before:.0f} % to {since:.0f} % while the return holds",
-            {
-                "held_out_completion_before": before,
-                "held_out_completion_since": since,
-                "return": returns.now,
-                "return_best": returns.best,
-            },
-            rule,
-        )
-
-    def _converged(self, rule: ConvergedRule) -> Decision | None:
-        names = ("completion", "mean_return", "laps_per_1000_steps", "entropy")
-        if not all(self._seen[name].known(rule.patience) for name in names):
-            return None
-        completion, returns, laps, entropy = (self._seen[name] for name in names)
-        flat = entropy.last(rule.patience)
-        values = {
-            "completion": completion.now,
-            "completion_best": completion.best,
-            "entropy": entropy.now,
-            "entropy_change": max(flat) - min(flat),
-        }
-        growth = {
-            "completion": rule.completion_gain,
-            "mean_return": rule.return_gain * returns.range,
-            "laps_per_1000_steps": rule.laps_gain * laps.best,
-        }
-        grew = False
-        for name, enough in growth.items():
-            before, since = self._seen[name].bests(rule.patience)
-            values |= {f"{name}_before": before, f"{name}_since": since}
-            grew = grew or since > before + enough
-        scores_s = self._race_scores_s
-        before_s = min(scores_s[: -rule.best_patience], default=math.inf)
-        since_s = min(scores_s[-rule.best_patience :])
-        if math.isfinite(before_s) and math.isfinite(since_s):
-            values |= {"race_score_s_before": before_s, "race_score_s_since": since_s}
-        if (
-            grew
-            or since_s < before_s * (1 - rule.best_gain)
-            or completion.now < completion.best - rule.completion_near
-            or values["entropy_change"] > rule.entropy_change
-        ):
-            return None
-        return _decision(
-            "converged",
-            f"{completion.now:.1f} % completion, entropy {entropy.now:.1%}, no growth for "
-            f"{count(rule.patience, 'iteration')}",
-            values,
-            rule,
-        )
-
-
 class _Average:
     """A moving average over the last known values of a column; it stays where a row has none."""
 
@@ -355,6 +192,133 @@ class _Average:
         """Return the highest average before the last `patience` rows, and within them."""
         before = (average for average in self._averages[:-patience] if average is not None)
         return max(before), max(self.last(patience))
+
+
+class TrendRule(StoppingRule):
+    """The rules `plateau` and `entropy`, which look at moving averages."""
+
+    def __init__(self, config: PlateauStopping | EntropyStopping, action_count: int | None):
+        """Set up the rule.
+
+        Args:
+            config: the stopping group.
+            action_count: number of discrete actions, None for a continuous action space.
+        """
+        self._config = config
+        self._action_count = action_count
+        self._entropy_at_start: float | None = None
+        self._before = (0, 0)
+        self._seen = {name: _Average(config.window) for name in (*_ALWAYS, *EVALUATED)}
+        self._race_scores_s: list[float] = []  # infinite where none is known
+        self._rows = 0
+
+    def observe(self, row: Row) -> Decision | None:
+        """Add the row to the averages and apply the rule."""
+        config = self._config
+        self._rows += 1
+        for name, value in self._watched(row).items():
+            self._seen[name].add(value)
+        score_s = row.get("eval_race_score_s")
+        self._race_scores_s.append(math.inf if score_s is None else score_s)
+        return self._plateau(config) if isinstance(config, PlateauStopping) else self._entropy(config)
+
+    def _watched(self, row: Row) -> dict[str, float | None]:
+        entropy = row.get("entropy")
+        if self._entropy_at_start is None:
+            self._entropy_at_start = entropy
+        (laps, steps), self._before = self._before, (row["laps"], row["env_steps"])
+        share = None
+        if entropy is not None and self._entropy_at_start is not None:
+            share = entropy_share(entropy, self._entropy_at_start, self._action_count)
+        return {
+            "entropy": share,
+            "laps_per_1000_steps": _STEPS * (row["laps"] - laps) / max(row["env_steps"] - steps, 1),
+            **{name: row.get(name) for name in ("completion", "mean_return", *EVALUATED)},
+        }
+
+    def _plateau(self, config: PlateauStopping) -> Decision | None:
+        series = self._seen[config.metric]
+        if self._rows <= max(config.warmup, config.patience) or not series.known(config.patience):
+            return None
+        before, since = series.bests(config.patience)
+        if since > before + config.gain * series.range:
+            return None
+        why = f"{config.metric} has not grown for {count(config.patience, 'iteration')}"
+        values = {f"{config.metric}_before": before, f"{config.metric}_since": since}
+        return _decision("plateau", why, values, config)
+
+    def _entropy(self, config: EntropyStopping) -> Decision | None:
+        rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., _Found | None]], ...] = (
+            ("collapsed", config.collapsed, ("entropy", "completion"), _collapsed),
+            ("not_learning", config.not_learning, ("entropy", "completion"), _not_learning),
+            ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), _overfitting),
+            ("converged", config.converged, _ALWAYS, self._converged),
+        )
+        for name, rule, columns, judge in rules:
+            # Patience begins with the first average, so that there is something before it to compare with.
+            if rule is None or self._rows <= max(rule.warmup, rule.patience):
+                continue
+            averages = [self._seen[column] for column in columns]
+            if all(one.known(rule.patience) for one in averages) and (found := judge(rule, *averages)):
+                return _decision(name, *found, rule)
+        return None
+
+    def _converged(self, rule: ConvergedRule, *averages: _Average) -> _Found | None:
+        completion, returns, laps, entropy = averages
+        flat = entropy.last(rule.patience)
+        values = {
+            "completion": completion.now,
+            "completion_best": completion.best,
+            "entropy": entropy.now,
+            "entropy_change": max(flat) - min(flat),
+        }
+        grew = False
+        gains = (rule.completion_gain, rule.return_gain * returns.range, rule.laps_gain * laps.best)
+        for name, series, enough in zip(_ALWAYS[:3], averages[:3], gains, strict=True):
+            before, since = series.bests(rule.patience)
+            values |= {f"{name}_before": before, f"{name}_since": since}
+            grew = grew or since > before + enough
+        scores_s = self._race_scores_s
+        before_s = min(scores_s[: -rule.best_patience], default=math.inf)
+        since_s = min(scores_s[-rule.best_patience :])
+        if math.isfinite(before_s) and math.isfinite(since_s):
+            values |= {"race_score_s_before": before_s, "race_score_s_since": since_s}
+        if (
+            grew
+            or since_s < before_s * (1 - rule.best_gain)
+            or completion.now < completion.best - rule.completion_near
+            or values["entropy_change"] > rule.entropy_change
+        ):
+            return None
+        idle = count(rule.patience, "iteration")
+        return f"{completion.now:.1f} % completion, entropy {entropy.now:.1%}, no growth for {idle}", values
+
+
+def _collapsed(rule: CollapsedRule, entropy: _Average, completion: _Average) -> _Found | None:
+    highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
+    if highest >= rule.entropy_floor or best >= rule.completion_poor:
+        return None
+    why = f"entropy at {highest:.1%} with {best:.0f} % completion"
+    return why, {"entropy": highest, "completion": best}
+
+
+def _not_learning(rule: NotLearningRule, entropy: _Average, completion: _Average) -> _Found | None:
+    lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
+    start = completion.first
+    if lowest <= rule.entropy_near or best - start > rule.completion_gain or best >= rule.completion_poor:
+        return None
+    why = f"entropy still at {lowest:.1%}, completion {start:.1f} % at the start and {best:.1f} % since"
+    return why, {"entropy": lowest, "completion_start": start, "completion": best}
+
+
+def _overfitting(rule: OverfittingRule, held_out: _Average, returns: _Average) -> _Found | None:
+    before, since = held_out.bests(rule.patience)
+    lowest_return = returns.best - rule.return_drop * returns.range
+    if since > before - rule.held_out_drop or returns.now < lowest_return:
+        return None
+    why = f"held-out completion fell from {before:.0f} % to {since:.0f} % while the return holds"
+    completions = {"held_out_completion_before": before, "held_out_completion_since": since}
+    return why, completions | {"return": returns.now, "return_best": returns.best}
 
 
 def build_rule(config: StoppingConfig, action_count: int | None) -> StoppingRule:

@@ -86,13 +86,7 @@ def read_head(path: Path) -> RunRecord:
     Raises:
         BadInput: as for `read_record`.
     """
-    return RunRecord(
-        path,
-        read_config(path),
-        [],
-        read_object(path / SUMMARY),
-        read_object(path / PROVENANCE),
-    )
+    return RunRecord(path, read_config(path), [], read_object(path / SUMMARY), read_object(path / PROVENANCE))
 
 
 def read_config(path: Path) -> dict[str, Any]:

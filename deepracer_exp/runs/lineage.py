@@ -1,9 +1,9 @@
 """Lineage: what a run was cloned from, and the family tree of its ancestors and clones."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, TypeAdapter
 
@@ -17,6 +17,7 @@ from .result import RunResult, read_result
 _NO_EFFECT = ("runs_dir", "debug", "report", "tracking")
 """Groups that change nothing of how the car drives."""
 _IGNORED = ("name", "code")
+_Place = TypeVar("_Place")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,31 +122,33 @@ def best_members(root: Member) -> dict[int, str]:
     """
     known = [(one, one.result) for one in root.walk() if one.result is not None]
     known = [pair for pair in known if pair[1].evaluated] or known
-    groups: dict[tuple[str, str], tuple[Member, RunResult]] = {}
-    for member, result in known:
-        key = (member.course, result.measure)
-        if key not in groups or result.rank > groups[key][1].rank:
-            groups[key] = (member, result)
-    courses = {course for course, _ in groups}
+    groups = _best_of_groups((member.course, member, result) for member, result in known)
+    several = len({course for course, _ in groups}) > 1
     words: dict[int, str] = {}
     for (course, _), (member, result) in groups.items():
-        word = "best" + f" on {course}" * (len(courses) > 1) + f" by {result.criterion}"
+        word = "best" + f" on {course}" * several + f" by {result.criterion}"
         words[id(member)] = ", ".join(filter(None, [words.get(id(member)), word]))
     return words
 
 
 def best_by_generation(root: Member) -> list[tuple[int, Member, RunResult]]:
     """Return the best member of each generation on each track and measure; evaluated ones before others."""
-    found: dict[tuple[int, str, str], tuple[Member, RunResult]] = {}
-    evaluated = {(one.generation, one.course) for one in root.walk() if one.result and one.result.evaluated}
-    for member in root.walk():
-        result, place = member.result, (member.generation, member.course)
-        if result is None or (place in evaluated and not result.evaluated):
-            continue
-        key = (*place, result.measure)
+    known = [((one.generation, one.course), one, one.result) for one in root.walk() if one.result is not None]
+    evaluated = {place for place, _, result in known if result.evaluated}
+    groups = _best_of_groups(one for one in known if one[2].evaluated or one[0] not in evaluated)
+    return [(place[0], *groups[place, measure]) for place, measure in sorted(groups)]
+
+
+def _best_of_groups(
+    members: Iterable[tuple[_Place, Member, RunResult]],
+) -> dict[tuple[_Place, str], tuple[Member, RunResult]]:
+    """Return the best by place and measure, the first of equals."""
+    found: dict[tuple[_Place, str], tuple[Member, RunResult]] = {}
+    for place, member, result in members:
+        key = place, result.measure
         if key not in found or result.rank > found[key][1].rank:
-            found[key] = (member, result)
-    return [(key[0], *found[key]) for key in sorted(found)]
+            found[key] = member, result
+    return found
 
 
 def _parent(lineage: Lineage, places: list[Path]) -> Path:

@@ -81,7 +81,7 @@ def read_own_recording(folder: Path) -> Recording:
         evaluations=evaluated,
         metadata=_metadata(folder, config, problems),
         hyperparameters=_hyperparameters(config),
-        reward_source=_reward(folder, problems, files),
+        reward_source=_text(folder / REWARD, problems, files) or None,
         track=_track(config),
         problems=tuple(problems),
         files=tuple(files),
@@ -220,10 +220,6 @@ def _track(config: Mapping[str, Any]) -> str | None:
     track = config.get("track")
     name = track.get("name") if isinstance(track, Mapping) else None
     return name if isinstance(name, str) else None
-
-
-def _reward(folder: Path, problems: list[LogProblem], files: list[Path]) -> str | None:
-    return _text(folder / REWARD, problems, files) or None
 
 
 def _text(file: Path, problems: list[LogProblem], files: list[Path]) -> str:

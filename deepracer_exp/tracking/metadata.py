@@ -124,10 +124,7 @@ _COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.cons
 
 
 def run_params(
-    choices: Mapping[str, str],
-    names: Mapping[str, str],
-    config: Mapping[str, Any],
-    overrides: Sequence[str],
+    choices: Mapping[str, str], names: Mapping[str, str], config: Mapping[str, Any], overrides: Sequence[str]
 ) -> dict[str, Scalar]:
     """Return the parameters by which runs are compared; the run's config.yaml has all values.
 

@@ -185,12 +185,7 @@ class StudyRun:
 
 
 def open_trial_run(
-    store: Store,
-    study: str,
-    trial: int,
-    parent_run_id: str,
-    base: Sequence[str],
-    deadline_s: float = 30.0,
+    store: Store, study: str, trial: int, parent_run_id: str, base: Sequence[str], deadline_s: float = 30.0
 ) -> str | None:
     """Return the id in MLflow of the run that groups the seeds of a trial, created on the first call.
 

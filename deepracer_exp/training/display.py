@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console, Group, RenderableType
@@ -31,17 +30,11 @@ NOTHING = "\N{EN DASH}"
 
 _HALVES = 60  # columns from which the figures stand in two halves side by side
 _WIDE = 76  # columns from which the limit of the budget stands beside the bar
-_LABEL, _VALUE, _GAP, _RIGHT = (
-    12,
-    10,
-    3,
-    24,
-)  # columns of a name, a value, between the halves, of the right half
+# Columns of a name, a value, between the halves, of the right half.
+_LABEL, _VALUE, _GAP, _RIGHT = 12, 10, 3, 24
 _FRAME_LINES = 10  # of the panel beside figures and table, and the terminal's last
-_TABLE_GAP, _CELL = (
-    2,
-    22,
-)  # columns between tracks, and of a track: 18 tracks in three columns of a terminal of 80
+# Columns between tracks, and of a track: 18 tracks in three columns of a terminal of 80.
+_TABLE_GAP, _CELL = 2, 22
 _PERCENT, _LAP = 4, 7  # columns of per cent and lap time in it
 
 # What is shown of a row by its label: key, format and unit.
@@ -129,9 +122,7 @@ class ProgressDisplay:
             self._print(f"results in {self._header.folder}")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._pending:
             self._show()
         if self._live is not None:

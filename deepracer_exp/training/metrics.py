@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -186,7 +186,7 @@ def _each_car_once(cars: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(turn == nth) for nth in range(turn.max() + 1)]
 
 
-class RunMetrics:
+class RunMetrics(EpisodeBook):
     """Results of a run on one track, or of each of its tracks.
 
     Attributes:
@@ -205,7 +205,7 @@ class RunMetrics:
         """
         self.track_names = names
         self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else REMEMBERED_EPISODES
-        self._book = EpisodeBook(n_cars, len(names), self.remembered, step_s)
+        super().__init__(n_cars, len(names), self.remembered, step_s)
         self.labels = track_labels(names) if len(names) > 1 else []
         self._last: list[dict[str, float | None]] = [{} for _ in self.labels]
 
@@ -215,25 +215,16 @@ class RunMetrics:
 
         None before as many episodes as are remembered have ended on every track.
         """
-        shares = [record.lap_share for record in self._book.tracks]
+        shares = [record.lap_share for record in self.tracks]
         known = [share for share in shares if share is not None]
         return min(known) if len(known) == len(shares) else None
-
-    @property
-    def episodes(self) -> Record:
-        """Episodes and laps on all tracks so far."""
-        return self._book.all
-
-    def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
-        """Count a batch; arguments and results as of `EpisodeBook.enter`."""
-        return self._book.enter(trace)
 
     def row(self, finished: Finished) -> dict[str, float | None]:
         """Return the figures of the episodes of an iteration, means over episodes.
 
         Lap times of different tracks have no common measure: with several tracks they stand at each track only.
         """
-        figures = _figures(finished, self._book.all)
+        figures = _figures(finished, self.all)
         if self.labels:
             figures |= {"lap_share": self.lap_share, "best_lap_time_s": None, "mean_lap_time_s": None}
         return {"mean_return": _mean(finished.returns), **figures}
@@ -242,27 +233,24 @@ class RunMetrics:
         """Return the figures of each track, empty with one track; None where none is known."""
         row: dict[str, float | None] = {}
         for number, label in enumerate(self.labels):
-            figures = _figures(finished.on(number), self._book.tracks[number])
+            figures = _figures(finished.on(number), self.tracks[number])
             self._last[number] |= {key: value for key, value in figures.items() if value is not None}
             row |= {track_metric(metric, label): value for metric, value in figures.items()}
         return row
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything."""
-        return {"book": self._book.state_dict(), "last": self._last}
+        return {"book": super().state_dict(), "last": self._last}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a `state_dict`."""
-        self._book.load_state_dict(state["book"])
+        super().load_state_dict(state["book"])
         self._last = [dict(last) for last in state["last"]]
 
     def summary(self) -> dict[str, Any]:
         """Return the figures at the end; with several tracks, `tracks` has those of each by its name."""
-        book = self._book
-        whole = {
-            "lap_share": self.lap_share,
-            "best_lap_time_s": None if self.labels else book.all.best_lap_s,
-        }
+        best_s = None if self.labels else self.all.best_lap_s
+        whole = {"lap_share": self.lap_share, "best_lap_time_s": best_s}
         if not self.labels:
             return whole
         tracks = {
@@ -274,7 +262,7 @@ class RunMetrics:
                 "best_lap_time_s": record.best_lap_s,
                 "mean_lap_time_s": last.get("mean_lap_time_s"),
             }
-            for name, record, last in zip(self.track_names, book.tracks, self._last, strict=True)
+            for name, record, last in zip(self.track_names, self.tracks, self._last, strict=True)
         }
         return {**whole, "tracks": tracks}
 
@@ -351,10 +339,10 @@ class EvalResult:
     """Per cent of the lap, mean over the laps tried on the usual conditions."""
     held_out_completion: float | None
     """The same on the held-out conditions; None where there are none."""
-    eval_lap_time_s: float | None
-    """Mean time of the complete laps on the usual conditions, over all tracks."""
     eval_lap_share: float
     """Complete laps per lap tried on the usual conditions, 0 to 1."""
+    eval_lap_time_s: float | None
+    """Mean time of the complete laps on the usual conditions, over all tracks."""
     eval_race_score_s: float | None
     """Seconds per complete lap on all conditions, failed laps included; None without a lap on each track."""
 
@@ -377,11 +365,5 @@ class EvalResult:
         return {name: getattr(self, name) for name in EVAL_COLUMNS}
 
 
-EVAL_COLUMNS = (
-    "eval_completion",
-    "held_out_completion",
-    "eval_lap_share",
-    "eval_lap_time_s",
-    "eval_race_score_s",
-)
+EVAL_COLUMNS = tuple(field.name for field in fields(EvalResult) if field.name != "rank")
 NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)

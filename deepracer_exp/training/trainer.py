@@ -389,7 +389,7 @@ class Trainer:
 
     def counters(self) -> dict[str, int]:
         """Return iteration, env steps, episodes and laps so far."""
-        episodes = self.metrics.episodes
+        episodes = self.metrics.all
         return {
             "iteration": self.iteration,
             "env_steps": self.env_steps,
@@ -444,7 +444,7 @@ class Trainer:
         self, finished: Finished, update: UpdateMetrics, frames: int, collect_s: float, update_s: float
     ) -> dict[str, Any]:
         """Return the iteration's row of metrics.jsonl."""
-        if self._first_lap is None and self.metrics.episodes.laps:
+        if self._first_lap is None and self.metrics.all.laps:
             self._first_lap = self.moment()
         return {
             **self.counters(),
