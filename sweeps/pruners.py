@@ -100,12 +100,10 @@ def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf
 def is_worse_across_seeds(study: Study, values: Sequence[float]) -> bool:
     """Return whether these values are worse than the best trial's, seed by seed, by Wilcoxon's signed-rank test.
 
-    The significance level is 0.1; with fewer than five seeds it is the least the test can reach before the last seed,
-    2^-(seeds - 1); after one seed no test can decide. With several objectives there is no best trial: False.
-
-    Args:
-        study: its complete trials have `runs` in their user attributes.
-        values: of the first seeds of a trial, in the order of the seeds.
+    The significance level is 0.1; with fewer than five seeds it is the least the test can reach before the last
+    seed, 2^-(seeds - 1); after one seed no test can decide. With several objectives there is no best trial: False.
+    `values` are those of a trial's first seeds, in the order of the seeds; the study's complete trials have `runs`
+    in their user attributes.
     """
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if not complete or len(study.directions) > 1:

@@ -37,9 +37,7 @@ def verify(folder: Path) -> None:
 def find_checkpoint(folder: Path, name: str) -> Path:
     """Return the folder of a checkpoint, or the link to it; a `last` that is missing has others in its place.
 
-    Args:
-        folder: `checkpoints/` of a run.
-        name: `best`, `last` or the number of an iteration.
+    `folder` is `checkpoints/` of a run, `name` is `best`, `last` or the number of an iteration.
 
     Raises:
         BadInput: there is no such checkpoint, or it lies elsewhere.
@@ -78,10 +76,7 @@ def checkpoint_sha256(folder: Path) -> str:
 def pin(checkpoints: Path, name: str, why: str) -> None:
     """Note that a checkpoint must stay.
 
-    Args:
-        checkpoints: `checkpoints/` of a run.
-        name: of the checkpoint's own folder, e.g. ``000120``.
-        why: shown by `runs clean`.
+    `name` is that of its own folder in `checkpoints/` of its run, e.g. ``000120``; `runs clean` shows `why`.
     """
     pins = pinned(checkpoints)
     if why in pins.setdefault(name, []):

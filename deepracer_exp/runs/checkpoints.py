@@ -46,10 +46,7 @@ class StoredPolicy:
 def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
     """Read the networks of a checkpoint, or of the newest intact one if `best` or `last` is corrupt.
 
-    Args:
-        experiment: of the run.
-        folder: `checkpoints/` of its run.
-        name: `best`, `last` or the number of an iteration.
+    `folder` and `name` as of `find_checkpoint`.
 
     Raises:
         BadInput: as for `intact_checkpoint` and `read_policy`.
@@ -60,12 +57,8 @@ def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPo
 def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Path:
     """Return the folder of a checkpoint whose files all match their hashes.
 
-    If `best` or `last` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning.
-
-    Args:
-        folder: `checkpoints/` of a run.
-        name: `best`, `last` or the number of an iteration.
-        resumable: require one that a training can resume from.
+    If `best` or `last` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning. With
+    `resumable`, it is one that a training can resume from; `folder` and `name` as of `find_checkpoint`.
 
     Raises:
         BadInput: there is no such checkpoint, it lies elsewhere, or it is corrupt and so are all others. Files that
@@ -170,8 +163,7 @@ def read_agent(path: Path, agent: Algorithm) -> None:
 def read_training(path: Path) -> dict[str, Any]:
     """Return what `CheckpointStore.save` was given as `training`.
 
-    Args:
-        path: a checkpoint that `check` has accepted.
+    `path` is a checkpoint that `check` has accepted.
 
     Raises:
         BadInput: there is none, or it cannot be read.
@@ -284,9 +276,7 @@ class CheckpointStore:
     def rewind(self, iteration: int, best: int | None) -> None:
         """Go back to an iteration: `last` is its checkpoint, and what came later goes, unless it must stay.
 
-        Args:
-            iteration: it has a checkpoint.
-            best: iteration of the best checkpoint up to there, None if there was none.
+        `best` is the iteration of the best checkpoint up to there, None if there was none.
         """
         pins = pinned(self.folder)
         for path in self._own():

@@ -70,10 +70,7 @@ class Removables:
 def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
     """Find what may be removed; nothing is changed.
 
-    Args:
-        runs_dir: where runs are.
-        overview: what MLflow knows; None: it was not read, and nothing of a run that is recorded there goes but its
-            trace.
+    Without `overview`, what MLflow knows, nothing of a run that is recorded there goes but its trace.
 
     Raises:
         BadInput: a file that says what must be kept cannot be read.

@@ -124,11 +124,7 @@ class StoppingRule:
     """
 
     def observe(self, row: Row) -> Decision | None:
-        """Return why the run should end after this iteration, None to continue.
-
-        Args:
-            row: of metrics.jsonl, in their order.
-        """
+        """Return why the run should end after this row of metrics.jsonl, None to continue."""
         return None
 
 
@@ -200,9 +196,7 @@ class TrendRule(StoppingRule):
     def __init__(self, config: PlateauStopping | EntropyStopping, action_count: int | None):
         """Set up the rule.
 
-        Args:
-            config: the stopping group.
-            action_count: number of discrete actions, None for a continuous action space.
+        `action_count` is the number of discrete actions, None for a continuous action space.
         """
         self._config = config
         self._action_count = action_count
@@ -324,9 +318,7 @@ def _overfitting(rule: OverfittingRule, held_out: _Average, returns: _Average) -
 def build_rule(config: StoppingConfig, action_count: int | None) -> StoppingRule:
     """Return the rule of the group `stopping`.
 
-    Args:
-        config: the group.
-        action_count: number of discrete actions, None for a continuous action space.
+    `action_count` is the number of discrete actions, None for a continuous action space.
 
     Raises:
         BadInput: a class of the user's own cannot be used.

@@ -30,12 +30,7 @@ REMEMBERED_EPISODES = 50
 
 
 def fingerprint(config: Mapping[str, Any], setup: RaceSetup) -> dict[str, Any]:
-    """Return the configuration of a run and a hash of each of the files it was made from, JSON types.
-
-    Args:
-        config: all values, as in config.yaml.
-        setup: its files, read.
-    """
+    """Return the configuration of a run and a hash of each of the files it was made from, JSON types."""
     return {"config": dict(config), "files": _hashes(setup)}
 
 
@@ -44,11 +39,7 @@ def refuse_changes(
 ) -> None:
     """Refuse to resume a run with other values or files than it was started with.
 
-    Args:
-        run_dir: folder of the run.
-        before: its `fingerprint`.
-        config: all values it would be resumed with.
-        setup: its files as they are now.
+    `before` is its `fingerprint`; `config` and `setup` are what it would be resumed with.
 
     Raises:
         BadInput: a value or a file that matters differs; all of them are named.

@@ -85,12 +85,7 @@ class RunFolder:
         """Write the configuration and where code and reward come from; return the git commit if there is one.
 
         config.yaml makes a folder a run, and is written last: a run that was killed at any moment can be resumed.
-
-        Args:
-            composition: of the experiment.
-            reward: its reward function.
-            seed: of the run.
-            names: what a racer calls its choices.
+        `names` are what a racer calls its choices.
         """
         overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
         self.write(OVERRIDES, overrides or "[]\n")

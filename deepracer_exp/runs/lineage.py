@@ -84,9 +84,7 @@ class Member:
 def family(run: Path, runs_dir: Path) -> Member:
     """Return the root of a run's family tree.
 
-    Args:
-        run: its folder.
-        runs_dir: where relatives are searched, besides the runs beside it.
+    Relatives are searched in `runs_dir` and beside the run.
 
     Raises:
         BadInput: a file of a relative cannot be used, or a run descends from itself.

@@ -61,9 +61,8 @@ class StoredRun:
     def choose_checkpoint(self, given: str | None) -> str:
         """Return the name of the checkpoint to use.
 
-        Args:
-            given: `best`, `last` or an iteration; None: the alias's, or the best. A run that ended before its first
-                evaluation has no best: its last is used, with a warning.
+        `given` is `best`, `last` or an iteration; None: the alias's, or the best. A run that ended before its first
+        evaluation has no best: its last is used, with a warning.
         """
         name = given or self.checkpoint
         best, last = (self.checkpoints / link for link in LINKS)
@@ -186,9 +185,6 @@ def read_best_of_sweep(folder: Path) -> BestOfSweep | None:
 
 def best_run_of_sweep(folder: Path) -> Path | None:
     """Return the folder of the best run of a sweep, None if no sweep has chosen one.
-
-    Args:
-        folder: of the study's runs.
 
     Raises:
         BadInput: the file was not written by a sweep, or its run is gone or lies elsewhere.

@@ -81,10 +81,6 @@ def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.Data
 
     An episode may continue in the next iteration: its rows need not be adjacent.
 
-    Args:
-        folder: `trace/` of a run.
-        columns: the columns to read; a chart of a million steps needs few of them.
-
     Raises:
         BadInput: there is no trace, or a file is incomplete or of another kind.
     """

@@ -27,10 +27,7 @@ _log = logging.getLogger(__name__)
 def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
     """Record in MLflow what it lacks of a finished run, and mark the run as ended.
 
-    Args:
-        run_dir: the run's folder.
-        uri: the store, as in `tracking.uri` with its password; None: the one in `runs_dir`.
-        runs_dir: where runs are.
+    `uri` is the store, as in `tracking.uri` with its password; None: the one in `runs_dir`.
 
     Returns:
         The number of missing metric points.
@@ -81,13 +78,8 @@ def deliver_evaluation(
 ) -> None:
     """Record the results of evaluating a checkpoint of a recorded run in MLflow; errors are logged.
 
-    Args:
-        run_dir: the run's folder.
-        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
-        runs_dir: where runs are.
-        env_steps: of the checkpoint.
-        metrics: by name in MLflow.
-        files: and their folders in MLflow.
+    `uri` and `runs_dir` as of `deliver`, `env_steps` are those of the checkpoint, `metrics` have MLflow's names,
+    and each of the `files` its folder in MLflow.
     """
     run_id = read_run_id(run_dir)
     if run_id is None or not has_store(uri, runs_dir):

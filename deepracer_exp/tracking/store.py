@@ -217,10 +217,7 @@ def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
 def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowClient]":
     """Open a store and turn its errors into BadInput.
 
-    Args:
-        what: beginning of the error message.
-        uri: the store, as in `tracking.uri`; None: the one in `runs_dir`.
-        runs_dir: where runs are.
+    `what` begins the message; `uri` is the store, as in `tracking.uri`, None: the one in `runs_dir`.
 
     Raises:
         BadInput: there is no store, it does not answer, or it refuses.

@@ -55,9 +55,7 @@ class Budget:
     def __init__(self, config: BudgetConfig, folder: Path | None = None):
         """Set the limits.
 
-        Args:
-            config: the budget group.
-            folder: the run's own; the folders beside it are the other runs of the experiment. None: there are none.
+        The folders beside the run's own are the other runs of the experiment; without `folder` there are none.
         """
         self._config, self._folder = config, folder
         self._others: dict[str, float] = {}
@@ -125,9 +123,7 @@ class Budget:
 def refuse_spent(config: BudgetConfig, experiment_dir: Path) -> None:
     """Refuse to start a run of an experiment that has nothing left.
 
-    Args:
-        config: the budget group.
-        experiment_dir: the folder of the experiment's runs; it need not exist.
+    The folder of the experiment's runs need not exist.
 
     Raises:
         BadInput: a limit is reached; it is named with what was used.
@@ -151,11 +147,6 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
 
     With another stopping rule among the overrides, what ended it, its own rule or a comparison with other runs, does
     not count; a budget that is still used up does.
-
-    Args:
-        run_dir: its folder.
-        config: the budget to resume it with.
-        overrides: to resume it with.
 
     Raises:
         RunEnded: it says how the run can be resumed anyway.

@@ -264,8 +264,7 @@ class TrackTable:
     def __init__(self, labels: Sequence[str]):
         """Start empty.
 
-        Args:
-            labels: of the tracks, as in the rows of metrics.jsonl; empty for a run on one track.
+        `labels` are those of the rows of metrics.jsonl; empty for a run on one track.
         """
         self._labels = labels
         # An iteration need not end an episode on every track: what was known last stays.

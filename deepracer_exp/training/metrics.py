@@ -52,8 +52,7 @@ class Record:
     def __init__(self, remembered: int):
         """Begin with nothing.
 
-        Args:
-            remembered: how many of the last finished episodes `lap_share` looks at.
+        `remembered` is how many of the last finished episodes `lap_share` looks at.
         """
         self._laps_of_last: deque[bool] = deque(maxlen=remembered)
         self.finished = 0
@@ -288,11 +287,7 @@ class Ranking:
     """
 
     def __init__(self, lengths_m: Sequence[float]):
-        """Begin without a result.
-
-        Args:
-            lengths_m: length of each track.
-        """
+        """Begin without a result."""
         self._lengths_m = lengths_m
         self._completion = np.full(len(lengths_m), np.nan)
         self._speed_mps = np.full(len(lengths_m), np.nan)

@@ -131,13 +131,7 @@ def resume(
 ) -> TrainResult:
     """Resume a run that was killed, interrupted or failed from its last checkpoint.
 
-    Args:
-        run_dir: its folder.
-        overrides: of values that change nothing of what it learns.
-        console: shows the progress; None: nothing is shown.
-        callbacks: called beside the standard ones.
-        run_name: as in `train`, if the run was not recorded yet.
-        tags: likewise.
+    `overrides` are of values that change nothing of what it learns; the others as of `run_training`.
 
     Raises:
         RunEnded: the run has ended.

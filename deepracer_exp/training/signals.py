@@ -14,8 +14,7 @@ class Interruption:
     def __init__(self, answer: Callable[[str], None] | None = None) -> None:
         """Hear nothing yet.
 
-        Args:
-            answer: called with a line when the first signal comes; None: nothing is shown.
+        `answer` is called with a line when the first signal comes; None: nothing is shown.
         """
         self._answer = answer
         self.signum: int | None = None

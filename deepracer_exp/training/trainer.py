@@ -85,9 +85,7 @@ class Callback:
     def on_batch(self, trainer: "Trainer", finished: Finished) -> None:
         """A batch was collected; the networks are still those that drove it.
 
-        Args:
-            trainer: with the batch's steps and episodes counted.
-            finished: the episodes that ended in the batch.
+        `finished` are the episodes that ended in the batch, whose steps and episodes are counted.
         """
 
     def on_iteration_end(self, trainer: "Trainer") -> None:
@@ -152,12 +150,7 @@ class Trainer:
     ):
         """Build the networks and all that trains them.
 
-        Args:
-            experiment: what is trained.
-            setup: its files, read.
-            folder: where everything is written.
-            config: all values, as in config.yaml.
-            callbacks: in the order in which they are called.
+        `config` are all values, as in config.yaml; the callbacks are called in their order.
 
         Raises:
             BadInput: the networks do not fit into memory.
@@ -207,13 +200,9 @@ class Trainer:
         folder.open_log()
 
     def fit(self, interruption: Interruption) -> str:
-        """Train until there is a reason to stop.
+        """Train until there is a reason to stop, and return it.
 
-        Args:
-            interruption: entered; a signal ends the loop after the iteration in progress.
-
-        Returns:
-            The reason.
+        A signal to `interruption`, which is entered, ends the loop after the iteration in progress.
 
         Raises:
             RunFailed: a worker was lost, a number became NaN or infinite, or the disk is full.
@@ -257,9 +246,7 @@ class Trainer:
     def request_stop(self, reason: str, status: str = FINISHED) -> None:
         """End the run after this iteration; the first request counts.
 
-        Args:
-            reason: for the last line of the run and summary.json.
-            status: FINISHED or STOPPED_EARLY.
+        `reason` is for the last line of the run and summary.json, `status` FINISHED or STOPPED_EARLY.
         """
         if self.stop_reason is None:
             self.stop_reason, self.status = reason, status
@@ -298,9 +285,7 @@ class Trainer:
     def load(self, checkpoint: Path, state: Mapping[str, Any]) -> None:
         """Restore a run from a checkpoint.
 
-        Args:
-            checkpoint: its folder.
-            state: what `read_training` found in it.
+        `state` is what `read_training` found in it.
 
         Raises:
             BadInput: it does not fit the experiment.
