@@ -58,11 +58,9 @@ def read_log(path: Path) -> Recording:
 def read_own_recording(folder: Path) -> Recording:
     """Read a run of ours.
 
-    The rows are those of its trace in the order of iterations, the last `MOST_STEPS` of them; the rows of one episode
-    may run on into the next iteration. What cannot be read of it is left out and listed.
-
-    Args:
-        folder: of the run, with `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
+    The rows are those of its trace in the order of iterations, the last `MOST_STEPS` of them; the rows of one
+    episode may run on into the next iteration. What cannot be read of it is left out and listed. `folder` has
+    `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
 
     Raises:
         BadInput: there is no trace, or nothing of it can be read.

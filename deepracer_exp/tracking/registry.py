@@ -151,11 +151,10 @@ def promote(
     tags = {_RUN_DIR: str(run.resolve()), _CHECKPOINT: folder.name, _SHA256: checkpoint_sha256(folder)}
     what = f"promote {run.name}"
     with open_client(what, uri, runs_dir) as client:
-        recorded = client.get_run(run_id)
-    if recorded.info.lifecycle_stage != "active":
-        raise BadInput(f"{what}: was deleted in MLflow (run {run_id}); restore it there")
-    pin(run / CHECKPOINTS, folder.name, f"registered as {model}")
-    with open_client(what, uri, runs_dir) as client:
+        recorded = client.get_run(run_id).info
+        if recorded.lifecycle_stage != "active":
+            raise BadInput(f"{what}: was deleted in MLflow (run {run_id}); restore it there")
+        pin(run / CHECKPOINTS, folder.name, f"registered as {model}")
         if not any(found.name == model for found in pages(client.search_registered_models)):
             client.create_registered_model(
                 model, description=f"Policies of `deepracer-exp`, experiment `{model}`."
@@ -165,7 +164,7 @@ def promote(
         if version is None:
             metrics = _evaluated(run, folder)
             logged = _log_model(
-                client, recorded.info.experiment_id, run_id, run, folder, tags, features, seen, metrics
+                client, recorded.experiment_id, run_id, run, folder, tags, features, seen, metrics
             )
             shown = (
                 f"Checkpoint {int(folder.name)} of `{run.name}`: {race_result(metrics)}.\n\n{picture(run_id)}"

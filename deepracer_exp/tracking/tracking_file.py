@@ -46,9 +46,9 @@ class TrackingFile:
     def __init__(self, path: Path, run: TrackedRun) -> None:
         """Write the file."""
         self._path = path
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self.run = run
-        self._write(run)
+        self.change()
 
     @classmethod
     def read(cls, path: Path, store: str) -> "TrackingFile":
@@ -69,27 +69,24 @@ class TrackingFile:
     def change(self, **changes: Any) -> None:
         """Set fields of the run."""
         with self._lock:
-            self._write(replace(self.run, **changes))
+            self.run = replace(self.run, **changes)
+            try:
+                atomic_write(self._path, json.dumps(asdict(self.run), indent=1) + "\n")
+            except OSError as error:
+                # Only needed after a kill; a full disk ends the training elsewhere.
+                _log.warning("%s: cannot be written: %s", self._path, error.strerror)
 
     def add_tag(self, key: str, value: str) -> None:
         """Add a tag."""
         with self._lock:
-            self._write(replace(self.run, tags={**self.run.tags, key: value}))
+            self.change(tags={**self.run.tags, key: value})
 
     def add_file(self, path: Path, folder: str | None) -> None:
         """Add a file or folder that is stored with the run."""
         path, base = path.resolve(), self._path.parent.resolve()
         shown = path.relative_to(base) if path.is_relative_to(base) else path
         with self._lock:
-            self._write(replace(self.run, files={**self.run.files, shown.as_posix(): folder}))
-
-    def _write(self, run: TrackedRun) -> None:
-        self.run = run
-        try:
-            atomic_write(self._path, json.dumps(asdict(run), indent=1) + "\n")
-        except OSError as error:
-            # Only needed after a kill; a full disk ends the training elsewhere.
-            _log.warning("%s: cannot be written: %s", self._path, error.strerror)
+            self.change(files={**self.run.files, shown.as_posix(): folder})
 
 
 _TRACKED_RUN = TypeAdapter(TrackedRun)

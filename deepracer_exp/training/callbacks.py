@@ -12,6 +12,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
+from deepracer_exp.runs.checkpoint_files import LINKS
 from deepracer_exp.runs.convergence import Decision, StoppingRule, build_rule
 from deepracer_exp.runs.files import (
     BEST_LAP,
@@ -45,6 +46,7 @@ logger = logging.getLogger("deepracer_exp")
 
 _DRIVING = "driving"
 """What ranks a policy that is not evaluated: the training's own episodes."""
+_TRACKED_FILES = (CONFIG, OVERRIDES, PROVENANCE, REWARD, SUMMARY, METRICS, LOG, REPORT, BEST_LAP, LEARNING)
 
 
 def standard_callbacks(
@@ -257,19 +259,13 @@ class TrackingCallback(Callback):
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Log files and end the run in the store."""
-        path = trainer.folder.path
-        for name in (CONFIG, OVERRIDES, PROVENANCE, REWARD):
-            self._tracker.log_artifact(path / name)
-        for name in (SUMMARY, METRICS, LOG, REPORT, BEST_LAP, LEARNING):
-            if (path / name).exists():
-                self._tracker.log_artifact(path / name)
-        if (path / CRASH_DUMPS).exists():
-            self._tracker.log_artifact(path / CRASH_DUMPS, CRASH_DUMPS)
-        for name in ("best", "last"):
-            if (trainer.checkpoints.folder / name).exists():
-                self._tracker.log_artifact(
-                    (trainer.checkpoints.folder / name).resolve(), f"{CHECKPOINTS}/{name}"
-                )
+        path, checkpoints = trainer.folder.path, trainer.checkpoints.folder
+        files: list[tuple[Path, str | None]] = [(path / name, None) for name in _TRACKED_FILES]
+        files.append((path / CRASH_DUMPS, CRASH_DUMPS))
+        files += [((checkpoints / link).resolve(), f"{CHECKPOINTS}/{link}") for link in LINKS]
+        for file, folder in files:
+            if file.exists():
+                self._tracker.log_artifact(file, folder)
         self._tracker.set_tag(END_TAG, f"{result.status}: {result.reason}")
         self._tracker.finish(ENDS.get(result.status, "KILLED"))
 

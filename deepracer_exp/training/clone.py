@@ -108,11 +108,8 @@ def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
         raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
     ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
     before, after = (
-        {
-            name: sensor and vars(sensor)
-            for name, sensor in (("camera", one.observation.camera), ("lidar", one.observation.lidar))
-        }
-        for one in (parent, clone)
+        {name: sensor and vars(sensor) for name, sensor in (("camera", seen.camera), ("lidar", seen.lidar))}
+        for seen in (parent.observation, clone.observation)
     )
     if before != after:
         changed = "; ".join(describe_differences(config_differences([before, after])))

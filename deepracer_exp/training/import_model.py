@@ -100,7 +100,7 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
         remove_options(options)
         raise
     notes = [f"{model.source}: {', '.join([*seen, *network])}", *model.notes]
-    notes += [*_absent(absent), *_remarks(files, model, world)]
+    notes += _remarks(files, model, world, absent)
     return Imported(result.folder, options, notes, model.has_logs)
 
 
@@ -164,7 +164,7 @@ def _world(model: StoredModel, path: str) -> str | None:
     return find_world(first) if isinstance(first, str) else None
 
 
-def _absent(absent: Sequence[str]) -> list[str]:
+def _remarks(files: CustomFiles, model: StoredModel, world: str | None, absent: Sequence[str]) -> list[str]:
     notes = []
     if VALUE in absent:
         notes.append(
@@ -175,11 +175,7 @@ def _absent(absent: Sequence[str]) -> list[str]:
         notes.append(
             "a frozen graph holds no standard deviation of the actions: it starts at network.initial_std"
         )
-    return notes
-
-
-def _remarks(files: CustomFiles, model: StoredModel, world: str | None) -> list[str]:
-    notes = [one for one in files.remarks() if not one.startswith(_CHOSEN_HERE)]
+    notes += [one for one in files.remarks() if not one.startswith(_CHOSEN_HERE)]
     if "reward_function.py" not in model.files:
         notes.append(
             "reward_function.py: not among the files; clones learn from the default reward unless given reward="

@@ -299,9 +299,6 @@ class Ranking:
         Completion is the mean over a track's episodes, speed the track's length over the mean time of complete laps,
         0 where there is none.
 
-        Args:
-            finished: what ended in this iteration.
-
         Returns:
             None as long as too few episodes have ended, or if none did in this iteration.
         """

@@ -105,13 +105,8 @@ def store_run(
 ) -> TrainResult:
     """Make a run of networks that were trained elsewhere, as if its training had ended before it began.
 
-    The reward function is not run.
-
-    Args:
-        experiment: validated.
-        composition: where it came from.
-        networks: are its checkpoint, best and last.
-        reason: where they came from, for the summary.
+    The reward function is not run. `networks` are its checkpoint, best and last; `reason` says in the summary where
+    they came from.
 
     Raises:
         BadInput: as for `run_training`; no folder is left.
