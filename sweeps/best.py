@@ -44,8 +44,8 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
 def best_values(study: optuna.Study) -> list[float]:
     """Return the values of the best trial, on fresh laps if it drove some."""
     trial = best_trial(study)
-    again = next((one for one in reranked(study) if one["trial"] == trial.number), None)
-    return list(trial.values if again is None else again["values"])
+    on_fresh_laps = {one["trial"]: one["values"] for one in reranked(study)}
+    return list(on_fresh_laps.get(trial.number, trial.values))
 
 
 def best_shown(study: optuna.Study) -> str:

@@ -12,8 +12,9 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.convergence import Decision, Row, StoppingRule, build_rule
 from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord
+from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 
-NOTHING = "\N{EN DASH}"
+from .display import NOTHING
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +134,7 @@ def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) 
 
 def _check_memory(record: RunRecord, config: ReliableStopping) -> None:
     """Refuse a number of episodes that the run's lap_share was not taken of."""
-    own = record.config.get("stopping", {}).get("episodes", 50)
+    own = record.config.get("stopping", {}).get("episodes", REMEMBERED_EPISODES)
     if own != config.episodes:
         raise BadInput(
             f"stopping.episodes={config.episodes}: {record.name} recorded the share of its last {own} episodes; "
