@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import RaceSetup, build_setup
 
 
+@cache
 def make_setup(*overrides: str) -> RaceSetup:
+    """Compose and build a setup, once for all tests that ask for the same."""
     return build_setup(compose_experiment(overrides)[0])
 
 

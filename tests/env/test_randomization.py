@@ -1,5 +1,4 @@
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable
 
@@ -12,24 +11,19 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.deepracer.trace import PACKED, RANDOMIZED
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.randomization import CarStreams
-from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarBatch
+from tests.env.conftest import make_setup
 
 DRAWN = [PACKED[name] for name in QUANTITIES]
 REST = [place for name, place in PACKED.items() if name not in QUANTITIES]
-
-
-@functools.cache
-def setup_of(*overrides: str) -> RaceSetup:
-    return build_setup(compose_experiment(overrides)[0])
 
 
 def race_of(
     option: str = "none", *overrides: str, n_cars: int = 1, first_car: int = 0, max_steps: int = 20, **ranges
 ) -> Race:
     """Build a race whose cars stand at their starts, with other ranges than the option's."""
-    setup = setup_of(f"randomization={option}", "action_space=continuous", *overrides)
+    setup = make_setup(f"randomization={option}", "action_space=continuous", *overrides)
     setup = dataclasses.replace(
         setup,
         randomization=dataclasses.replace(setup.randomization, **ranges),
@@ -107,7 +101,7 @@ def test_an_episode_keeps_what_it_drew_and_the_next_one_draws_again():
     assert len(drawn) > 12
     values, ranges = (
         np.array(list(drawn.values())),
-        setup_of("randomization=sim2real", "action_space=continuous").randomization,
+        make_setup("randomization=sim2real", "action_space=continuous").randomization,
     )
     for column, name in enumerate(QUANTITIES):
         low, high = getattr(ranges, name)
