@@ -19,7 +19,7 @@ from deepracer_exp.training.trainer import Trainer
 from tests.conftest import IN_PROCESS
 
 # Reached sooner than a lap: episodes end often.
-OFTEN = ("episode.max_steps=60", "checkpoints.every=2")
+OFTEN = ("episode.max_steps=60", "checkpoints.every=2", "algorithm.frames_per_iteration=512")
 
 # Ends a run after three iterations.
 SOON = ("stopping=plateau", *(f"stopping.{one}" for one in ("window=1", "warmup=2", "patience=2", "gain=1")))
