@@ -151,8 +151,10 @@ def test_a_misspelt_study_is_not_begun(swept, call_at):
 
 @pytest.mark.slow
 def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_path):
+    # A trial lasts longer than the driver looks away, so that it sees the third failure before the fourth.
     (tmp_path / "broken.py").write_text(
-        "def reward_function(params):\n    return 1 / (params['steps'] < 5)\n"
+        "import time\n\n\ndef reward_function(params):\n"
+        "    time.sleep(2.0 * (params['steps'] >= 5))\n    return 1 / (params['steps'] < 5)\n"
     )
     ended = start(*TINY, "study=f", LR, "sweep.trials=30", "reward.file=broken.py").end()
     assert ended.code == 3, ended.stderr
