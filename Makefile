@@ -51,10 +51,10 @@ test: $(STAMP)  ## the tests
 	@$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile
 
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each
-	@$(BIN)/python -m pytest -q -m slow
+	@$(BIN)/python -m pytest -q -m slow -n 2
 
-test-faults: $(STAMP)  ## runs and sweeps whose processes are killed and stopped, twenty times each; kill_loops.json
-	@FAULT_TIMES=20 KILL_LOOPS=kill_loops.json $(BIN)/python -m pytest -q tests/faults/test_kill_loops.py tests/faults/test_killed_sweeps.py
+test-faults: $(STAMP)  ## runs and sweeps whose processes are killed and stopped, twenty times each; kill_loops.jsonl
+	@FAULT_TIMES=20 KILL_LOOPS=kill_loops.jsonl $(BIN)/python -m pytest -q tests/faults/test_kill_loops.py tests/faults/test_killed_sweeps.py -n 2
 
 check: $(STAMP)  ## style, types and import rules
 	@$(BIN)/ruff check .

@@ -1,7 +1,7 @@
 """kill -9 of each process that the program starts, at random moments, again and again.
 
 What the killed one had started is gone within ten seconds, and study and run resume. `FAULT_TIMES=20` kills each of
-them twenty times (`make test-faults`), `KILL_LOOPS=FILE` keeps what was measured.
+them twenty times (`make test-faults`), `KILL_LOOPS=FILE` adds a line of what was measured.
 """
 
 import contextlib
@@ -43,10 +43,8 @@ def kill(request):
 
     yield go
     if file := os.environ.get("KILL_LOOPS"):
-        path = Path(file)
-        all_loops = json.loads(path.read_text()) if path.exists() else {}
-        all_loops[request.node.name] = kills
-        path.write_text(json.dumps(all_loops, indent=1) + "\n")
+        with Path(file).open("a") as lines:
+            lines.write(json.dumps({request.node.name: kills}) + "\n")
 
 
 def ended(cwd):
