@@ -35,7 +35,8 @@ _ANALYZE_EPILOG = """\
   deepracer-exp analyze RUN --reward racing_line            what another reward function would have paid for
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
 
-The page needs no network: findings in words first, then figures and tables, then what could not be read and why.
+The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
+read and why.
 """
 _COMPARE_EPILOG = """\
   deepracer-exp compare RUN ~/Downloads/evaluation.tar.gz   our laps beside those of the service's evaluation
@@ -83,7 +84,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         _compare,
         help="put simulated laps of a policy beside the service's log of it",
         description="Race a run's best policy as the laps of a log were driven, print lap times, line, actions and "
-        "where they part, and write a page of figures.",
+        "where they differ most, and write a page of figures.",
         epilog=_COMPARE_EPILOG,
         entry="evaluate",
     )
@@ -95,7 +96,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def _add_page(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(
-        "--track", metavar="NAME | ROUTE", help="one of several tracks, or the route (.npy) of an unknown one"
+        "--track",
+        metavar="NAME | ROUTE",
+        help="one of several tracks; or, of a track that the log does not name, its name or file (.npy, .yaml)",
     )
     parser.add_argument("-o", "--output", metavar="FILE", help=f"page to write (default: {default})")
 

@@ -37,8 +37,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         _evaluate,
         help="measure how good a trained car is",
         description=(
-            "Race a run's best policy: several trials at once, on the conditions of its training and on conditions it "
-            "was not trained on, on any tracks."
+            "Race a run's best policy: several trials at once, on the usual and on held-out conditions (slippery "
+            "floor, heavy car, delayed actions, ...), on any tracks."
         ),
         epilog=_EVALUATE_EPILOG,
         runs_rewards=True,
@@ -200,7 +200,7 @@ _CHECKPOINTS_EPILOG = """\
   deepracer-exp checkpoints RUN evaluation.tracks=[Oval_track,Bowtie_track]
   deepracer-exp checkpoints RUN -o checkpoints.html         also draw speed against stability
 
-Every checkpoint drives the same trials, on the conditions of its training and on conditions it was not trained on.
+Every checkpoint drives the same trials, on the usual and on held-out conditions.
 """
 
 

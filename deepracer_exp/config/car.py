@@ -13,7 +13,7 @@ class CarConfig:
     """A four-wheel-driven, front-steered 1/18 scale car.
 
     Lengths are measured from the chassis origin: on the ground plane, between the axles, x ahead, y left,
-    z up. Sources and meanings of the values stand in `conf/car/deepracer.yaml`.
+    z up. Sources and meanings of the values are in `conf/car/deepracer_v5.yaml`.
     """
 
     name: str
@@ -31,7 +31,7 @@ class CarConfig:
     camera_z_m: Finite
     camera_pitch_deg: Finite
     tilt_deg_per_mps2: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.0
-    """Seen by the camera only: tyres know of load, not of angles."""
+    """Only the camera leans; tyres depend on load, not on angles."""
 
     mass_kg: Positive
     com_x_m: Finite

@@ -37,7 +37,7 @@ class PenaltyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CarPictureConfig:
-    """The car's way from its camera's 640x480 to what a model sees."""
+    """How the car turns its camera's 640x480 into what a model sees."""
 
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None
     """Of the frames between the car's programs; null: they are not compressed, as in AWS's software."""
@@ -65,7 +65,7 @@ class CarControlsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RealCarConfig:
-    """The physical car's own ways; each part may be null, then it is the simulator's."""
+    """How the physical car sees and acts; a part that is null is as in the simulator."""
 
     picture: CarPictureConfig | None
     timing: CarTimingConfig | None

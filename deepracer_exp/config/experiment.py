@@ -73,7 +73,7 @@ class Experiment:
     """Where updates are computed; cars, cameras and the policy that drives are on the CPU."""
 
     def __post_init__(self) -> None:
-        """Refuse a network that cannot read what is observed."""
+        """Refuse groups that contradict each other, such as a network that cannot read what is observed."""
         if self.teacher is None and self.algorithm.teacher_iterations:
             raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")
         if self.device != "cpu" and self.algorithm.target is not None:

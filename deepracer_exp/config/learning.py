@@ -44,7 +44,7 @@ class CNNConfig:
     """Units of each hidden layer after the convolutions."""
     activation: Literal["tanh", "relu", "elu", "silu"]
     critic: Literal["features", "pictures"]
-    """What the value network sees, `pictures`: the same as the policy; it is of no use to a car that drives."""
+    """What the value network, which only training needs, sees; `pictures`: the same as the policy."""
     shared_trunk: bool
     """One trunk with two heads; only where both see pictures."""
     initial_std: Positive
