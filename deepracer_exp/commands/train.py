@@ -194,7 +194,7 @@ def _resume(args: argparse.Namespace) -> int:
 
     with warnings_on_stderr():
         outcome = resume(run_dir, overrides, Console(stderr=True))
-    print_result(outcome, str(stores.runs_dir))
+    print_result(outcome, str(run_dir.parent.parent) if experiment.tracking.kind == "mlflow" else None)
     return outcome.exit_code
 
 
