@@ -79,7 +79,7 @@ class SweepConfig:
     rerank: Annotated[int, Field(ge=0, le=1000)]
     """Number of the best trials that are evaluated again at the end."""
     rerank_laps: Annotated[int, Field(ge=1, le=4096)]
-    """Trials of that evaluation."""
+    """Trials of that evaluation, on each track and condition."""
     sampler: Sampler
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     """Seed of the sampler."""
