@@ -323,33 +323,48 @@ def rerank(
 
 
 def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s: float) -> list[float]:
-    """Return the bootstrap interval of an objective; trials are resampled within each track and each evaluation.
+    """Return the bootstrap interval of an objective; trials are resampled within evaluation, track and condition.
 
+    The race score counts the laps of all conditions, the other objectives those of the usual ones (`values_of`).
     `trial_time_s` is the longest that a trial of an evaluation may take.
     """
-    groups = [group for one in evaluations for group in one.groups if group.condition == USUAL]
     rng = np.random.default_rng(0)
-    draws = np.mean([_draws(group, objective, trial_time_s, rng) for group in groups], axis=0)
+    counted = [
+        [
+            group
+            for group in one.groups
+            if group.track == track and (objective == "race_score" or group.condition == USUAL)
+        ]
+        for one in evaluations
+        for track in one.tracks
+    ]
+    draws = np.mean([_draws(groups, objective, trial_time_s, rng) for groups in counted], axis=0)
     tail = 100 * (1 - _CONFIDENCE) / 2
     return np.percentile(draws, [tail, 100 - tail]).tolist()
 
 
 def _draws(
-    group: Group, objective: str, trial_time_s: float, rng: np.random.Generator
+    groups: Sequence[Group], objective: str, trial_time_s: float, rng: np.random.Generator
 ) -> "np.ndarray[Any, np.dtype[np.float64]]":
-    """Return the objective's value in each resample, (n,)."""
-    column = {trial: at for at, trial in enumerate(group.trials)}
-    sums = np.zeros((4, len(column)))  # laps tried, complete laps, counted time, progress
-    for attempt in group.decided:
-        time_s = attempt.time_s if objective == "race_score" or attempt.complete else 0.0
-        sums[:, column[attempt.trial]] += (1, attempt.complete, time_s, attempt.progress)
-    drawn = sums[:, rng.integers(len(column), size=(_RESAMPLES, len(column)))].sum(axis=2)
-    tried, laps, time_s, progress = drawn
+    """Return the objective's value on one track in each resample, (n,)."""
+    tried, laps, time_s, progress = np.sum([_resampled(group, objective, rng) for group in groups], axis=0)
     completion = progress / tried
     if objective == "completion":
         return completion
     fallback = np.array([without_lap(one, trial_time_s) for one in completion])
     return np.where(laps > 0, time_s / np.maximum(laps, 1), fallback)
+
+
+def _resampled(
+    group: Group, objective: str, rng: np.random.Generator
+) -> "np.ndarray[Any, np.dtype[np.float64]]":
+    """Return laps tried, complete laps, counted time and progress in each resample of the trials, (4, n)."""
+    column = {trial: at for at, trial in enumerate(group.trials)}
+    sums = np.zeros((4, len(column)))
+    for attempt in group.decided:
+        time_s = attempt.time_s if objective == "race_score" or attempt.complete else 0.0
+        sums[:, column[attempt.trial]] += (1, attempt.complete, time_s, attempt.progress)
+    return sums[:, rng.integers(len(column), size=(_RESAMPLES, len(column)))].sum(axis=2)
 
 
 def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evaluation:
