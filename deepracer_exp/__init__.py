@@ -48,11 +48,11 @@ _MODULES = {
     "tracking.tracker": ("Tracker",),
     "training.trainer": ("Callback", "Trainer", "TrainResult"),
 }
-"""Where the classes are; worker processes import no more than those that classes of the user's own derive from."""
+"""The modules of the classes; a worker process imports only those that the user's own classes derive from."""
 
 
 def __getattr__(name: str) -> Any:
-    # Not before they are asked for: torch takes seconds to import, and the command line answers before that.
+    # Imported on first use: torch takes seconds to import, and the command line need not wait for it.
     if name in __all__:
         module = next((module for module, names in _MODULES.items() if name in names), "api")
         return getattr(import_module(f"deepracer_exp.{module}"), name)

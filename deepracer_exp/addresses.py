@@ -1,6 +1,6 @@
-"""Passwords in addresses of servers and databases: taken out where text comes in, put back where one connects.
+"""Passwords in addresses of servers and databases: removed where text comes in, put back to connect.
 
-Between the two the program knows addresses without passwords only, so that nothing it prints or writes can hold one.
+In between, the program has only addresses without passwords, so that nothing it prints or writes can contain one.
 """
 
 import re
@@ -16,16 +16,16 @@ _PARAMETER = re.compile(r"(?<=[?&])(?:password|passwd|pwd|token|secret)=([^&\s'\
 _USER_INFO = re.compile(r"(?<=://)[^/\s]*@")
 
 _whole: dict[str, str] = {}
-"""Addresses as they were given, by what is left of them without password."""
+"""Addresses as given, by the same address without its password."""
 _secrets: set[str] = set()
-"""Every spelling of the passwords that were taken out."""
+"""Every spelling of the passwords that were removed."""
 
 
 def without_passwords(value: Value) -> Value:
-    """Return a text without the passwords of the addresses in it; mappings and lists with all texts in them.
+    """Return a text, or all texts in a mapping or list, without the passwords of addresses.
 
-    A server's user goes as well (`http://host:5000`), a database's stays (`postgresql://user@host/name`): what is left
-    works wherever the password comes from the environment. `with_password` knows what was taken out.
+    A server's user is removed as well (`http://host:5000`), a database's stays (`postgresql://user@host/name`): what is
+    left works wherever the password comes from the environment. `with_password` puts it back.
     """
     if isinstance(value, str):
         return _ADDRESS.sub(_without_password, value) if "://" in value else value  # type: ignore[return-value]
@@ -37,7 +37,7 @@ def without_passwords(value: Value) -> Value:
 
 
 def with_password(address: str) -> str:
-    """Return an address as it was given to this process, or to the one that it works for."""
+    """Return an address with the password that was given to this process, or to the one that it works for."""
     return _whole.get(address, address)
 
 
@@ -47,13 +47,13 @@ def taken_out() -> dict[str, str]:
 
 
 def take_over(addresses: Mapping[str, str]) -> None:
-    """Know the passwords that another process has taken out."""
+    """Take over the passwords that another process has removed."""
     for address in addresses.values():
         without_passwords(address)
 
 
 def redact(text: str) -> str:
-    """Return what a library said, without passwords: neither known ones nor what looks like one in an address."""
+    """Return a library's message without known passwords, and without what looks like one in an address."""
     for secret in sorted(_secrets, key=len, reverse=True):
         text = text.replace(secret, "***")
     return _PARAMETER.sub("", _USER_INFO.sub("***@", text))
@@ -61,7 +61,7 @@ def redact(text: str) -> str:
 
 def _without_password(found: re.Match[str]) -> str:
     scheme, rest = found.groups()
-    # What the shell or Hydra's grammar has around an address is no part of it.
+    # Quotes and brackets of the shell or of Hydra's grammar are not part of the address.
     address = rest.rstrip("'\"]},")
     around = rest[len(address) :]
     user, password, place = _parts(address)

@@ -57,7 +57,7 @@ def make_env(experiment: ComposedExperiment, n_cars: int = 1, threads: int = 1) 
     Args:
         experiment: chooses track, car, action space, observation, randomization and reward.
         n_cars: cars stepped together.
-        threads: of the physics; 0: one a core.
+        threads: of the physics; 0: one per core.
 
     Raises:
         BadInput: a file of the experiment is missing or malformed, or the reward function cannot be used.
@@ -76,7 +76,7 @@ def train(
     Args:
         experiment: to train.
         callbacks: called beside the standard ones.
-        console: shows the progress; None: nothing is shown.
+        console: for the progress; None: nothing is shown.
 
     Raises:
         BadInput: before anything was started; no folder is left.
@@ -103,7 +103,7 @@ def evaluate(run: str | Path, *overrides: str) -> Evaluation:
 def load_policy(
     run: str | Path, checkpoint: str | None = None, runs_dir: str | Path = "runs"
 ) -> TensorDictModuleBase:
-    """Return a stored policy: a TorchRL module that reads `observation` and writes `action`.
+    """Return a stored policy: a TorchRL module that reads what its network sees of a `RaceEnv` and writes `action`.
 
     It samples actions; within `torchrl.envs.utils.set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the
     most likely one, as evaluations do.
@@ -111,7 +111,7 @@ def load_policy(
     Args:
         run: as for `evaluate`.
         checkpoint: `best`, `last` or the number of an iteration; None: the best, or that of the alias.
-        runs_dir: where runs are looked for.
+        runs_dir: where to look for runs.
 
     Raises:
         BadInput: there is no such run or checkpoint, or it is corrupt.
@@ -133,12 +133,12 @@ class RunTables:
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
-        """One row an iteration, the columns of metrics.jsonl."""
+        """One row per iteration, the columns of metrics.jsonl."""
         return pd.DataFrame(read_metrics(self.path / METRICS))
 
     @cached_property
     def steps(self) -> pd.DataFrame:
-        """One row a control step of the trace, columns `deepracer.recording.STEP_COLUMNS`."""
+        """One row per control step of the trace, columns `deepracer.recording.STEP_COLUMNS`."""
         return read_own_recording(self.path).steps
 
 
@@ -147,7 +147,7 @@ def read_run(run: str | Path, runs_dir: str | Path = "runs") -> RunTables:
 
     Args:
         run: as for `evaluate`.
-        runs_dir: where runs are looked for.
+        runs_dir: where to look for runs.
 
     Raises:
         BadInput: there is no such run, or a file of it cannot be read.

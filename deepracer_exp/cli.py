@@ -28,15 +28,15 @@ Completion in bash or zsh: eval "$(register-python-argcomplete deepracer-exp)"
 """
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _ARRIVES_S = 0.1
-"""By then a signal for the whole process group has reached the child or is pending, and another one changes nothing."""
+"""By then a signal to the whole process group has reached the child or is pending, and another one changes nothing."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130/143 interrupted.
 
     Args:
-        arguments: of the command line, all run in this process; None: those of this process, and reward functions run
-            in a child process.
+        arguments: of the command line, to run in this process; None: those of this process, and a command that runs
+            reward functions does so in a child process.
     """
     args = argparse.Namespace()
     if arguments is None:
@@ -55,7 +55,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
     Raises:
         BadInput: the command or an argument is unknown.
-        SystemExit: help or the version was asked for and printed.
+        SystemExit: help or the version was printed.
     """
     parser = build_parser()
     if "_ARGCOMPLETE" in os.environ:
@@ -107,7 +107,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _call(args: argparse.Namespace) -> int:
-    """Run the command that was asked for and return its exit code."""
+    """Run the parsed command and return its exit code."""
     try:
         code = int(args.command(args))
         sys.stdout.flush()  # an error of writing is raised here, not at interpreter exit
@@ -134,12 +134,12 @@ def _fail(error: Exception, code: int, args: argparse.Namespace) -> int:
 def supervised(call: Callable[[], int]) -> int:
     """Call a function in a child process and return its result, an exit code.
 
-    Reward functions run within a command's process. They can leave it (`os._exit(0)`), crash it or spoil what Python
-    itself needs. Hence an exit code counts only if it comes through a pipe, after the call has returned. A process that
+    Reward functions run within a command's process. They can exit it (`os._exit(0)`), crash it or damage the
+    interpreter. Hence an exit code counts only if it comes through a pipe, after the call has returned. A process that
     ends in another way has failed; one line says so, from a process in which no reward has run.
 
     Args:
-        call: returns 0 to 255; what it raises is the child's own end, with a traceback.
+        call: returns 0 to 255; an exception ends the child with a traceback.
     """
     if not hasattr(os, "fork"):
         return call()
@@ -154,7 +154,7 @@ def supervised(call: Callable[[], int]) -> int:
         die_with_parent()
         if os.getppid() != supervisor:
             os._exit(RunFailed.exit_code)
-        # Python writes the number of each signal it gets there.
+        # Python writes the number of each signal it receives into this pipe.
         os.set_blocking(hears, False)
         signal.set_wakeup_fd(hears, warn_on_full_buffer=False)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
@@ -173,7 +173,7 @@ def supervised(call: Callable[[], int]) -> int:
         signal.signal(signum, pass_on)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    # Not until its end: a process that the child has forked may still hold the pipe.
+    # Without blocking: a process that the child has forked may still hold the pipe open.
     os.set_blocking(results, False)
     with contextlib.suppress(BlockingIOError):
         received = os.read(results, 1)

@@ -1,4 +1,4 @@
-"""The two ways a command ends badly, their exit codes, the boundary around what a user gave, and words of messages."""
+"""The two errors that end a command, their exit codes, guards around user input, and helpers for messages."""
 
 import difflib
 from collections.abc import Iterable, Iterator
@@ -27,11 +27,11 @@ class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise 
 
 @contextmanager
 def reading(what: object, accepted: str = "") -> Iterator[None]:
-    """Turn whatever goes wrong while a user's value or file is read, composed or built into `BadInput`.
+    """Turn any error while a user's value or file is read, composed or built into `BadInput`.
 
     Args:
         what: the key with its value, or the file.
-        accepted: what would be, for the message.
+        accepted: what would be accepted, for the message.
 
     Raises:
         BadInput: one line with `what`, the reason and what would be accepted.
@@ -40,7 +40,7 @@ def reading(what: object, accepted: str = "") -> Iterator[None]:
         yield
     except (BadInput, RunFailed):
         raise
-    except Exception as error:  # what a value or a file can bring about in a library has no end
+    except Exception as error:  # a library can raise anything for a bad value or file
         hint = f"; accepted: {accepted}" if accepted else ""
         raise BadInput(f"{what}: {_reason(error)}{hint}") from error
 
@@ -49,9 +49,13 @@ def reading(what: object, accepted: str = "") -> Iterator[None]:
 def writing(
     what: object, accepted: str = "", failure: type[Exception] = BadInput, also: type[Exception] = OSError
 ) -> Iterator[None]:
-    """Turn an OSError, and what else is named, while a file is written into `BadInput` or another failure.
+    """Turn an OSError while a file is written into `BadInput` or another failure.
 
-    `what` and `accepted` are those of `reading`.
+    Args:
+        what: as for `reading`.
+        accepted: as for `reading`.
+        failure: raised in its place.
+        also: another error to turn.
     """
     try:
         yield
@@ -77,7 +81,7 @@ def _reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"cannot be read: {error.strerror}"
     mark = getattr(error, "problem_mark", None)
-    if mark is not None:  # YAML's errors have several lines, most of which say where
+    if mark is not None:  # a YAML error has several lines, most of them about the position
         return f"{getattr(error, 'problem', None)} in line {mark.line + 1}"
     if type(error).__module__ != "builtins" or isinstance(error, ValueError | OSError | RuntimeError):
         return str(error) or type(error).__name__
@@ -85,7 +89,7 @@ def _reason(error: Exception) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Return a text without line breaks and control characters, the middle left out of a very long one."""
+    """Return a text without line breaks and control characters; a very long one without its middle."""
     line = "".join(
         letter if letter.isprintable() else repr(letter)[1:-1] for letter in " ".join(text.split())
     )
@@ -103,7 +107,7 @@ def count(number: int, what: str) -> str:
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return `` (did you mean X?)`` for the known word nearest to `word`, or an empty string.
 
-    A word that begins with it is nearest, then one that looks like it, and then one that holds it.
+    A word that begins with it is nearest, then one that looks like it, then one that contains it.
     """
     words, lower = list(known), word.casefold()
     long = len(word) > 2

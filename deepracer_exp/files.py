@@ -1,4 +1,4 @@
-"""Files that users give, read with limits (regular files alone), and files written atomically."""
+"""User files read with limits (regular files only), and files written atomically."""
 
 import contextlib
 import json
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Content = TypeVar("Content")
 
 SETTINGS_BYTES = 2**20
-"""Of a file that people write: YAML, JSON, a reward function. None comes near it; a larger one is another file."""
+"""Of a hand-written file: YAML, JSON, a reward function. None comes near it; a larger file is something else."""
 ROUTE_BYTES = 2**21
 """Of a route: more than 40,000 rows, a hundred times the longest of the service."""
 RECORD_BYTES = 2**30
@@ -47,11 +47,11 @@ def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes
 
     Args:
         path: of the file.
-        accepted: what would be, for messages.
+        accepted: what would be accepted, for messages.
         most_bytes: that a file of its kind can have.
 
     Raises:
-        BadInput: it is not there, no regular file (a pipe or a device never ends), larger, or cannot be read.
+        BadInput: it is missing, not a regular file (a pipe or a device never ends), larger, or cannot be read.
     """
     with reading(path, accepted):
         found = Path(path).stat()
@@ -63,7 +63,7 @@ def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes
 
 
 def read_bytes(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> bytes:
-    """Return what a file holds; arguments and errors as of `open_user_file`."""
+    """Return the bytes of a file; arguments and errors as for `open_user_file`."""
     with open_user_file(path, accepted, most_bytes) as file, reading(path, accepted):
         raw = file.read(most_bytes + 1)
     _check_size(path, len(raw), accepted, most_bytes)
@@ -71,7 +71,7 @@ def read_bytes(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES
 
 
 def read_text(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> str:
-    """Return the text of a file in UTF-8; arguments and errors as of `open_user_file`."""
+    """Return the text of a file in UTF-8; arguments and errors as for `open_user_file`."""
     raw = read_bytes(path, accepted, most_bytes)
     with reading(path, accepted):
         # Editors on Windows put a byte order mark at the beginning.
@@ -83,8 +83,8 @@ def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
 
     Args:
         path: of the file.
-        accepted: what would be, for messages.
-        raw: its bytes where they are known: of a member of an archive, or taken out of a log.
+        accepted: what would be accepted, for messages.
+        raw: its bytes where they are known: of a member of an archive, or a part of a log.
 
     Raises:
         BadInput: it cannot be read, is too large, or not JSON.
@@ -102,13 +102,13 @@ def read_yaml(
 
     Args:
         path: of the file.
-        accepted: what would be, for messages.
-        load: turns the text into something else than plain values.
+        accepted: what would be accepted, for messages.
+        load: parses the text; None: into plain values.
         raw: its bytes where they are known.
 
     Raises:
-        BadInput: it cannot be read, is too large, not YAML, holds itself, or has more values, aliases counted each
-            time, or more levels than a hand-written file.
+        BadInput: it cannot be read, is too large, not YAML, contains itself, or has more values (each alias counted in
+            full) or more levels than a hand-written file.
     """
     raw = read_bytes(path, accepted) if raw is None else raw
     _check_size(path, len(raw), accepted, SETTINGS_BYTES)
@@ -141,7 +141,7 @@ def read_yaml_as(path: str | Path, adapter: "TypeAdapter[Content]", accepted: st
     Args:
         path: of the file.
         adapter: of the dataclass.
-        accepted: what would be, for messages.
+        accepted: what would be accepted, for messages.
 
     Raises:
         BadInput: the file cannot be read or holds something else.
@@ -165,13 +165,13 @@ def _validated(path: str | Path, raw: bytes, adapter: "TypeAdapter[Content]", ac
 
 def atomic_write(path: Path, content: str | bytes) -> Path:
     """Write a file completely or not at all; of several processes that write it at once, the last one wins."""
-    # Each in a file of its own: what another process moved into place would be missing here.
+    # Each process writes a temporary file of its own: a shared one could be moved away by another process.
     aside = path.with_name(f".{uuid.uuid4().hex}.tmp")
     try:
         aside.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
         return aside.replace(path)
     except BaseException:
-        # A disk that takes no file may refuse to delete one as well.
+        # A disk that refuses a file may refuse to delete one as well.
         with contextlib.suppress(OSError):
             aside.unlink(missing_ok=True)
         raise
@@ -183,7 +183,7 @@ def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> 
 
 
 def _check_structure(text: str) -> None:
-    """Refuse what would not come to an end: a few lines of aliases can stand for billions of values."""
+    """Refuse what would take forever to build: a few lines of aliases can stand for billions of values."""
     known: dict[str, tuple[int, int]] = {}
     open_nodes: list[list[Any]] = [[None, 0, 0]]  # anchor, values and levels of each that is open
     for event in yaml.parse(text, _LOADER):

@@ -2,8 +2,8 @@
 
 The owner alone holds the writing end of a pipe, and what it started holds the reading end. When the owner is gone, its
 end is closed, and the kernel kills the process at the other end at once, even one that hangs or is stopped (fcntl(2),
-F_SETSIG and F_SETOWN: Linux only; elsewhere a thread waits for the owner). PR_SET_PDEATHSIG would ask who forked a
-process: of a worker that is a fork server, which its workers keep alive.
+F_SETSIG and F_SETOWN: Linux only; elsewhere a thread waits for the owner). PR_SET_PDEATHSIG alone would not do: it
+watches the process that forked, which for a worker is a fork server that its workers keep alive.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ def kill_when_closed(pipe: int, target: int) -> None:
     """Have a process killed once the writing end of a pipe is closed.
 
     Args:
-        pipe: reading end, which has been read to the end; the target must keep it open.
+        pipe: reading end, with nothing left to read; the target must keep it open.
         target: id of the process; negative: of a process group, all of which is killed.
     """
     fcntl.fcntl(pipe, fcntl.F_SETOWN, target)
