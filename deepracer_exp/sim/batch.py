@@ -79,7 +79,7 @@ class CarBatch:
         self._set_pose(rows, np.asarray(x_m, np.float64), np.asarray(y_m, np.float64), yaw_rad)
 
     def move(self, ids: ArrayLike, pose: Floats, motion: Floats) -> None:
-        """Put cars elsewhere in motion; wheel turns and steering angles stay as they are.
+        """Give cars another pose and motion; speeds of the wheels and steering angles stay as they are.
 
         Args:
             ids: distinct indices of cars, (n,).
@@ -114,7 +114,7 @@ class CarBatch:
         return np.stack([self._drives["ahead_mps2"][:, 0], self._drives["left_mps2"][:, 0]], axis=1)
 
     def lift(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
-        """Put cars at rest as `place` does, but keep where their front wheels stand and what was sent to them."""
+        """Put cars at rest as `place` does, but keep their steering angles and last steering commands."""
         rows = np.asarray(ids, np.intp)
         kept = {name: self._drives[name][rows] for name in ("steering_rad", "sent_steering_rad")}
         self.place(rows, x_m, y_m, yaw_rad)

@@ -103,7 +103,7 @@ def _take(  # type: ignore[no-untyped-def]
 ):
     """Take the pictures."""
     cars, channels, height, width = out.shape
-    # The rows beyond the picture take what edges at its bottom leave to those below.
+    # Edges at the bottom of the picture also change the rows below it, which are not drawn.
     changes = np.zeros((channels, (height + 3) * width), np.float32)
     running = np.empty(width, np.float32)
     change = np.empty(channels, np.float32)
@@ -111,7 +111,7 @@ def _take(  # type: ignore[no-untyped-def]
     middle_x, middle_y = 0.5 * width, 0.5 * height
     for car in range(cars):
         focal = mounts[car, 4]
-        # Of the planes through the picture's left and right edges: normal's share along the axis and across.
+        # Of the planes through the picture's left and right edges: the normal's parts along the axis and across.
         side_axis = middle_x / np.hypot(middle_x, focal)
         side_across = focal / np.hypot(middle_x, focal)
         eye, axis, sideways, downwards = _camera(poses[car], mounts[car], rotation)
@@ -299,8 +299,8 @@ def _take_boxes(poses, boxes, corners, mounts, out):  # type: ignore[no-untyped-
 def _may_hide(corners, others, eye, nearer):  # type: ignore[no-untyped-def]
     """Return whether a box may hide a part of another, given their corners on the floor.
 
-    If the line of a side parts them, only the one on the side of the eye can hide the other. `nearer` is the answer for
-    boxes that stand in each other.
+    If the line of a side separates them, only the one on the side of the eye can hide the other. `nearer` is the answer
+    for boxes that overlap.
     """
     apart = False
     for side in range(4):
@@ -366,7 +366,7 @@ def _add_edge(changes, height, width, ax, ay, bx, by, change):  # type: ignore[n
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
 def _add_flat(changes, height, width, ax, ay, bx, slope, sign, change):  # type: ignore[no-untyped-def]
-    """Add an edge column by column; in one it crosses two rows at most. No branches: they could not be foreseen."""
+    """Add an edge column by column; in one it crosses two rows at most. No branches: they would be mispredicted."""
     bottom = np.float64(height)
     for column in range(int(ax), int(np.ceil(bx))):
         begin, end = max(ax, np.float64(column)), min(bx, column + 1.0)

@@ -13,8 +13,8 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """The order of the wheels in everything that is per wheel."""
 STEERED = WHEELS[:2]
 
-# What this model has none of. AUTORESET is off so that a blown-up state stays visible instead of being
-# replaced by the initial one.
+# Features that this model does not use. AUTORESET is off so that a blown-up state stays visible instead of
+# being replaced by the initial one.
 _DISABLED = (
     mujoco.mjtDisableBit.mjDSBL_AUTORESET
     | mujoco.mjtDisableBit.mjDSBL_ISLAND
@@ -31,7 +31,7 @@ _DARK_RGBA = (0.08, 0.08, 0.09, 1.0)
 _RIM_RGBA = (0.75, 0.75, 0.78, 1.0)
 
 PHYSICS_GROUP = 3
-"""Geom group of what cars touch with, hidden by MuJoCo's renderer; the visual geoms are in group 0."""
+"""Geom group of the outline, hidden by MuJoCo's renderer; the visual geoms are in group 0."""
 
 
 class WheelPlace(NamedTuple):
@@ -61,7 +61,7 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     Args:
         car: the car's dimensions and masses.
         visual: for films, also give the car a shell, a camera housing and wheels that steer and spin, and add a
-            light. For pictures of given poses, not to simulate.
+            light. For pictures of given poses, not for simulation.
     """
     spec = mujoco.MjSpec()
     spec.modelname = car.name
@@ -78,7 +78,7 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     chassis.ipos = [car.com_x_m, 0, car.com_z_m]
     chassis.inertia = car.inertia_kgm2
     chassis.explicitinertial = True
-    # What cars, boxes and walls touch.
+    # The outline that something else could touch; nothing does, the model has no contacts.
     middle_x = 0.5 * (car.front_axle_x_m + car.rear_axle_x_m)
     half = [0.5 * car.body_length_m, 0.5 * car.body_width_m, car.wheel_radius_m]
     chassis.add_geom(
@@ -132,7 +132,7 @@ def _add_visuals(spec: mujoco.MjSpec, chassis: mujoco.MjsBody, car: CarConfig) -
         if place.name in STEERED:
             wheel.add_joint(name=f"{place.name}_steer", type=hinge, axis=[0, 0, 1])
         wheel.add_joint(name=f"{place.name}_spin", type=hinge, axis=[0, 1, 0])
-        # MuJoCo asks for a mass of what moves.
+        # MuJoCo requires a mass of every moving body.
         wheel.mass, wheel.inertia, wheel.explicitinertial = 1e-3, [1e-6, 1e-6, 1e-6], True
         size = (car.wheel_radius_m, 0.5 * car.wheel_width_m, 0)
         _add_visual(wheel, f"{place.name}_tyre", cylinder, (0, 0, 0), size, _DARK_RGBA, across)

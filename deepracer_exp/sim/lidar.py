@@ -11,7 +11,7 @@ from .scenery import box_corners
 
 RAYS = 64
 ANGLES_RAD = np.linspace(-2.61799, 2.61799, RAYS)
-"""From the sensor's middle direction, to the right first (this and the next three: deepracer-simapp,
+"""From the sensor's middle direction, the rightmost first (these numbers and the next two: deepracer-simapp,
 `bundle/markov/sensors/constants.py`)."""
 NEAREST_M, FURTHEST_M = 0.15, 12.0
 SCANS_PER_S = 10
@@ -25,7 +25,7 @@ class Walls(NamedTuple):
 
     Attributes:
         segments_m: ends ax, ay, bx, by, (S, 4).
-        first: of each group, and the number of all segments, (groups + 1,).
+        first: index of each group's first segment, then the number of all segments, (groups + 1,).
     """
 
     segments_m: NDArray[np.float64]
@@ -33,7 +33,7 @@ class Walls(NamedTuple):
 
 
 def join_walls(groups: Sequence[NDArray[np.float64]]) -> Walls:
-    """Return groups of segments, (n, 4) each, none of which need have any."""
+    """Join groups of segments, (n, 4) each; a group may be empty."""
     return Walls(np.concatenate([np.empty((0, 4)), *groups]), np.cumsum([0, *(len(some) for some in groups)]))
 
 
@@ -45,7 +45,7 @@ def ring_walls(ring: NDArray[np.float64]) -> NDArray[np.float64]:
 def box_sides(boxes: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the sides of boxes (N, boxes, 6 or more), see `camera.take_pictures`, as segments (N, 4 * boxes, 4).
 
-    Those of boxes that are not higher than the sensor are NaN, which no ray hits.
+    Sides of boxes no higher than the sensor are NaN, which no ray hits.
     """
     corners = box_corners(boxes.astype(np.float64))
     corners[boxes[..., 5] <= MOUNT_Z_M] = np.nan
@@ -58,13 +58,13 @@ def scan(
     group: NDArray[np.intp],
     beside: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the distances along each of the rays, (N, RAYS), metres; infinite where nothing is hit.
+    """Return the distance along each ray, (N, RAYS), metres; infinite where nothing is hit.
 
     Args:
         walls: what reflects.
         poses: x and y in metres and direction in radians of each sensor, (N, 3).
-        group: of the walls that each sensor sees, (N,).
-        beside: segments that each sees as well, (N, segments, 4); None: there are none.
+        group: index of the group of walls that each sensor sees, (N,).
+        beside: segments that each sensor sees as well, (N, segments, 4); None: there are none.
     """
     out = np.empty((len(poses), RAYS))
     _scan(

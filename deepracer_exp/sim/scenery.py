@@ -52,7 +52,7 @@ DASHES_UNTIL_M = 2.0
 """Distance from which dashes run together: a row of the picture sees more than one of them."""
 
 CURVES_UNTIL_M, COARSE_M = 4.0, 0.004
-"""Beyond this distance outlines are drawn with fewer points, which lie off by so much at most: an eighth of a pixel."""
+"""Beyond the first, outlines are drawn with fewer points, off by the second at most: an eighth of a pixel."""
 
 PIECE = np.dtype(
     [
@@ -60,14 +60,14 @@ PIECE = np.dtype(
         ("last", "i4"),
         ("inside", "i4"),
         ("outside", "i4"),
-        # It is drawn by cameras that are so far from its middle.
+        # A circle around the points; cameras draw them from `near_m` to `far_m` from its middle.
         ("middle_m", "f4", 2),
         ("radius_m", "f4"),
         ("near_m", "f4"),
         ("far_m", "f4"),
     ]
 )
-"""Some consecutive points of an outline: the materials to its left (`inside`) and right seen from above."""
+"""Some consecutive points of an outline, with the materials to its left (`inside`) and right, seen from above."""
 
 
 class Scenery(NamedTuple):
@@ -77,7 +77,7 @@ class Scenery(NamedTuple):
         points_m: (P, 3), float32.
         joined: whether a line leads from the point before to this one, (P,).
         pieces: `PIECE` records.
-        first_piece: of each track, and the number of all pieces, (tracks + 1,).
+        first_piece: index of each track's first piece, then the number of all pieces, (tracks + 1,).
     """
 
     points_m: NDArray[np.float32]

@@ -3,7 +3,7 @@
 A tyre resists slip, the velocity of its contact point over the floor, along and across the wheel separately: in
 proportion to a small slip, and with no more than friction times load. In the simulator of the service the directions
 of friction are fixed to the turning wheel (deepracer-simapp, urdf/deepracer/racecar.gazebo: `fdir1`), so that the
-friction along and across the floor comes and goes with the cosine of the wheel's turn. `_grip` is the mean over a turn.
+friction along and across the floor varies with the cosine of the wheel's rotation. `_grip` is the mean over a rotation.
 
 The forces are those of the end of the step (implicit Euler), so that stiff tyres are stable at any step.
 """
@@ -57,7 +57,7 @@ DRIVE = np.dtype(
         ("wheel_mps", "f8", 4),
     ]
 )
-"""What changes while a car drives: front wheels without trim, last command, acceleration, speeds of the rims."""
+"""What changes while a car drives: steering angle without trim, last command, acceleration, speeds of the rims."""
 
 Cars = NDArray[np.void]
 
@@ -90,7 +90,7 @@ def car_record(car: CarConfig) -> Cars:
 def _grip(stiffness, limit, slip):  # type: ignore[no-untyped-def]
     """Return the force of a tyre per slip velocity, N s/m, along or across the wheel.
 
-    The mean of min(stiffness * slip, limit * |cos(turn)|) over a turn of the wheel, divided by slip.
+    The mean of min(stiffness * slip, limit * |cos(angle)|) over a rotation of the wheel, divided by slip.
     """
     if limit <= 0.0:
         return 0.0
@@ -104,23 +104,23 @@ def _grip(stiffness, limit, slip):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ignore[no-untyped-def]
-    """Return the force of the floor on one car during a physics step; its wheels' speeds go along.
+    """Return the force of the floor on one car during a physics step, and update the speeds of its wheels.
 
     Args:
         car: a `CAR` record.
-        drive: its `DRIVE` record; `wheel_mps` and accelerations are brought to the end of the step.
+        drive: its `DRIVE` record; `wheel_mps` and accelerations are advanced to the end of the step.
         ahead_mps: velocity of the centre of mass along the heading.
-        left_mps: the same across.
+        left_mps: the same to the left.
         rate_radps: yaw rate.
         dt_s: length of the step.
 
     Returns:
-        Force ahead and to the left at the centre of mass, N, and torque about it, N m. The velocity that they lead to
-        at the end of the step is the one that they belong to.
+        Force ahead and to the left at the centre of mass, N, and torque about it, N m: those of the velocity that they
+        lead to at the end of the step.
     """
     front_m, rear_m = car.axle_x_m[0] - car.com_x_m, car.com_x_m - car.axle_x_m[1]
     base_m = front_m + rear_m
-    # Load: at rest, and what acceleration along and across moves at the height of the centre of mass.
+    # Load: at rest, plus what acceleration ahead and to the left shifts at the height of the centre of mass.
     shifted_n = car.mass_kg * drive.ahead_mps2 * car.com_z_m / base_m
     tilted_n = 0.25 * car.mass_kg * drive.left_mps2 * car.com_z_m
     angle = drive.steering_rad + car.steering_trim_rad
@@ -158,7 +158,7 @@ def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ign
             motor, motor_n = 0.0, np.copysign(car.motor_n, motor_n)
         else:
             motor_n = motor * target_mps
-        # The rim's speed at the end of the step, as a line over the floor's: free + share * floor.
+        # The rim's speed at the end of the step, linear in the floor's: free + share * floor.
         total = wheel_kg_per_s + motor + along
         free_mps, share = (wheel_kg_per_s * rim_mps + motor_n) / total, along / total
         push, drag = along * free_mps, along * (1.0 - share)
@@ -196,9 +196,18 @@ def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ign
 
 @njit(cache=True)
 def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignore[no-untyped-def]
-    """Bring the command that a car's motors and steering follow to physics step `step` of `steps` of a control period.
+    """Advance a car's steering and the command that its motors follow by physics step `step` of a control period's.
 
-    A command takes effect after the car's delay; in the step in which that is, in part.
+    A command takes effect after the car's delay: in part in the physics step in which the delay ends.
+
+    Args:
+        car: a `CAR` record.
+        drive: its `DRIVE` record, changed in place.
+        speed_mps: commanded.
+        steering_rad: commanded.
+        step: number of the physics step in the control period, from 0.
+        steps: physics steps in a control period.
+        dt_s: length of a physics step.
     """
     arrived = min(max(step + 1 - car.speed_delay * steps, 0.0), 1.0)
     drive.sent_speed_mps += arrived * (speed_mps - drive.sent_speed_mps)
@@ -213,7 +222,7 @@ def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignor
 
 @njit(cache=True)
 def push_cars(cars, drives, yaw_rad, velocity, commands, step, steps, dt_s, forces):  # type: ignore[no-untyped-def]
-    """Find the forces on all cars for one physics step of a control period.
+    """Compute the forces on all cars for one physics step of a control period.
 
     Args:
         cars: `CAR` records, (N,).

@@ -143,7 +143,7 @@ def test_positive_steering_turns_left_and_negative_as_much_to_the_right(name, sp
 
 
 @pytest.mark.parametrize("name", VERSIONS)
-def test_the_car_gets_round_the_tightest_corner_of_a_course(name):
+def test_the_car_gets_around_the_tightest_corner_of_a_course(name):
     # 0.7 m radius at 1 m/s.
     cars = CarBatch(CARS[name], 1, 1)
     drive(cars, 1.0, 0.0, 15)
@@ -181,7 +181,7 @@ def test_a_moved_car_continues_from_its_new_place_with_its_new_motion():
     after = drive(cars, 1.0, 10.0, 10)
     dx, dy = after.x_m - placed.x_m, after.y_m - placed.y_m
     turned = (np.cos(turn) * dx[0] - np.sin(turn) * dy[0], np.sin(turn) * dx[0] + np.cos(turn) * dy[0])
-    # The acceleration that shifts the load, and the wheels, are those of before.
+    # The acceleration that shifts the load, and the speeds of the wheels, are those from before.
     np.testing.assert_allclose(turned, (dx[1], dy[1]), atol=2e-3)
 
 

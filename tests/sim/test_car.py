@@ -70,7 +70,7 @@ def test_the_model_turns_about_its_centre_of_mass(car):
     assert data.qvel == pytest.approx([0.0, 0.0, 3.0], abs=1e-12)
 
 
-def test_the_car_to_look_at_has_wheels_that_steer_and_spin(car):
+def test_the_car_in_films_has_wheels_that_steer_and_spin(car):
     model = build_spec(car, visual=True).compile()
     names = [model.joint(number).name for number in range(model.njnt)]
     assert names[:3] == ["x", "y", "yaw"]

@@ -33,7 +33,7 @@ def energy_j(cars: CarBatch) -> np.ndarray:
     limit=st.floats(0.01, 100),
     slip=st.floats(-20, 20).filter(lambda v: abs(v) > 1e-6),
 )
-def test_a_tyres_force_is_the_mean_over_a_turn_of_the_wheel(stiffness, limit, slip):
+def test_a_tyres_force_is_the_mean_over_a_rotation_of_the_wheel(stiffness, limit, slip):
     turn = (np.arange(20_000) + 0.5) / 20_000 * np.pi / 2
     mean = np.minimum(stiffness * abs(slip), limit * np.cos(turn)).mean()
     assert _grip(stiffness, limit, slip) * abs(slip) == pytest.approx(mean, rel=1e-4)
@@ -56,7 +56,7 @@ def test_a_car_without_grip_is_not_moved():
 
 
 @pytest.mark.parametrize("motion", [(3.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 20.0), (2.0, -2.0, 8.0)])
-def test_a_car_that_is_told_to_stand_loses_its_energy_and_stays(motion):
+def test_a_car_commanded_to_stand_loses_its_energy_and_stays(motion):
     cars = CarBatch(CAR, 1, 1)
     cars.move([0], np.zeros((1, 3)), np.array([motion]))
     energies = [energy_j(cars)[0]]
