@@ -32,12 +32,12 @@ _BOUNDS = {"observation": (-np.inf, np.inf), "pixels": (0, 255), "lidar": (0, FU
 
 
 class DeepRacerEnv(gym.Env[Observed, Any]):
-    """One car; with several tracks, every episode is on another one, by their weights.
+    """One car; with several tracks, its episodes are distributed over them by their weights.
 
-    Observation: the features of `Features`, float32; with a camera or a LIDAR only its pictures, uint8, or readings,
-    float32; with both a dictionary of `pixels` and `lidar`. Action: an index into the
-    action space's list, or steering and speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of
-    the pose before the step.
+    Observation: the features of `Features`, float32; with a camera or a LIDAR, instead, its pictures, uint8, or
+    readings, float32; with both, a dictionary of `pixels` and `lidar`. Action: an index into the action space's list,
+    or steering and speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of the pose before the
+    step.
     """
 
     def __init__(self, overrides: Sequence[str] = ()):

@@ -25,9 +25,9 @@ from deepracer_exp.tracks.track import Track
 from .randomization import CarStreams, Ids, Purpose
 
 _NOISE_NUMBERS = 2**16
-"""Standard normal numbers that all scans take their noise from: drawing each would take longer than the scan."""
+"""Standard normal numbers that all scans take their noise from: drawing new ones would take longer than the scan."""
 _NEXT_SCAN = 7919
-"""Numbers by which the noise of successive scans is apart."""
+"""Offset between the noise of successive scans, in these numbers."""
 
 Readings = NDArray[np.float32]
 
@@ -44,10 +44,10 @@ class Lidar:
         """Set up the walls; call `seed` and then `begin` next.
 
         Args:
-            config: what is read of a scan.
-            tracks: of each course one.
+            config: how a scan is read.
+            tracks: one per course.
             cars: their numbers over all processes.
-            period_s: of control.
+            period_s: control period.
         """
         self._config, self._cars = config, list(cars)
         rings = [None if track.floor.walls_height_m < MOUNT_Z_M else wall_ring(track) for track in tracks]
@@ -77,7 +77,7 @@ class Lidar:
             self._noise_at[car] = self._streams.at(car, episode).integers(_NOISE_NUMBERS)
 
     def read(self, ids: Ids, state: CarState, course: NDArray[np.intp], steps: NDArray[np.int64]) -> Readings:
-        """Return what new scans of the cars `ids` read, (n, size).
+        """Return the readings of new scans by the cars `ids`, (n, size).
 
         Args:
             ids: indices of the cars, (n,).
@@ -107,16 +107,16 @@ class Lidar:
         steps: NDArray[np.int64],
         dropped: NDArray[np.bool_] | None,
     ) -> Readings:
-        """Return what all cars read after `before`, (N, size): a new scan, or the same until there is one.
+        """Return the readings of all cars after `before`, (N, size): of a new scan, or the same until there is one.
 
         Args:
-            before: (N, size).
+            before: readings of the step before, (N, size).
             state: arrays (N,).
             course: index of each car's track, (N,).
             steps: control steps of each car's episode, (N,).
             dropped: cars that see nothing new, (N,); None: there are none.
         """
-        # A step is 2/3 of a scan; the margin is for rounding.
+        # At 15 Hz a step is 2/3 of a scan; the margin is for rounding.
         scans = np.floor(self._scans_per_step * np.stack([steps, steps - 1]) + 1e-6)
         same = scans[0] == scans[1]
         if dropped is not None:
@@ -128,8 +128,8 @@ class Lidar:
 def readings(config: LidarConfig, distances_m: NDArray[np.float64]) -> Readings:
     """Return scans (n, RAYS) as the policy sees them, (n, size).
 
-    `plain`: the distances, clipped. Otherwise the nearest of each sector, as one of `values_per_sector` equal steps up
-    to the furthest distance, of which the one it is in is 1; all are 0 where there is nothing nearer (deepracer-simapp,
+    `plain`: the distances, clipped. Otherwise one-hot for each sector: which of `values_per_sector` equal steps up to
+    the furthest distance the nearest thing is in; all 0 where there is nothing nearer than that (deepracer-simapp,
     `bundle/markov/filters/observation/observation_sector_discretize_filter.py`).
     """
     furthest_m = config.furthest_m
@@ -146,7 +146,7 @@ def readings(config: LidarConfig, distances_m: NDArray[np.float64]) -> Readings:
 def reach_of_rays(config: LidarConfig, seen: Readings) -> NDArray[np.float64]:
     """Return how far each ray got, metres, (n, RAYS), from what the policy sees, (n, size); NaN: nothing was there.
 
-    With sectors all rays of one end where the step of its nearest thing does.
+    All rays of a sector get as far as the end of the step that its nearest thing is in.
     """
     furthest_m = config.furthest_m
     if config.kind == "plain":

@@ -11,7 +11,7 @@ from .state import Measures
 
 
 class ObservationPart:
-    """Features of your own, after ours; without memory, because a resumed run builds it again.
+    """Features of your own, appended to ours; it keeps no state, because a resumed run builds it again.
 
     Attributes:
         names: of its features, in their order.
@@ -31,7 +31,7 @@ class ObservationPart:
 
 
 def build_parts(config: ObservationConfig) -> tuple[ObservationPart, ...]:
-    """Build the parts of the user's own.
+    """Build the user's own parts.
 
     Raises:
         BadInput: a class cannot be used.
@@ -43,7 +43,7 @@ def feature_names(config: ObservationConfig) -> tuple[str, ...]:
     """Return the names of the features, in their order.
 
     Raises:
-        BadInput: a part of the user's own cannot be used.
+        BadInput: one of the user's own parts cannot be used.
     """
     return _names(config, build_parts(config))
 
@@ -52,7 +52,7 @@ def observation_shape(config: ObservationConfig) -> ObservationShape:
     """Return the shape of what is observed.
 
     Raises:
-        BadInput: a part of the user's own cannot be used.
+        BadInput: one of the user's own parts cannot be used.
     """
     return ObservationShape(
         len(feature_names(config)),

@@ -1,4 +1,4 @@
-"""Pictures that differ from episode to episode: light, colours, sharpness, noise, the camera and what stands around."""
+"""Pictures that differ from episode to episode: light, colours, sharpness, noise, the camera, objects by the road."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -19,21 +19,22 @@ _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
 _LENS = _COLUMN["lens_k1"]
 _OFF = np.array([1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES])
 _FIRST_QUANTITIES, _FIRST_MATERIALS = 10, 8
-"""What came later is drawn after all else, so that it changes no draw of runs that do without; the lens, which came
-after the objects, whose draws are of no fixed number, has streams of its own."""
+"""Quantities and materials added later are drawn after everything else, so that they change no earlier draw. The lens
+was added after the objects, which draw a varying number of values, and so has streams of its own."""
 _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""
 _DIRT_SPOTS, _DIRT_SIZE = 4, (0.015, 0.06)
 """Of dirt: their number, and standard deviation as a share of the picture's width."""
 _OBJECT_LOW_M, _OBJECT_HIGH_M = np.array([0.1, 0.1, 0.1]), np.array([0.6, 0.6, 0.9])
-"""Length, width and height of objects: not higher than walls."""
+"""Length, width and height of objects: lower than the default walls."""
 _PLACES, _CLEARANCE_M, _BESIDE_M = 256, 0.05, 1.6
-"""Of objects: places per track, distance from road and walls at least, from the border at most."""
+"""Of objects: places per track, least distance from road and walls, largest distance from the border."""
 _NOISE_NUMBERS = 2**18
-"""Standard normal numbers that all pictures take their noise from: drawing each would take longer than the picture."""
+"""Standard normal numbers that all pictures take their noise from: drawing new ones would take longer than the
+picture."""
 _NEXT_PICTURE = 7919
-"""Numbers by which the noise of successive pictures is apart."""
+"""Offset between the noise of successive pictures, in these numbers."""
 
 Floats = NDArray[np.float64]
 
@@ -62,10 +63,10 @@ class PictureRandomization:
         n_cars = len(self._cars)
         self._values = np.tile(_OFF, (n_cars, 1))
         self._color_factor = np.ones((n_cars, len(MATERIALS), 3))
-        # Depth (negative: a shadow), and middle and size as shares of the width.
+        # Depth (negative: a shadow), middle as shares of width and height, and size as a share of the width.
         self._spot = np.zeros((n_cars, 4))
         self._noise_at = np.zeros(n_cars, np.int64)
-        # Middle and size as shares of the width (or height).
+        # Middle as shares of width and height, and size as a share of the width.
         self._dirt = np.zeros((n_cars, _DIRT_SPOTS, 3))
         most = int(ranges[:, _COLUMN["objects"], 1].max())
         self._span[:, _COLUMN["objects"]] += 1  # 0, 1 and 2 objects are equally probable
@@ -103,7 +104,7 @@ class PictureRandomization:
                 self._place_objects(car, objects, self._places[track])
 
     def _place_objects(self, car: int, objects: Floats, places: Floats) -> None:
-        """Set the car's boxes from uniform draws (n, 8); those that would stand in others are left out."""
+        """Set the car's boxes from uniform draws (n, 8); those that would overlap others are left out."""
         boxes = self._boxes[car]
         boxes[:] = 0
         taken = np.empty((0, 3))
@@ -119,7 +120,7 @@ class PictureRandomization:
         boxes[: len(objects), 6:] = self._exposed(np.array([car]), 255 * objects[None, :, 5:])[0]
 
     def mounts(self, ids: Ids, mount: Floats) -> Floats:
-        """Return the mounts (n, 5) of cameras that `camera.Lens.mount` describes, (5,)."""
+        """Return the randomized mounts (n, 5) of the cars' cameras, given the lens's `camera.Lens.mount`, (5,)."""
         out = np.tile(mount, (len(ids), 1))
         out[:, 2] += self._of("height_m", ids)
         out[:, 3] += np.radians(self._of("pitch_deg", ids))
@@ -145,7 +146,7 @@ class PictureRandomization:
     def disturb(self, ids: Ids, pictures: NDArray[np.uint8], steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Add the lens's distortion, dirt, light, blur and noise to pictures (n, channels, height, width).
 
-        Those of `steps` control steps after the start of the episode, (n,). Dirt is written into them.
+        They are those at control steps `steps` of the episodes, (n,). Dirt is written into `pictures` itself.
         """
         k1 = self._of("lens_k1", ids)
         if k1.any():
@@ -180,10 +181,10 @@ def _places(track: Track) -> Floats:
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
 def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
-    """Return pictures as lenses of a radial distortion show them.
+    """Return pictures as lenses with radial distortion show them.
 
-    A pixel at distance r from the middle, in half diagonals, shows what a pinhole shows at r (1 + k1 r^2). Pictures of
-    a positive k1 were taken by one with 1 / (1 + k1) of the focal length, so that the corners stay the corners.
+    A pixel at distance r from the middle, in half diagonals, shows what a pinhole shows at r (1 + k1 r^2). For a
+    positive k1, `pictures` have 1 / (1 + k1) of the focal length, so that the corners stay where they are.
     """
     count, channels, height, width = pictures.shape
     out = pictures.copy()
@@ -207,7 +208,7 @@ def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
                 left, top = np.int32(from_x), np.int32(from_y)
                 across[column], down[column] = from_x - np.float32(left), from_y - np.float32(top)
                 places[column] = top * np.int32(width) + left
-            # Apart from the loop above, which is then computed for several columns together.
+            # A loop of its own, so that the one above is vectorised.
             for channel in range(channels):
                 flat = pictures[at, channel].reshape(-1)
                 for column in range(width):

@@ -46,8 +46,8 @@ class Pictures:
         Args:
             config: size, colour and number of pictures.
             car: where the camera sits.
-            tracks: of each course one.
-            varied: what each episode's pictures differ in, drawn before they are taken; None: nothing.
+            tracks: one per course.
+            varied: what differs from episode to episode, drawn before the pictures are taken; None: nothing.
             of_car: how the physical car makes pictures; None: each pixel is the mean of what it sees.
         """
         self._of_car, finer = of_car, 1 if of_car is None else FRAME_SCALE
@@ -73,7 +73,7 @@ class Pictures:
         self._grey = config.color == "grey"
 
     def first(self, ids: Ids, state: CarState, course: NDArray[np.intp]) -> Pixels:
-        """Return the observations of the cars `ids`, which stand, (n, *shape): as if they had always stood there.
+        """Return the first observations of the cars `ids`, (n, *shape): earlier pictures equal the present one.
 
         Args:
             ids: indices of the cars, (n,).
@@ -93,10 +93,10 @@ class Pictures:
         steps: NDArray[np.int64],
         dropped: NDArray[np.bool_] | None,
     ) -> Pixels:
-        """Return the observations of all cars after those of `before`, (N, *shape).
+        """Return the observations of all cars after `before`, (N, *shape).
 
         Args:
-            before: (N, *shape).
+            before: observations of the step before, (N, *shape).
             state: arrays (N,).
             acceleration_mps2: ahead and to the left, (N, 2).
             course: index of each car's track, (N,).

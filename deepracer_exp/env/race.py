@@ -1,4 +1,4 @@
-"""N cars on their tracks under the service's rules; NumPy only, so that any learning library can drive them."""
+"""N cars on their tracks under the service's rules, as NumPy arrays, so that any learning library can drive them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -23,9 +23,7 @@ from .setup import RaceSetup
 from .state import Measures, checked_array
 
 _RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
-"""Their columns lie side by side in packed rows."""
-
-
+"""The columns of `RANDOMIZED`, which are adjacent in packed rows."""
 _KEPT = (
     *("_return", "_steering_deg", "_commanded_mps"),
     *("observation", "pixels", "reward", "terminated", "truncated", "trace"),
@@ -34,7 +32,7 @@ _KEPT = (
 
 
 class NonFinite(RunFailed):
-    """A value became NaN or infinite; `arrays` holds what is needed to look at it."""
+    """A value became NaN or infinite; `arrays` holds the cars' state for a crash dump."""
 
     def __init__(self, message: str, arrays: dict[str, np.ndarray]):
         super().__init__(message)
@@ -171,7 +169,7 @@ class Race:
         Args:
             ids: indices of the cars, None: all of them.
             course: indices in `setup.courses` of the courses to move to, (n,); None: each car stays on its own.
-            start_ndist: where they start as shares of the lap, (n,); None: as `episode` configures.
+            start_ndist: where they start, as shares of the lap, (n,); None: as `episode` configures.
         """
         ids = self._everyone if ids is None else ids
         pose = self.rules.reset(ids, start_ndist, course)
@@ -199,7 +197,7 @@ class Race:
             self._lidar.begin(ids, episode, None if self._varied is None else self._varied.boxes(ids))
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
-        """Put cars on the centre line in the middle of their episodes, standing; nothing is drawn again.
+        """Put cars at rest on the centre line in the middle of their episodes; nothing is drawn again.
 
         Args:
             ids: indices of the cars.
@@ -220,7 +218,7 @@ class Race:
         Cars whose episode ended keep driving until `reset`; their observation is the terminal one.
 
         Args:
-            action: int64 (N,) for a discrete space; float (N, 2) in -1..1, steering and speed, for a continuous.
+            action: int64 (N,) for a discrete space; float (N, 2) in -1..1, steering and speed, for a continuous one.
 
         Raises:
             RewardFailed: the reward function raised, timed out or returned no usable number.
@@ -265,7 +263,7 @@ class Race:
             state: of a race with the same setup and the same cars.
 
         Raises:
-            BadInput: it is of another number of cars, of other cars, tracks or features; the race is unusable then.
+            BadInput: it has another number of cars, or other cars, tracks or features; the race is then unusable.
         """
         physics = checked_array(state, "physics", self._batch.state.shape)
         if not np.array_equal(checked_array(state, "cars", self.cars.shape), self.cars):
@@ -356,7 +354,7 @@ class Race:
             )
 
     def _observe_started(self, ids: np.ndarray) -> None:
-        """Do the same for the cars `ids` alone: of many cars some start an episode at nearly every step."""
+        """Observe only the cars `ids`, just put on the track: with many cars, some start at nearly every step."""
         state = self._batch.read()
         if len(ids) == self.n_cars:
             started = self.rules.measure(state)

@@ -23,7 +23,7 @@ class RaceEnv(EnvBase):
     Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), with a LIDAR
     `lidar` (float32), `action` (int64 index, or float32 steering and speed in -1..1), and under `next` also `reward`,
     `done`, `terminated`, `truncated` and `trace` (float64, columns `deepracer.trace.PACKED_COLUMNS`). `trace` is part
-    of the reward spec because it exists after a step only.
+    of the reward spec because it exists only after a step.
     """
 
     def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
@@ -92,7 +92,7 @@ class RaceEnv(EnvBase):
         return self._begun()
 
     def _begun(self) -> TensorDict:
-        """Return what is seen where no episode has ended."""
+        """Return the observations, with all flags of the end of an episode False."""
         flags = {key: self._no.clone() for key in _FLAGS}
         return TensorDict._new_unsafe(
             {**self._seen(), **flags}, batch_size=self.batch_size, device=self.device

@@ -59,7 +59,7 @@ class CarStreams:
         self._state = self._philox.state
 
     def at(self, place: int, number: int) -> np.random.Generator:
-        """Return the one generator at the start of a stream of the car with that index in `cars`."""
+        """Return a generator, always the same object, at the start of stream `number` of the car `cars[place]`."""
         # A key and a counter are the whole state of Philox. Ten times faster than a new generator.
         self._state["state"] = {
             "key": self._keys[place],
@@ -98,7 +98,7 @@ class Randomization:
     """Draws the car of each episode, and disturbs its commands and observations.
 
     The values of an episode depend only on the seed, the car's number and the episode's number; the noise within it
-    on the seed, the car's number and the steps since the seed was set. Quantities that are off draw nothing.
+    on the seed, the car's number and the steps since the seed was set. Without randomization nothing is drawn.
 
     Attributes:
         values: the values of the cars' episodes, columns `QUANTITIES`, (N, Q); float64 numbers that float32 holds
@@ -116,7 +116,7 @@ class Randomization:
         """Apply what is constant over all episodes; call `seed` and then `begin` next.
 
         Each car has its own ranges and its number over all processes; `features` names the observation's entries.
-        Steering and speed commands reach all cars so many `late_steps` later than what is drawn.
+        Steering and speed commands reach all cars `late_steps` control steps later than the drawn delay.
         """
         ranges = np.array([[getattr(config, name) for name in QUANTITIES] for config in configs], np.float64)
         self._cars = list(cars)
@@ -223,7 +223,7 @@ class Randomization:
             steering_at, speed_at = (sent - late for late in self._late_steps)
             self._commands[steps % slots, self._rows] = np.stack([steering_deg, speed_mps], axis=1)
             steering_deg = self._commands[steering_at % slots, self._rows, 0]
-            # Those of before have nothing to say, and speed may come first.
+            # Earlier commands are void, and the speed may arrive before the steering.
             steering_deg = np.where(steering_at > self._no_command_until, steering_deg, 0.0)
             speed_mps = self._commands[speed_at % slots, self._rows, 1]
             moving = speed_at > self._no_command_until
@@ -247,7 +247,7 @@ class Randomization:
     ) -> NDArray[np.float32]:
         """Return the observations for the current features, given those of the step before, each (N, F).
 
-        `dropped` then says which cars see nothing new, (N,); it is None where none can.
+        `dropped` then says which cars see nothing new, (N,); it is None if no observation can be dropped.
         """
         if self._observation is None:
             return features

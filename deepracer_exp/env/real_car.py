@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 CAR_PICTURE = (160, 120)
 """Width and height of what the car's software shows a model."""
 FRAME_SCALE = 4
-"""Its camera's frames are so many times as wide and high."""
+"""Its camera's frames are this many times as wide and high."""
 
 
 def car_refusals(experiment: Experiment) -> list[str]:
-    """Return why the car could not run a policy of this experiment, or would show it something else; none: it can.
+    """Return why the car could not run a policy of this experiment, or would show it something else.
 
-    Each is a line with key, value and what would be accepted. Sources: deepracer-custom-car 2.1.9.9, sensor_fusion_pkg
-    and inference_pkg (one grey picture a frame, or two of a stereo pair), webserver_pkg (LIDAR),
-    deepracer_navigation_pkg (ranges of continuous actions).
+    Each reason is a line with key, value and what would be accepted; the list is empty if the car can. Sources:
+    deepracer-custom-car 2.1.9.9, sensor_fusion_pkg and inference_pkg (one grey picture a frame, or two of a stereo
+    pair), webserver_pkg (LIDAR), deepracer_navigation_pkg (ranges of continuous actions).
 
     Raises:
         BadInput: a file of the action space is missing or malformed.
@@ -141,9 +141,9 @@ class Servos:
 
 
 def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray[np.uint8]:
-    """Return what the car shows a model of its camera's frames.
+    """Return the pictures that the car makes of its camera's frames for a model.
 
-    The car compresses in colour and turns grey last, here it is the other way round: JPEG stores brightness on its own,
+    The car compresses in colour and turns grey last; here it is the other way round: JPEG stores brightness separately,
     with the same weights of red, green and blue, so that the difference is rounding.
 
     Args:
@@ -153,7 +153,7 @@ def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray
     Returns:
         (n, channels, height, width).
     """
-    # cv::resize, bilinear: between pixels 1 and 2 of each 4 by 4; the others are not looked at.
+    # cv::resize, bilinear: between pixels 1 and 2 of each 4 by 4; the others are not used.
     rows = frames[..., 1::FRAME_SCALE, :].astype(np.uint16) + frames[..., 2::FRAME_SCALE, :]
     small = ((rows[..., 1::FRAME_SCALE] + rows[..., 2::FRAME_SCALE] + 2) >> 2).astype(np.uint8)
     if jpeg_quality is not None:

@@ -86,8 +86,8 @@ class EpisodeRules:
     ) -> np.ndarray:
         """Return each car's status code, (N,) int64, for its control steps and its progress in per cent.
 
-        The prepare step is step 1; `moved_m` is the distance since one step before, and off the track no wheel is on
-        the road. Where several rules hold the service's priority decides: time_up, lap_complete, then the others.
+        The prepare step is step 1; `moved_m` is the distance since the step before; off the track, no wheel is on the
+        road. Where several rules hold, the service's priority decides: time_up, lap_complete, then the others.
         """
         config = self._config
         running = steps > 1
@@ -137,7 +137,7 @@ class RaceRules:
         steps: control steps of the episode so far, the prepare step being 1, (N,), int64.
         clock_steps: control steps since `restart`, (N,), int64.
         start_ndist: where the episodes began, as shares of the lap, (N,).
-        tracks: the courses in their directions, side by side.
+        tracks: each course in each of its directions, as one batch.
         track_params: the params of a reward function that are constant on each of these.
         course: index of each car's course in `setup.courses`, (N,).
         track_index: index of its track in `tracks` and `track_params`, (N,).
@@ -190,7 +190,7 @@ class RaceRules:
 
         Args:
             ids: indices of the cars, None: all of them.
-            start_ndist: where they start as shares of the lap, (n,); None: the start moves on by
+            start_ndist: where they start, as shares of the lap, (n,); None: the start advances by
                 `episode.start_advance` with every episode, as on the service, and from car to car.
             course: indices of the courses to move to, (n,); None: each car stays on its own. Where the direction
                 alternates, it does so with each episode that the car begins there.
@@ -220,8 +220,8 @@ class RaceRules:
 
         Args:
             ids: indices of the cars.
-            percent: progress at which they continue, (n,). The front of the car is put there, but no car is put
-                behind the start.
+            percent: progress at which they continue, (n,). The front of the car is put there, but its chassis origin
+                not behind the start.
         """
         length_m = self.length_m[ids]
         ahead_m = np.maximum(percent / 100.0 * length_m - self._front_point_m, 0.0)
@@ -231,7 +231,7 @@ class RaceRules:
         return self.tracks.start_pose(self.start_ndist[ids] + ahead_m / length_m, self.track_index[ids])
 
     def start_midway(self, steps: np.ndarray, progress: np.ndarray) -> None:
-        """Put all cars in the middle of their episodes, after so many steps, at so many per cent, each (N,)."""
+        """Put all cars in the middle of their episodes, after `steps` control steps, at `progress` per cent, (N,)."""
         self.steps[:] = steps
         self._previous[:] = progress
         self._last_progress[:] = progress
@@ -239,8 +239,8 @@ class RaceRules:
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything the next steps depend on; `measure` must have been called.
 
-        The measurements are part of it: those of some cars are taken without the others, and NumPy does not promise
-        the same last bit for an array of another length.
+        The measurements are part of it: cars may have been measured apart from others, and NumPy does not promise the
+        same last bit for an array of another length.
         """
         own = {key: getattr(self, name).copy() for name, key in _KEPT.items()}
         return {**own, "rules": self._episode_rules.state_dict(), "now": self.now.state_dict()}
@@ -322,7 +322,7 @@ class RaceRules:
         return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
 
     def _wheels_on_road(self) -> Bools:
-        """Return which wheel centres are on the road, (N, 4); flat, from x, y and yaw, as the service's log has."""
+        """Return which wheel centres are on the road, (N, 4), on a level car: from x, y and yaw, as logged."""
         now = self.now
         cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
         wheel_x, wheel_y = self._wheels.T

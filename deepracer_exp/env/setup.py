@@ -83,7 +83,7 @@ class RaceSetup:
     actions: ActionSpace
     observation: ObservationConfig
     observation_parts: tuple[ObservationPart, ...]
-    """Built here: a worker process imports the classes because its training sends them, not by their names."""
+    """Built here and sent to the workers as objects: they may not import classes that a configuration names."""
     randomization: RandomizationConfig
     episode: EpisodeConfig
     reward: RewardSource
@@ -91,7 +91,7 @@ class RaceSetup:
     seed: int
     real_car: RealCarConfig | None = None
     late_steps: tuple[int, int] = (0, 0)
-    """Control steps by which steering and speed commands reach every car late."""
+    """Control steps by which steering and speed commands reach every car later than drawn."""
 
     @property
     def track(self) -> Track:

@@ -63,7 +63,7 @@ class Measures:
 
     @classmethod
     def of(cls, car: CarState, front_point_m: float, tracks: Tracks, track_index: TrackIndex) -> "Measures":
-        """Measure cars (N,), whose front point is so far ahead of their origin, each against its course (N,)."""
+        """Measure cars (N,), whose front point is `front_point_m` ahead of the origin, each against its course (N,)."""
         front = np.empty((len(car.x_m), 2))
         front[:, 0] = car.x_m + front_point_m * np.cos(car.yaw_rad)
         front[:, 1] = car.y_m + front_point_m * np.sin(car.yaw_rad)

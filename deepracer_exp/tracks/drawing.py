@@ -35,8 +35,8 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
 
     Args:
         track: The course.
-        columns: Characters a line at most.
-        rows: Lines at most.
+        columns: Most characters in a line.
+        rows: Most lines.
 
     Returns:
         Lines without trailing blanks, joined by newlines.
@@ -164,7 +164,7 @@ def _start_line(track: Track) -> np.ndarray:
 
 
 def _roomier_border(track: Track) -> np.ndarray:
-    """Return for every waypoint its border point on the outside of the bend, on a straight the outer one."""
+    """Return for every waypoint its border point on the outside of the bend; on a straight, the outer border's."""
     last = len(track.waypoints) - 1
     index = np.arange(last + 1)[:, None] + (-3, 3)
     behind, ahead = (index % last if track.closed else index.clip(0, last)).T

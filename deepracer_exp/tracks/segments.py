@@ -251,7 +251,7 @@ def _candidates(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def nearest_segment(s, line, px, py):  # type: ignore[no-untyped-def]
-    """Return row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
+    """Return the row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
     column = (px - s.low_x[line]) / s.cell_m[line]
     row = (py - s.low_y[line]) / s.cell_m[line]
     best, found, fraction = np.inf, s.at[line], np.nan

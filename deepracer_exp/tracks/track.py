@@ -1,4 +1,4 @@
-"""Courses: centre line, borders, and where points are between them; one course, or several as one batch."""
+"""Courses: centre line, borders, and where points lie between them; one course, or several as one batch."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,7 +31,7 @@ TrackIndex = NDArray[np.intp]
 
 
 class Projection(NamedTuple):
-    """Points projected on the centre line; every array has one entry a point."""
+    """Points projected on the centre line; every array has one entry per point."""
 
     ndist: np.ndarray
     """Share of the course from waypoint 0 to the projection, 0 to 1."""
@@ -58,7 +58,7 @@ class Borders(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Start poses on the course."""
+    """Poses on the course; x and y in metres."""
 
     x: np.ndarray
     y: np.ndarray
@@ -92,7 +92,7 @@ class Track:
     width_max_m: float
     floor: FloorConfig
     road: BaseGeometry = field(repr=False)
-    """The road's polygon (shapely), for drawing and for obstacles."""
+    """The road's polygon (shapely)."""
     _center_line: Segments = field(repr=False)
     _inner_line: Segments = field(repr=False)
     _outer_line: Segments = field(repr=False)
@@ -276,7 +276,7 @@ class Tracks:
         return Projection(*segments.project(self._center_line, track_index, _points(points)))
 
     def border_distances(self, points: np.ndarray, center: np.ndarray, track_index: TrackIndex) -> Borders:
-        """Return width and side as `Track.border_distances` does, all (m, 2)."""
+        """Return width and side as `Track.border_distances` does, (m,) each, for points and centres (m, 2)."""
         borders = self._inner_line, self._outer_line
         return Borders(
             *segments.border_distances(

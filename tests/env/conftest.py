@@ -45,7 +45,7 @@ def steer_ahead() -> Callable[[Race, float], np.ndarray]:
     def act(race: Race, speed: float = 0.0) -> np.ndarray:
         at = race.feature_names.index("ahead_x_1")
         angle_rad = np.arctan2(race.observation[:, at + 1], race.observation[:, at])
-        # A stronger hand would weave: the car's steering takes half a second.
+        # With a larger gain the car would weave.
         steering = np.clip(1.4 * angle_rad / np.radians(30), -1, 1)
         return np.column_stack([steering, np.full(race.n_cars, speed)])
 

@@ -144,7 +144,7 @@ def test_a_cars_noise_depends_on_its_number_and_not_on_the_batch(race_of):
     ("steps", "varied"),
     [(6, "randomization.observation_dropout=[0.3,0.3]"), (7, "randomization=sim2real")],
 )
-def test_a_race_put_back_reads_on_as_the_original(race_of, steps, varied):
+def test_a_restored_race_reads_the_same_scans_as_the_original(race_of, steps, varied):
     options = (LIDAR, FAR, varied)
     race, other = race_of(*options, n_cars=4), race_of(*options, n_cars=4)
     drive(race, steps)

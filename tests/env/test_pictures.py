@@ -100,7 +100,7 @@ def test_a_dropped_observation_repeats_the_picture_too(race_of):
     assert 5 < repeated[0].sum() < 35
 
 
-def test_a_race_put_back_sees_on_as_the_original(race_of):
+def test_a_restored_race_sees_the_same_pictures_as_the_original(race_of):
     overrides = (SMALL, "observation.camera.frames=2", "randomization=sim2real")
     race, other = race_of(*overrides, n_cars=4), race_of(*overrides, n_cars=4)
     drive(race, 7)

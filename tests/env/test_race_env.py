@@ -84,14 +84,14 @@ def test_the_rewards_of_the_trace_are_the_rewards(setup_of):
     assert ((trace[..., PACKED["done"]] == 1) == steps["next", "done"][..., 0]).all()
 
 
-def test_a_sign_of_life_is_given_after_every_step(setup_of):
+def test_the_heartbeat_is_called_after_every_step(setup_of):
     beats = []
     env = RaceEnv(Race(setup_of(), 2), on_step=lambda: beats.append(1))
     env.rollout(7, break_when_any_done=False)
     assert len(beats) == 7
 
 
-def test_a_fault_in_the_race_reaches_the_caller(setup_of):
+def test_an_error_in_the_race_reaches_the_caller(setup_of):
     env = RaceEnv(Race(setup_of("action_space=continuous"), 2))
     root = env.reset().set("action", torch.full((2, 2), torch.nan))
     with pytest.raises(NonFinite):

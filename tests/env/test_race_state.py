@@ -26,7 +26,7 @@ def make_setup(*overrides: str) -> RaceSetup:
 
 
 def future(race: Race, seed: int, turns: int) -> list[np.ndarray]:
-    """Drive by dice: actions, new episodes, other courses and cars put back; return all that could be seen of it."""
+    """Drive at random: actions, new episodes, other courses, cars put back; return everything that can be observed."""
     dice, seen = np.random.default_rng(seed), []
     for _ in range(turns):
         n_actions = race.setup.actions.n
@@ -64,7 +64,7 @@ def test_the_floors_differ(everything):
 
 
 @pytest.mark.parametrize("space", ["discrete", "continuous"])
-def test_a_race_continues_from_a_state_as_the_race_it_was_taken_of(everything, space):
+def test_a_race_continues_from_a_state_as_the_race_it_was_taken_from(everything, space):
     setup = dataclasses.replace(everything, actions=make_setup(f"action_space={space}").actions)
     race, used = Race(setup, 5, first_car=3), Race(setup, 5, first_car=3)
     race.reset()

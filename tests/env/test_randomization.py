@@ -154,7 +154,7 @@ def test_switching_one_quantity_off_leaves_the_draws_of_the_others():
     np.testing.assert_array_equal(some[:, same], all_on[:, same])
 
 
-def test_draws_are_uniform_and_every_delay_is_as_likely():
+def test_draws_are_uniform_and_every_delay_is_equally_likely():
     race = race_of(friction_scale=(0.5, 1.5), action_delay_steps=(1, 4), n_cars=3000)
     friction, delay = drawn_of(race, "friction_scale"), drawn_of(race, "action_delay_steps")
     deciles = np.quantile(friction, np.linspace(0, 1, 11))
@@ -253,7 +253,7 @@ def test_each_car_has_the_mass_the_motors_and_the_servos_it_drew():
     np.testing.assert_allclose(cars["steering_time_s"], nominal["steering_time_s"] / servo)
 
 
-def test_a_heavy_car_with_weak_motors_is_slower_away():
+def test_a_heavy_car_with_weak_motors_starts_more_slowly():
     speeds = []
     for ranges in ({}, {"mass_scale": (1.5, 1.5), "motor_scale": (0.5, 0.5)}):
         race = race_of(**ranges)
@@ -283,7 +283,7 @@ def test_the_physics_bears_every_corner_of_what_is_accepted():
 # --- What the policy sees
 
 
-def test_what_is_seen_changes_nothing_of_what_is():
+def test_disturbed_observations_do_not_change_the_driving():
     actions = random_actions(50, 4)
     clear = drive(race_of(n_cars=4), actions)
     blurred = drive(race_of(observation_noise=(0.0, 0.5), observation_dropout=(0.0, 1.0), n_cars=4), actions)

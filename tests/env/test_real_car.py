@@ -121,7 +121,7 @@ def test_compressing_grey_is_as_good_as_compressing_colour_and_turning_it_grey(s
     assert np.abs(ours.astype(float) - grey[0]).max() > 1  # it does compress
 
 
-def test_with_every_part_off_the_cars_drive_and_see_as_ever_bit_for_bit(setup):
+def test_with_every_part_off_the_cars_drive_and_see_as_before_bit_for_bit(setup):
     off = replace(NONE, timing=CarTimingConfig(frames_per_s=15, latency_s=0))
     driven = []
     for one in (setup, as_the_car(setup, NONE), as_the_car(setup, off)):
@@ -148,7 +148,7 @@ def drive_path(setup, frames_per_s, latency_s, actions):
 
 @pytest.fixture
 def turns():
-    """Another action every fifth of a second of 15 frames a second, (45, 2)."""
+    """A new random action every third frame, (45, 2)."""
     return np.repeat(np.random.default_rng(1).uniform(-1, 1, (15, 2)), 3, axis=0)
 
 

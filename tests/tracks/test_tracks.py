@@ -53,7 +53,7 @@ def test_every_answer_is_that_of_the_course_alone(several, points):
 
 
 def test_points_of_a_car_may_follow_one_another(several, points):
-    """Four wheels a car need no course each."""
+    """The points of a car's four wheels share one index of a course."""
     at, track_index = points
     together = Tracks(several)
     np.testing.assert_array_equal(
