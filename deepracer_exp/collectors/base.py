@@ -1,4 +1,4 @@
-"""What every collector of driving is."""
+"""The interface of every collector, and what all of them need."""
 
 import os
 import time
@@ -31,7 +31,7 @@ class Collector(ABC):
         self.close()
 
     def collect(self, algorithm: AlgorithmConfig) -> tuple[TensorDictBase, float]:
-        """Return what one update learns from, as much as the algorithm says, and the seconds it took to collect.
+        """Return the batch of one update, as large as the algorithm says, and the seconds it took to collect.
 
         Raises:
             RunFailed: a worker is lost.
@@ -61,15 +61,14 @@ class Collector(ABC):
 
     @abstractmethod
     def publish_policy(self) -> None:
-        """Let the next batches be driven with the policy's weights as they are now; raises as `next_batch`."""
+        """Drive the next batches with the policy's present weights; raises as `next_batch`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the next batch depends on but the policy: arrays and plain values.
+        """Return everything that the next batch depends on except the policy: arrays and plain values.
 
-        It is that of the last batch's end, to be asked for before the next batch is. Asynchronous workers are in the
-        middle of other batches by then: there is no such state of them, and what is returned is empty. Raises as
-        `next_batch`.
+        It is the state at the end of the last batch; call it before the next. Asynchronous workers are by then in the
+        middle of other batches and have no such state: the result is empty. Raises as `next_batch`.
         """
 
     @abstractmethod
@@ -88,12 +87,12 @@ def worker_count(config: CollectorConfig) -> int:
 
 
 def by_worker(states: Iterable[Any]) -> dict[str, Any]:
-    """Return the states of workers as a collector's `state_dict`: state dicts have names for keys."""
+    """Return the states of workers as a collector's `state_dict`, whose keys are names."""
     return {f"worker-{worker}": state for worker, state in enumerate(states)}
 
 
 def states_of(state: Mapping[str, Any], workers: int) -> list[Any]:
-    """Return the workers' states of a collector's `state_dict`, none of an empty one.
+    """Return the workers' states in a collector's `state_dict`; an empty one has none.
 
     Raises:
         BadInput: it is that of other workers.

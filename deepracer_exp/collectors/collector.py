@@ -29,7 +29,7 @@ from .watchdog import Watchdog
 from .worker import EnvFactory
 
 _LOOK_EVERY_S = 0.2
-_CHUNK_STEPS = 32  # steps a car drives between two looks at how many episodes have ended
+_CHUNK_STEPS = 32  # control steps of each car between two counts of the episodes that have ended
 
 _T = TypeVar("_T")
 
@@ -46,7 +46,7 @@ class LocalCollector(Collector):
         run_dir: Path,
         state: Mapping[str, Any] | None = None,
     ):
-        """Start the cars; arguments and errors as of `open_collector`.
+        """Start the cars; arguments and errors as for `open_collector`.
 
         `frames_per_batch` is in control steps over all cars, and is rounded up to whole steps of all cars.
         """
@@ -131,7 +131,7 @@ class LocalCollector(Collector):
         if not self._collector.closed:
             threads = torch.get_num_threads()
             self._collector.shutdown()
-            # TorchRL gives this process the workers' threads, and with other threads sums have other last digits.
+            # TorchRL changes this process's number of threads, with which the last digits of sums change.
             torch.set_num_threads(threads)
         if self._workers:
             self._close_weights()
@@ -142,7 +142,7 @@ class LocalCollector(Collector):
         else:
             kind, more = MultiAsyncCollector, {}
         others = len(multiprocessing.active_children())
-        # What TorchRL would take itself; ours can be closed even if no collector is returned.
+        # The scheme that TorchRL would use itself; ours can be closed even if no collector is returned.
         self._weights = SharedMemWeightSyncScheme()
         options = options | {"weight_sync_schemes": {"policy": self._weights}}
         with contextlib.ExitStack() as undo:
@@ -168,10 +168,10 @@ class LocalCollector(Collector):
         self._close_weights()
 
     def _close_weights(self) -> None:
-        """Close the queues through which workers hear of new weights.
+        """Close the queues through which workers receive new weights.
 
-        TorchRL does it when its collector is garbage. After a failure that is at the interpreter's end, which would
-        then wait without end: for a queue that is never emptied, or for a thread, which can no longer start.
+        TorchRL does it when its collector is garbage-collected. After a failure that is when the interpreter exits,
+        which would then hang: on a queue that is never emptied, or on a thread that can no longer start.
         """
         for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
             for queue in getattr(self._weights, name).values():
@@ -179,9 +179,9 @@ class LocalCollector(Collector):
         self._weights.shutdown()
 
     def _restore_cars(self, states: Sequence[Any]) -> None:
-        """Put the cars where those of each worker's state were.
+        """Restore each worker's cars from its state.
 
-        TorchRL tries the policy once while it starts, which draws a number: the state is put back after that.
+        TorchRL calls the policy once while it starts, which draws a random number, so this comes after that.
         """
         if self._watchdog is None:
             with self._own_stream():
@@ -193,20 +193,25 @@ class LocalCollector(Collector):
             self._collector.map_fn("env.put_state", [(state,) for state in states])
             self._collector.map_fn("reset")
 
-        self._ask(put, lambda: "a collector worker did not put its cars where they were")
+        self._ask(put, lambda: "a collector worker did not restore its cars")
 
     @contextlib.contextmanager
     def _own_stream(self) -> Iterator[None]:
-        """Sample from the stream of the cars in this process: what else draws here must not shift it."""
+        """Sample from the random stream of the cars in this process, which no other draw here may shift."""
         with torch.random.fork_rng(devices=[]):
             torch.set_rng_state(self._random)
             yield
             self._random = torch.get_rng_state()
 
     def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
-        """Return the workers' answer; TorchRL waits for it without end, even if the worker is dead.
+        """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead.
 
-        `silence` says who did not answer.
+        Args:
+            question: asks the workers.
+            silence: returns who did not answer, for the message.
+
+        Raises:
+            RunFailed: a worker is lost, or did not answer within `collector.hang_timeout_s`.
         """
         answer: Future[_T] = Future()
 
@@ -257,7 +262,7 @@ class LocalCollector(Collector):
         return batch.flatten(0, 1) if self._mode == "sync" else batch
 
     def _loss(self, patience_s: float = 0.0) -> RunFailed | None:
-        """Return what became of the first lost worker, None if all are there after `patience_s`."""
+        """Return the error about the first lost worker, None if all are still alive after `patience_s`."""
         give_up_at = time.monotonic() + patience_s
         while True:
             loss = self._loss_now()
@@ -290,12 +295,12 @@ class LocalCollector(Collector):
 
 
 def _watch_deliveries(queue: Any, watchdog: Watchdog) -> None:
-    """Let the watchdog know of each worker's part that is taken from the queue of TorchRL's synchronous collector."""
+    """Report to the watchdog each worker's part that leaves the queue of TorchRL's synchronous collector."""
     get = queue.get
 
     def get_and_note(*args: Any, **options: Any) -> Any:
         message = get(*args, **options)
-        # A worker's number; the first time its buffer and its number.
+        # The worker's number; the first time, its buffer and its number.
         part, _ = message
         watchdog.delivered(part if isinstance(part, int) else part[1])
         return message
@@ -317,10 +322,10 @@ def open_collector(
         config: the collector's group.
         algorithm: says how many frames or episodes an iteration has.
         setup: what the cars need.
-        policy: reads `observation`, writes `action` and its log-probability.
+        policy: reads what its network sees of a `RaceEnv`, writes `action` and its log-probability.
         run_dir: where workers leave crash dumps and prints.
         state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
-            is what that one would have returned next, bit for bit. None or empty: episodes begin.
+            is what that one would have returned next, bit for bit. None or empty: new episodes begin.
 
     Raises:
         BadInput: the state is of other cars, or of another number of processes.

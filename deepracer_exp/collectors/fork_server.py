@@ -1,7 +1,7 @@
-"""Imported first by the process that workers are forked from, and by nothing else.
+"""Imported first by the fork server, from which workers are forked, and by nothing else.
 
-It ends once all that may ask it for a process are gone. On its own it would look only after it has imported what its
-workers need, which takes many seconds on a busy machine.
+The server ends once all its clients are gone. On its own it would look only after it has imported what its workers
+need, which takes many seconds on a busy machine.
 """
 
 import os

@@ -12,7 +12,7 @@ _ANSWER_S = 5.0
 
 
 def connect(address: str, asked_by: str) -> None:
-    """Join a cluster that runs, by HOST:PORT of its head or `auto`; none is ever started, so that none is left behind.
+    """Join a running cluster, by HOST:PORT of its head or `auto`; none is ever started, so that none is left behind.
 
     Raises:
         BadInput: Ray is not installed, or no cluster answers.
@@ -22,8 +22,8 @@ def connect(address: str, asked_by: str) -> None:
     import ray
     from ray._private import ray_constants
 
-    # A cluster that is gone is asked twenty times for half a minute otherwise; its variable of the environment is
-    # read when TorchRL imports Ray.
+    # Otherwise Ray asks a dead cluster twenty times, for half a minute. Its environment variable would come too late:
+    # it is read when TorchRL imports Ray.
     ray_constants.NUM_REDIS_GET_RETRIES = 1
     if ray.is_initialized():
         return
@@ -40,7 +40,7 @@ def connect(address: str, asked_by: str) -> None:
 
 
 def leave() -> None:
-    """Leave the cluster: what this process has started there ends."""
+    """Leave the cluster; everything that this process has started there ends."""
     import ray
 
     ray.shutdown()
@@ -52,7 +52,7 @@ def node_addresses() -> list[str]:
 
 
 def room(needs: dict[str, float]) -> int:
-    """Return for how many workers that each need these resources, `CPU` and `GPU`, the cluster has room when idle."""
+    """Return how many workers fit on the idle cluster if each needs these resources, `CPU` and `GPU`."""
     wanted = {name: amount for name, amount in needs.items() if amount > 0}
     return sum(
         int(min(node["Resources"].get(name, 0.0) / amount for name, amount in wanted.items()))

@@ -28,7 +28,7 @@ _LOOK_EVERY_S = 0.2
 _REPORT_EVERY_S = 0.5
 _START_TIMEOUT_S = 120.0
 _LONGEST_PRINTS = 10_000_000
-"""Bytes of the file that takes them, as on one machine."""
+"""Most bytes of the file of prints, as on one machine."""
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -36,13 +36,13 @@ Key = str | tuple[str, ...]
 
 
 class Beats:
-    """Knows how many control steps each worker has done; an actor of its own, because the others are driving."""
+    """Counts the control steps that each worker has done; an actor of its own, because the others are driving."""
 
     def __init__(self) -> None:
         self._steps: dict[int, int] = {}
 
     def report(self, worker: int, steps: int) -> None:
-        """Take a worker's sign of life."""
+        """Record a worker's heartbeat."""
         self._steps[worker] = steps
 
     def steps(self) -> dict[int, int]:
@@ -70,17 +70,17 @@ class KeptPrints(RewardPrints):
 class Cars:
     """The cars of one process; a Ray actor whose methods run in its main thread.
 
-    Only there a reward function that hangs can be stopped (`env.reward_guard`), so that its steps are reported to
-    `Beats` and not asked for from another thread of it.
+    Only there can a hanging reward function be stopped (`rewards.guard`); so the steps are reported to `Beats`, and
+    not asked for in another thread of the actor.
     """
 
     def build(
         self, factory: EnvFactory, policy: torch.nn.Module, frames_per_batch: int, beats: Any
     ) -> tuple[str, int]:
-        """Put the cars on the road; return the address of the node and the number of the process."""
+        """Put the cars on the road; return the address of the node and the id of the process."""
         import ray
 
-        # As in worker processes of one machine: with other threads sums have other last digits.
+        # As in worker processes of one machine: the last digits of sums depend on the number of threads.
         torch.set_num_threads(1)
         self._policy, self._kept = policy, KeptPrints()
         steps, reported_at = 0, 0.0
@@ -122,7 +122,7 @@ class Cars:
         self._collector.update_policy_weights_()
 
     def take_state(self) -> dict[str, Any]:
-        """Return all that the next batch depends on but the policy."""
+        """Return everything that the next batch depends on except the policy."""
         state: dict[str, Any] = self._collector.env.take_state()
         return state
 
@@ -135,9 +135,9 @@ class Cars:
 class RayCollector(Collector):
     """An endless source of batches, as `LocalCollector` with `sync`: the same batches in the same order, bit for bit.
 
-    TorchRL's RayCollector is not used: it waits without end for a worker that hangs, does not say which one is
-    lost, joins the training process with all workers in a process group of torch.distributed that does not outlive
-    the loss of one, and brings home neither prints nor the cars' state after a fault.
+    TorchRL's RayCollector is not used: it waits forever for a worker that hangs, does not say which one is lost, joins
+    the training process with all workers in a process group of torch.distributed that does not survive the loss of one,
+    and returns neither prints nor the cars' state after a crash.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class RayCollector(Collector):
         run_dir: Path,
         state: Mapping[str, Any] | None = None,
     ):
-        """Start the cars; arguments and errors as of `open_collector`."""
+        """Start the cars; arguments and errors as for `open_collector`."""
         import ray
 
         assert config.processes is not None
@@ -194,8 +194,8 @@ class RayCollector(Collector):
         return self._joined(self._ask(lambda worker: self._cars[worker].drive.remote()))
 
     def publish_policy(self) -> None:
-        """Give the workers the policy's weights as they are now."""
-        # Once for each node, and not for each worker.
+        """Send the workers the policy's present weights."""
+        # Once for each node, not for each worker.
         weights = self._ray.put({name: w.detach().numpy() for name, w in self._policy.state_dict().items()})
         self._ask(lambda worker: self._cars[worker].take_weights.remote(weights))
 
@@ -275,7 +275,7 @@ class RayCollector(Collector):
             ) from error
 
     def _steps(self) -> dict[int, int]:
-        """Return what the workers have reported last; it is never waited for."""
+        """Return the steps that the workers reported last, without waiting."""
         done, _ = self._ray.wait([self._asked], timeout=0)
         if done:
             try:

@@ -1,4 +1,4 @@
-"""Notices a worker process that dies or hangs, and ends the latter."""
+"""Detects worker processes that die, and detects and ends those that hang."""
 
 import contextlib
 import multiprocessing
@@ -45,7 +45,7 @@ class Watchdog:
         self._waiting.set()
         self._over = threading.Event()
         self.verdict: dict[int, str] = {}
-        """Of each worker that was ended: what it had done."""
+        """Why each worker that was ended was ended, by its number."""
         self.first_dead: int | None = None
         """The worker whose process ended first."""
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
@@ -99,11 +99,11 @@ class Watchdog:
 
     def _end(self, worker: int, idle_s: float, steps: int) -> None:
         known = worker in self.verdict
-        # Before the kill: who sees the death asks for the verdict.
+        # Before the kill: the collector reads the verdict as soon as it sees the death.
         self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
         if self._processes is None:
-            # They are still being started, and nothing says yet which is which: none of them can continue alone. Again
-            # and again, because one may be started only now.
+            # They are still being started, and it is not yet known which is which; none of them can continue alone.
+            # Repeated at every look, because another one may have been started since.
             for process in multiprocessing.active_children():
                 process.kill()
             _end_fork_servers_children()
@@ -113,9 +113,9 @@ class Watchdog:
 
 
 def _end_fork_servers_children() -> None:
-    """End the workers that the fork server has forked; one of them may not know yet what it is.
+    """End the workers that the fork server has forked, those included that have not yet read their task.
 
-    Until it has read that, `multiprocessing` does not list it, and the training process waits for it to read.
+    Until a worker has read it, `multiprocessing` does not list the worker, and the training process waits for it.
     """
     server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
     if server is None:

@@ -1,4 +1,4 @@
-"""What happens inside a collector's process."""
+"""The environment of a collector's process."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ from deepracer_exp.runs.files import REWARD_PRINTS
 
 @dataclass(frozen=True, kw_only=True)
 class EnvFactory:
-    """Builds the cars of one process; sent to it and called there.
+    """Builds the cars of one process; it is sent there and called there.
 
     `heartbeat` is a file of one int64 per worker, mapped by all of them: control steps done so far, -1 before the
     first. A file needs no clean-up protocol: it lies in the run folder and never outlives it.
@@ -44,11 +44,11 @@ class EnvFactory:
     def __call__(self) -> RaceEnv:
         """Return the environment, with the process around it made ready."""
         if self.heartbeat is not None:
-            # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes: the training process hears it.
+            # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes: the training process handles it.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             end_with_owner()
-        # Sampling of actions is a worker's own stream, whatever the other workers do.
+        # Each worker samples actions from a random stream of its own.
         torch.manual_seed(int(np.random.SeedSequence([self.setup.seed, self.worker]).generate_state(1)[0]))
         race = Race(
             self.setup,
@@ -68,14 +68,14 @@ class EnvFactory:
         def end(error: RunFailed) -> None:
             write_crash_dump(self.run_dir, error, worker)
             sys.stderr.flush()
-            # No traceback from here: the training process finds the dump, prints its line and holds the exit code.
+            # No traceback from here: the training process finds the dump, prints its line and sets the exit code.
             os._exit(RunFailed.exit_code)
 
         return _StateKeepingEnv(race, beat, end)
 
 
 class _StateKeepingEnv(RaceEnv):
-    """A RaceEnv whose state can be taken and put back, and whose failure carries the cars' state."""
+    """A RaceEnv whose state can be taken and restored, and whose errors carry the cars' state."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class _StateKeepingEnv(RaceEnv):
         self._on_failure = on_failure
 
     def take_state(self) -> dict[str, Any]:
-        """Return the cars and the process's stream of random numbers, with which actions are sampled."""
+        """Return the state of the cars and of the process's random stream, from which actions are sampled."""
         return {"race": self.race.state_dict(), "random": torch.get_rng_state().numpy()}
 
     def put_state(self, state: Mapping[str, Any]) -> None:

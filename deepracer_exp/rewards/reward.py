@@ -37,9 +37,11 @@ class RewardFailed(RunFailed):
         self.what = what
         """Part of the message: what the function did, and in which line."""
         self.hung = hung
+        """Whether the time limit was exceeded."""
         self.params = params
         """The params of the call (`reward_batch`: of all cars, if the car is not known)."""
         self.car = car
+        """Index of the car in its batch; None: not known."""
 
 
 class RewardFunction:
@@ -47,10 +49,10 @@ class RewardFunction:
 
     Each car has its own module namespace, as on the service, where a process has one car: global variables persist
     from call to call and are not shared between cars. They are not part of a checkpoint. A module with
-    `reward_batch(params)` is loaded once and called once a step for all cars of a course instead.
+    `reward_batch(params)` is instead loaded once, and called once a step for all cars of a course.
 
     Args:
-        source: The module; its overriding constants are set.
+        source: The module and the values that replace its constants.
         n_cars: Number of cars.
         time_limit_s: Seconds of CPU for all calls of one step (see `Guard` for where it holds).
         prints: Where `print` goes; None discards it.

@@ -1,4 +1,4 @@
-"""The source of a reward function: found, checked without being run, its constants set."""
+"""The source of a reward function: find it, check it without running it, and set its constants."""
 
 import ast
 import hashlib
@@ -37,7 +37,7 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
     """Read the reward function that `config` names and check it without running it.
 
     Raises:
-        BadInput: Unknown name; the file is missing, no file, not UTF-8, not Python, without a
+        BadInput: Unknown name; the file is missing, not a regular file, not UTF-8, not Python, without a
             `reward_function` of one argument; a constant that the module does not have.
     """
     if config.file is None:

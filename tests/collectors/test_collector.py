@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("workers_start_early")
 
 @pytest.fixture
 def collect(tmp_path):
-    """Open a collection of tiny's cars; the policy drives at random, its weights are 0."""
+    """Open a collector with the cars of experiment=tiny; the policy drives at random, its weights are 0."""
     opened = []
 
     def open_(*overrides: str) -> LocalCollector:

@@ -30,7 +30,7 @@ EVERYTHING = (
 
 
 class Driver:
-    """Collections of one experiment, and the weights that drive in them."""
+    """Opens collectors of one experiment, and has the policy that drives in them."""
 
     def __init__(self, folder, *overrides: str):
         experiment, _ = compose_experiment(["experiment=tiny", *overrides])
@@ -105,7 +105,7 @@ def assert_same(batches, expected) -> None:
     for batch, wanted in zip(batches, expected, strict=True):
         assert set(batch.keys(True, True)) == set(wanted.keys(True, True))
         for key, values in wanted.items(True, True):
-            # NaN stands in columns of the trace that say nothing.
+            # NaN stands for a missing value in columns of the trace.
             assert torch.equal(batch[key].nan_to_num(7.0), values.nan_to_num(7.0)), key
 
 

@@ -83,7 +83,7 @@ def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats, proc
     assert list(dog.verdict) == [1]
 
 
-def test_what_arrived_is_no_excuse_for_the_next_batch(watch, beats, processes):
+def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats, processes):
     """A worker may hang after the last step of its part as well as within it."""
     dog = watch(lockstep=True)
     dog.workers_started(processes)

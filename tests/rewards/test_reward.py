@@ -93,7 +93,7 @@ def test_cars_that_are_not_active_get_nothing_and_are_not_called() -> None:
 @pytest.mark.parametrize(
     "value", ["True", "3", "2.5", "-1e5", "1e5", "np.float32(2)", "np.array(3)", "Fraction(1, 2)"]
 )
-def test_whatever_float_makes_a_bounded_number_of_is_a_reward(value: str) -> None:
+def test_whatever_float_turns_into_a_bounded_number_is_a_reward(value: str) -> None:
     head = "import numpy as np\nfrom fractions import Fraction\n"
     result = function(f"{head}def reward_function(params):\n    return {value}\n")(columns(3), ROAD)
     assert result.dtype == np.float64
@@ -164,7 +164,7 @@ def test_a_keyboard_interrupt_that_the_reward_raises_is_its_fault() -> None:
 
 @pytest.mark.parametrize("method", ["__str__", "__repr__"])
 @pytest.mark.parametrize("body", ["raise SystemExit", "while True: pass"])
-def test_an_error_whose_text_is_hostile_is_a_fault_like_others(method: str, body: str) -> None:
+def test_an_error_with_hostile_text_is_reported_like_others(method: str, body: str) -> None:
     text = (
         f"class Evil(Exception):\n    def {method}(self):\n        {body}\n"
         "def reward_function(params):\n    raise Evil(params)\n"
