@@ -18,7 +18,7 @@ HALF_SPEED_THROTTLE = 0.8
 def full_scale(metadata: ModelMetadata) -> Action:
     """Return the angle in degrees that is full lock, and the speed in m/s that is full throttle.
 
-    Whatever they are: a space of at most 20 degrees turns the wheels as far as one of 30. Of a continuous space only
+    They are relative: a space of at most 20 degrees turns the wheels as far as one of 30. Of a continuous space only
     the high ends count.
     """
     if metadata.high is not None:
@@ -32,7 +32,7 @@ def steering_share(steering_deg: ArrayLike, full_lock_deg: float) -> Floats:
 
     Args:
         steering_deg: of the actions, positive to the left, any shape.
-        full_lock_deg: of `full_scale`; 0 or less stands for a car that drives straight ahead only.
+        full_lock_deg: of `full_scale`; with 0 or less the car only drives straight ahead.
     """
     steering_deg = np.asarray(steering_deg, np.float64)
     return steering_deg / full_lock_deg if full_lock_deg > 0 else np.zeros_like(steering_deg)
@@ -54,5 +54,5 @@ def throttle(speed_mps: ArrayLike, full_throttle_mps: float, slider: float = 1.0
 
 
 def servo_value(requested: Floats, last: Floats) -> Floats:
-    """Return where the servo is after a request: the servo node refuses what is not in -1..1 and keeps the last."""
+    """Return the servo's position after a request: the servo node refuses what is not in -1..1 and keeps the last."""
     return np.where(np.abs(requested) <= 1.0, requested, last)

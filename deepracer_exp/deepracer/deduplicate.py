@@ -101,7 +101,7 @@ def first_checkpoint(log: TrainingLog) -> int:
 
 
 def _episodes_between(log: TrainingLog, usual: int) -> int:
-    """Return how many episodes an iteration has: as many as lie between two evaluations."""
+    """Return the number of episodes in an iteration: those between two evaluations."""
     ends = log.evaluated_after
     if len(ends) > 1:
         return ends[1] - ends[0]

@@ -1,4 +1,4 @@
-"""Frozen graphs of TensorFlow 1 (`.pb`), in which a car takes its policy; written and read without TensorFlow.
+"""Frozen graphs of TensorFlow 1 (`.pb`), the form in which a car takes a policy; written and read without TensorFlow.
 
 Such a file is one GraphDef in the wire format of protobuf. Its weights are nodes `Const`. Source of the field numbers:
 tensorflow/core/framework/{graph,node_def,attr_value,tensor,tensor_shape,versions}.proto. Nodes have the names that they
@@ -117,7 +117,7 @@ def _embed(
                 kernel.shape[3],
             )
         else:
-            # Of a picture a layer of its own for each pixel, or one for all of them.
+            # On a picture, a dense layer applies to each pixel, or to all of them together.
             places = shape[:-1] if kernel.shape[0] == shape[-1] else ()
             x = _reshape(graph, f"{name}/Reshape", x, shape, kernel.shape[0])
             x = _activate(graph, name, _dense(graph, tensors, name, x))
@@ -219,7 +219,7 @@ def read_weights(path: str | Path, raw: bytes | None = None) -> dict[str, Tensor
 
     Args:
         path: of the file.
-        raw: its content where it is known, as of a member of an archive.
+        raw: its content if known, e.g. of a member of an archive.
 
     Raises:
         BadInput: it cannot be read, is larger than `GRAPH_BYTES`, or not a frozen graph.
@@ -255,7 +255,7 @@ class _Fields:
         self._left = _MOST_FIELDS
 
     def of(self, message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-        """Yield the number and the value of each field: a number, or the bytes of what has a length."""
+        """Yield the number and the value of each field: a number, or the bytes of anything else."""
         for each in read_fields(message):
             self._left -= 1
             if self._left < 0:
@@ -297,7 +297,7 @@ def _constant(fields: _Fields, node: memoryview) -> tuple[str, Tensor | None]:
             listed = _message(value)
     if kind != _FLOAT:
         raise ValueError(f"{name}: is not of type float32")
-    raw = raw or listed  # the latter of a tensor with one element
+    raw = raw or listed  # a tensor with one element may be listed
     if not all(0 < size < 2**31 for size in shape) or len(shape) > 8 or 4 * math.prod(shape) != len(raw):
         raise ValueError(f"{name}: {len(raw)} bytes for a tensor of shape {shape}")
     return name, np.frombuffer(raw, "<f4").reshape(shape)

@@ -37,9 +37,9 @@ CONSOLE_RANGES = {
     "lr": (1e-8, 1e-3),
     "num_episodes_between_training": (1, 100),
 }
-"""Lowest and highest value that the console accepts, where that is less than the trainer does.
+"""Lowest and highest value that the console accepts, where its range is narrower than the trainer's.
 
-There, `batch_size` must also be a power of two.
+The console also requires `batch_size` to be a power of two.
 """
 
 
@@ -114,5 +114,5 @@ def read_hyperparameters(
 
 
 def hyperparameters_text(values: Hyperparameters) -> str:
-    """Return the text of a hyperparameters.json with all keys; `read_hyperparameters` gives the same again."""
+    """Return the text of a hyperparameters.json with all keys, which `read_hyperparameters` reads back unchanged."""
     return json.dumps({key: getattr(values, key) for key in sorted(KEYS)}, indent=2) + "\n"

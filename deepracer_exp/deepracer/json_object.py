@@ -20,7 +20,7 @@ class JsonObject:
             path: the file.
             kind: what it should be, e.g. ``a model_metadata.json``.
             accepted: what its JSON should hold, e.g. ``a JSON object with action_space``.
-            raw: the file's content if known, as of a member of an archive or a part of a log.
+            raw: the file's content if known, e.g. of a member of an archive or a part of a log.
 
         Raises:
             BadInput: it cannot be read, is not a regular file, too large, not JSON, or not an object.

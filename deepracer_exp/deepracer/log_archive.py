@@ -56,7 +56,7 @@ class LogFile:
         return self.opener(*self.given)
 
     def head(self, most_bytes: int) -> bytes:
-        """Return what it begins with."""
+        """Return its first bytes, at most `most_bytes`."""
         with self.open() as stream:
             return stream.read(most_bytes)
 
@@ -73,10 +73,10 @@ class LogFile:
 
 @dataclass
 class LogFolder:
-    """The files found."""
+    """The files found in a folder or an archive."""
 
     files: list[LogFile] = field(default_factory=list)
-    """In the order in which they are read fastest."""
+    """In the order in which they are fastest to read."""
     problems: list[LogProblem] = field(default_factory=list)
     parallel: bool = True
     """Whether files can be read in parallel."""
@@ -248,7 +248,7 @@ def _unpack(
         found: the files to add to.
         path: path of the archive or compressed file.
         inside: folders that the members are in; empty if the archive is all there is.
-        beside: folders that a compressed file is in.
+        beside: folders that the archive or compressed file is in.
         archives: opens the members.
 
     Raises:
@@ -312,7 +312,7 @@ def _ending(name: str) -> str | None:
 
 
 def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFolder:
-    """List the members in their order in the archive: going back would mean reading it again."""
+    """List the members in the order of the archive: going back would mean reading it again."""
     found = LogFolder(parallel=False)
     members: dict[tuple[str, ...], tarfile.TarInfo] = {}
     try:

@@ -1,6 +1,6 @@
 """A trained model as the AWS console, deepracer-for-cloud and deepracer-on-aws store it: a folder or an archive.
 
-Nothing of it is run or unpacked. Sizes are compared with limits before anything is read into memory.
+None of it is run or unpacked. Sizes are compared with limits before anything is read into memory.
 """
 
 import json
@@ -30,7 +30,7 @@ from .tf_checkpoint import DATA, DATA_BYTES, INDEX, INDEX_BYTES, read_index, rea
 Tensors = Mapping[str, npt.NDArray[np.float32]]
 
 SMALL_FILES = ("model_metadata.json", "reward_function.py", "hyperparameters.json", "training_params.yaml")
-"""What is read of a model beside its weights, where it lies nearest to the model's own folder."""
+"""Files of a model that are read besides its weights; of several, the one nearest to the top."""
 CHECKPOINTS = "deepracer_checkpoints.json"
 NEWEST = ".coach_checkpoint"
 """Beside the checkpoints: the names of the best and the last, and of the newest."""
@@ -38,7 +38,7 @@ _ACCEPTED = "a model's folder or archive (.tar.gz, .tar, .zip) with NAME.ckpt.in
 _MOST_FILES = 100_000
 _LOGS = re.compile(r"simtrace/.*\.csv$|\.log$")
 _HEADER_BYTES = 2**20
-"""Of a long name in an archive."""
+"""Most bytes of a long name in an archive."""
 
 
 class StoredModel(NamedTuple):
@@ -48,9 +48,9 @@ class StoredModel(NamedTuple):
     source: str
     """The file of the weights, for messages."""
     name: str
-    """Of the checkpoint, `11_Step-38428.ckpt`, or the frozen graph."""
+    """Of the checkpoint, `11_Step-38428.ckpt`, or of the frozen graph."""
     is_graph: bool
-    """Whether it is a frozen graph, which has the policy alone."""
+    """Whether it is a frozen graph, which has only the policy."""
     files: Mapping[str, bytes]
     """Contents by their names in SMALL_FILES."""
     has_logs: bool
@@ -198,13 +198,13 @@ def _opened(path: str) -> Iterator[_Files]:
 
 
 class _Listing:
-    """The files found so far; refuses what would lead out of a folder or not come to an end."""
+    """The files found so far; refuses paths that lead out of the archive, and too many or too large files."""
 
     def __init__(self, path: str, most_bytes: float = LOG_BYTES) -> None:
         self.path, self._most_bytes = path, most_bytes
         self.sizes: dict[str, int] = {}
         self.given: dict[str, str] = {}
-        """Names as they stand in an archive."""
+        """Names as they are in the archive."""
         self._total = 0
 
     def add(self, name: str, size: int) -> None:

@@ -59,7 +59,7 @@ class ModelMetadata:
     sensor: tuple[str, ...] = ("FRONT_FACING_CAMERA",)
     neural_network: str = NEURAL_NETWORKS[0]
     version: int = 5
-    """Of the simulator; 5 has the newest physics that deepracer-for-cloud writes."""
+    """Of the simulator; 5 is the newest that deepracer-for-cloud writes."""
     training_algorithm: str = "clipped_ppo"
     lidar_config: LidarSectors = SERVICES_SECTORS
     given: tuple[str, ...] = field(default=(), compare=False)
@@ -200,7 +200,7 @@ def _lidar_config(file: JsonObject) -> LidarSectors:
 
 
 def model_metadata_text(metadata: ModelMetadata) -> str:
-    """Return the text of a model_metadata.json; `read_model_metadata` gives the same again."""
+    """Return the text of a model_metadata.json, which `read_model_metadata` reads back unchanged."""
     if metadata.low is not None and metadata.high is not None:
         bounds = zip(("steering_angle", "speed"), metadata.low, metadata.high, strict=True)
         space: Any = {key: {"low": low, "high": high} for key, low, high in bounds}

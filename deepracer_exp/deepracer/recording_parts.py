@@ -30,7 +30,7 @@ _NUMBER = re.compile(r"(\d{1,9})-iteration")
 _METADATA = re.compile(r"model_metadata.*\.json")
 _HYPERPARAMETERS = re.compile(r"hyper_?parameters.*?(?:\.json)?")
 _PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")
-# What lies beside the logs of a model and has no data of a recording.
+# Files that lie beside the logs of a model and hold no data of a recording.
 _BESIDE = re.compile(
     r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
     r"|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
@@ -91,7 +91,7 @@ class Parts:
                 getattr(self, part.name).extend(getattr(other, part.name))
 
     def refuse(self, file: LogFile, refused: list[tuple[int | None, str]]) -> None:
-        """List what of a file cannot be read."""
+        """List what cannot be read in a file."""
         rest = refused[MOST_LISTED:] if len(refused) > MOST_LISTED + 1 else []
         for line, reason in refused[: len(refused) - len(rest)]:
             self.problems.append(LogProblem(str(file.path), line, reason))
@@ -108,7 +108,7 @@ def read_parts(folder: LogFolder) -> Parts:
     whole = Parts(problems=list(folder.problems))
     others: list[LogFile] = []
     limit = _StepLimit()
-    # The members of an archive come out of one stream.
+    # The members of an archive are read from one stream.
     with ThreadPoolExecutor(_THREADS if folder.parallel else 1) as pool:
         found = _in_turn(pool, lambda file: _read_one(file, alone), folder.files)
         for file, (parts, known) in zip(folder.files, found, strict=True):
@@ -174,7 +174,7 @@ class _StepLimit:
 def _in_turn(
     pool: ThreadPoolExecutor, read: Callable[[LogFile], Result], files: Sequence[LogFile]
 ) -> Iterator[Result]:
-    """Read files in parallel and yield their content in their order; only a few wait to be yielded."""
+    """Read files in parallel and yield their contents in order; only a few wait to be yielded."""
     waiting: deque[Future[Result]] = deque()
     for file in files:
         waiting.append(pool.submit(read, file))
@@ -262,7 +262,7 @@ def _read_log(parts: Parts, file: LogFile) -> bool:
 
 
 def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
-    """Add the values that the file itself gives; one that cannot be used is listed, the others stay."""
+    """Add the values that the file gives; those that cannot be used are listed as problems."""
     refused: list[str] = []
     known = read_hyperparameters(file.path, raw, refused)
     parts.hyperparameters.append(

@@ -166,7 +166,7 @@ class _Assembly:
             yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
 
     def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
-        """Add the drives of a log, or its settings where its drives are known already."""
+        """Add the drives of a log, unless they are known already from CSVs or another log."""
         file = files[0]
         place = place_of(file.parts)
         if place.kind == TRAINING:
@@ -226,7 +226,7 @@ class _Assembly:
             self.problems.append(LogProblem(str(file.path), None, reason, lines=rest.table.num_rows))
 
     def _without_copies(self) -> None:
-        """Leave out drives that are there twice, as with a copy of a folder."""
+        """Leave out drives that occur twice, as with a copy of a folder."""
         known: dict[tuple[str, bytes, bytes], Drives] = {}
         for one in list(self.drives):
             times = one.table["tstamp"].to_numpy()
@@ -444,7 +444,7 @@ def _iterations_by_trial(rows: Sequence[Mapping[str, Any]]) -> list[int]:
 
 
 def _behind(numbers: Numbers, key: tuple[int, int, int]) -> int:
-    """Return a number for an episode without rows: as far behind its worker's last one as in the file."""
+    """Return a number for an episode without rows: as far after its worker's last one as in the metrics file."""
     mine = [(own, number) for (of, worker, own), number in numbers.items() if (of, worker) == key[:2]]
     if not mine:
         return key[2]

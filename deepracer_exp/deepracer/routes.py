@@ -18,7 +18,7 @@ from .worlds import FILE, ROUTES, UNITS_PER_M, worlds
 REPEAT_M = 1e-9
 """A point closer than this to the one before it repeats it."""
 FARTHEST_M = 10_000.0
-"""Larger coordinates are not metres."""
+"""Larger coordinates are refused: they are not in metres."""
 ROUTE_ROWS = "rows of 6 numbers: centre x, y, inner x, y, outer x, y in metres"
 SPACING_M = 0.15
 """Distance between two rows along knots, as in AWS's worlds of 2018 and 2019."""

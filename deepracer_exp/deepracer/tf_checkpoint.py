@@ -3,7 +3,7 @@
 `NAME.index` is a sorted table of LevelDB: name -> type, shape, place and checksum of each tensor.
 `NAME.data-00000-of-00001` has the tensors one after the other. Sources: TensorFlow,
 `core/util/tensor_bundle/tensor_bundle.cc`, `core/protobuf/tensor_bundle.proto`, `core/lib/io/format.cc`,
-`block_builder.cc`; byte for byte the index of a checkpoint that the AWS console wrote in 2020.
+`block_builder.cc`. An index equals, byte for byte, that of a checkpoint that the AWS console wrote in 2020.
 """
 
 import math
@@ -95,7 +95,7 @@ def read_tensors(index: Index, data: bytes, where: str) -> dict[str, Array]:
     for name, entry in index.entries.items():
         part = memoryview(data)[entry.offset : entry.offset + entry.size]
         if masked_crc32c(part) != entry.crc:
-            raise BadInput(f"{where}: {name}: corrupt, its checksum is another; copy the file again")
+            raise BadInput(f"{where}: {name}: corrupt, its checksum is wrong; copy the file again")
         if entry.dtype == _FLOAT:
             tensors[name] = np.frombuffer(part, "<f4").reshape(entry.shape)
     return tensors
@@ -173,14 +173,14 @@ def _checked_block(raw: memoryview, offset: int, size: int) -> memoryview:
         raise ValueError("ends early")
     (crc,) = struct.unpack_from("<I", raw, end)
     if masked_crc32c(raw[offset:end]) != crc:
-        raise ValueError("is corrupt: the checksum of a block is another")
+        raise ValueError("is corrupt: the checksum of a block is wrong")
     if raw[end - 1] != 0:
         raise ValueError("is compressed")
     return raw[offset : end - 1]
 
 
 def _rows(block: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield keys and values; each key is given by what it does not share with the one before."""
+    """Yield keys and values; each key is stored without the beginning that it shares with the one before."""
     (restarts,) = struct.unpack_from("<I", block, len(block) - 4)
     end = len(block) - 4 * (restarts + 1)
     key, at = b"", 0

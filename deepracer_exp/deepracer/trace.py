@@ -18,8 +18,8 @@ EPISODE_STATUS = (
     "park",
     "time_up",
 )
-"""The service's names; the index in the list is the code in packed rows. An episode that reaches the limit of
-steps is `time_up`."""
+"""The service's names; the position is the code in packed rows. An episode that reaches the limit of steps is
+`time_up`."""
 STATUS_CODE = {status: code for code, status in enumerate(EPISODE_STATUS)}
 
 RANDOMIZED = {

@@ -1,4 +1,4 @@
-"""Frozen graphs: what is written is read back, and nothing else is believed."""
+"""Frozen graphs: what is written is read back, and anything else is refused."""
 
 import tracemalloc
 from pathlib import Path

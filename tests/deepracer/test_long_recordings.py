@@ -25,7 +25,7 @@ def read_training_log(raw: bytes) -> TrainingLog:
 
 @pytest.fixture
 def most_steps(monkeypatch):
-    """Let so many steps be too many already."""
+    """Lower the number of steps that are held in memory."""
 
     def most(steps: int) -> None:
         monkeypatch.setattr(sim_trace, "MOST_STEPS", steps)

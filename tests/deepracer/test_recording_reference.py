@@ -69,7 +69,7 @@ def test_the_text_log_reports_the_same_rows_and_the_iteration_that_was_not_finis
     assert problem.lines == 595
 
 
-def test_the_entropy_begins_at_that_of_a_policy_that_knows_nothing(recording):
+def test_the_entropy_begins_at_that_of_a_uniform_policy(recording):
     updates = recording.updates
     assert len(updates) == 84
     assert updates["iteration"].unique().tolist() == list(range(28))
