@@ -21,7 +21,7 @@ CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
 def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tuple[dict[str, str], list[str]]:
     """Return the texts of an experiment's files by name, and a note on each value changed or beyond the console.
 
-    Values are clipped to the console's ranges. The action space is kept, because another one makes another car.
+    Hyperparameters are clipped to the console's ranges. The action space is kept, because a policy only fits its own.
     `reward` is the text of the reward function, with its constants filled in.
     """
     metadata = replace(metadata_of(actions), **sensor_keys(experiment.observation))
@@ -80,7 +80,7 @@ def _action_notes(metadata: ModelMetadata) -> list[str]:
 
 
 def hyperparameters_of(experiment: Experiment) -> Hyperparameters:
-    """Return an experiment's hyperparameters in the service's terms, with its defaults where ours has none."""
+    """Return an experiment's hyperparameters in the service's terms, with the service's default where it has none."""
     own = {}
     for key, target in TAKEN.items():
         group, name = target.split(".")

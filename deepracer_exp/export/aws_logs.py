@@ -56,7 +56,7 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
         BadInput: no episode is finished, or the folder is not empty or cannot be written.
     """
     numbered = _number(recording.steps)
-    # The service names its jobs so: the time in 14 digits, a hyphen, the rest.
+    # The service's names of jobs: the time in 14 digits, a hyphen, the rest.
     dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", recording.name)
     job = f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{recording.name}"
     learning = replace(hyperparameters_of(experiment), num_episodes_between_training=numbered.per_iteration)
@@ -124,7 +124,7 @@ def _number(steps: pd.DataFrame) -> _Numbered:
     iteration = episodes["iteration"].to_numpy(np.int64) - first
     trial = episodes.groupby("iteration").cumcount().to_numpy() + 1
     per_iteration = int(trial.max())
-    # Tools take the largest number in iteration 0 for the length of all iterations.
+    # Tools take the largest episode number in iteration 0 for the length of every iteration.
     trial[np.flatnonzero(iteration == 0)[-1]] = per_iteration
     episodes = episodes.assign(number=iteration * per_iteration + trial - 1, trial=trial, iteration=iteration)
     finished = rows[rows["episode"].isin(episodes.index)]
@@ -187,7 +187,7 @@ def _episode_line(episode: Any, driven: int, reward: float) -> str:
 
 
 def _metrics_text(numbered: _Numbered, evaluated: pd.DataFrame) -> str:
-    """Return the metrics file: an item an episode, and one an evaluation."""
+    """Return the metrics file: an item for each episode, and for each evaluation."""
     tried = {int(row["iteration"]) - numbered.first_iteration: row for row in evaluated.to_dict("records")}
     items: list[dict[str, Any]] = []
     for iteration, episodes in numbered.episodes.groupby("iteration", sort=False):

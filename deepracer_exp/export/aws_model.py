@@ -36,7 +36,7 @@ from .aws_files import aws_files
 _PIXELS = 160, 120
 _LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
 _EMPTY_GRAPH = field(2, field(4, field(1, 27)))
-"""A MetaGraphDef whose graph has no nodes; the service wants the file and reads nothing of it when it restores."""
+"""A MetaGraphDef whose graph has no nodes; the service requires the file but does not use it to restore weights."""
 
 
 def aws_model(
@@ -77,7 +77,7 @@ def _refuse_other_sensors(experiment: Experiment, metadata: ModelMetadata) -> No
     camera, lidar = experiment.observation.camera, experiment.observation.lidar
     if camera is None:
         raise BadInput(
-            "observation: has no camera, and models of the service see through one; accepted: a run with "
+            "observation: has no camera, and every model of the service has one; accepted: a run with "
             "observation=camera, stereo or camera_lidar"
         )
     if (camera.width, camera.height) != _PIXELS:
@@ -124,7 +124,7 @@ def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
 
 
 def _with_value(experiment: Experiment, networks: ActorCritic) -> tuple[ActorCritic, list[str]]:
-    """Return networks both of which see pictures, and a note if the value network is a new one."""
+    """Return networks that both see pictures, and a note if the value network is a new one."""
     network = experiment.network
     if not isinstance(network, CNNConfig) or network.critic == "pictures":
         return networks, []
@@ -136,13 +136,13 @@ def _with_value(experiment: Experiment, networks: ActorCritic) -> tuple[ActorCri
     )
     assert isinstance(fresh.value_head.module, SensorNet)
     return ActorCritic(networks.policy_head, fresh.value_head), [
-        "value network: the run's sees features, which the service does not have, so that a new one is written: the "
-        "policy races as it does here, but a training on the service has to learn the values first"
+        "value network: the run's sees features, which the service does not have, so a new one is written: the policy "
+        "races as it does here, but a training on the service has to learn the values first"
     ]
 
 
 def _training_params(experiment: Experiment) -> tuple[str, list[str]]:
-    """Return what deepracer-on-aws reads of a training's parameters, and a note if the track is not the service's."""
+    """Return the training parameters that deepracer-on-aws reads, and a note if the track is not the service's."""
     name, config = next(iter(experiment.tracks.items()))
     world, notes = None if config.file else find_world(name), list[str]()
     if world is None:

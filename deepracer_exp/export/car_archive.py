@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from deepracer_exp.agents.actor_critic import ActorCritic
 
 ENDING = ".tar.gz"
-"""The car's console takes no file with another one."""
+"""The car's console takes no file with another ending."""
 METADATA, GRAPH = "model_metadata.json", "agent/model.pb"
 
 Tensors = Mapping[str, NDArray[np.float32]]
 
 
 class Rescaling(NamedTuple):
-    """Of the outputs [steering, speed]: factor x output, clipped to -1..1, + shift; (2,) each."""
+    """How to rescale the outputs [steering, speed], clipped to -1..1: factor * output + shift; (2,) each."""
 
     factor: NDArray[np.float64]
     shift: NDArray[np.float64]
@@ -51,11 +51,11 @@ class CarArchive(NamedTuple):
     content: bytes
     metadata: ModelMetadata
     notes: list[str]
-    """On each thing that was changed, or that the car will do otherwise."""
+    """One for each change, and for each thing that the car does differently."""
 
 
 def check_car(experiment: Experiment) -> None:
-    """Refuse what the car could not load or would show the policy otherwise.
+    """Refuse a policy that the car could not load, or to which it would show something else.
 
     Raises:
         BadInput: naming the key and what would be accepted.
@@ -96,7 +96,7 @@ def car_archive(networks: "ActorCritic", experiment: Experiment, actions: Action
             f"steering from {actions.low[0]:g} to {actions.high[0]:g} degrees is written as -{lock_deg:g} to "
             f"{lock_deg:g}, and the outputs are rescaled to give the same angles: the car divides by the high end alone"
         )
-    # Or `check_car` and `to_service` had refused it.
+    # Anything else was refused by `check_car` or `to_service`.
     assert observation.camera is not None
     assert isinstance(network, CNNConfig)
     channels, height, width = observation.camera.shape
@@ -118,9 +118,9 @@ def car_archive(networks: "ActorCritic", experiment: Experiment, actions: Action
 
 
 def car_actions(actions: ActionSpace) -> tuple[ModelMetadata, Rescaling | None]:
-    """Return an action space in a form that the car scales as it is meant, and what the outputs need for it.
+    """Return an action space in a form that the car scales correctly, and the rescaling of the outputs that it needs.
 
-    The car divides steering by the high end alone, so that nothing but a range from -x to x comes out right.
+    The car divides steering by the high end alone, so that only a range from -x to x comes out right.
     """
     metadata = metadata_of(actions)
     if not isinstance(actions, ContinuousActions) or actions.low[0] == -actions.high[0]:
@@ -133,7 +133,7 @@ def car_actions(actions: ActionSpace) -> tuple[ModelMetadata, Rescaling | None]:
 
 
 def _rescaled(tensors: Tensors, rescaling: Rescaling) -> Tensors:
-    """Return the tensors with the factor and the shift in the last layer."""
+    """Return the tensors with factor and shift applied in the last layer."""
     kernel, bias = (tensors[f"{HEAD}/policy_mean/{name}"] for name in ("kernel", "bias"))
     return {
         **tensors,
@@ -143,7 +143,7 @@ def _rescaled(tensors: Tensors, rescaling: Rescaling) -> Tensors:
 
 
 def check_weights(graph: bytes, tensors: Tensors) -> None:
-    """Compare what the graph holds with the weights of the policy.
+    """Compare the weights in a graph with those of the policy.
 
     Raises:
         RunFailed: they differ.
@@ -161,7 +161,7 @@ def check_weights(graph: bytes, tensors: Tensors) -> None:
 
 
 def _lidar_config(lidar: LidarConfig) -> dict[str, float]:
-    """Return the car's own keys, all of which it needs; they are not those of the simulator."""
+    """Return the keys of the car's own `lidar_config`, all of which it needs; they differ from the simulator's."""
     from deepracer_exp.sim.lidar import ANGLES_RAD, NEAREST_M, RAYS
 
     angle_deg = round(float(np.degrees(ANGLES_RAD[-1])), 1)
@@ -170,7 +170,7 @@ def _lidar_config(lidar: LidarConfig) -> dict[str, float]:
         "min_angle": -angle_deg,
         "max_angle": angle_deg,
         "min_distance": NEAREST_M,
-        "max_distance": float(lidar.furthest_m),  # the car takes no whole number
+        "max_distance": float(lidar.furthest_m),  # the car refuses whole numbers
         "clipping_distance": float(lidar.furthest_m),
         "num_sectors": lidar.size,
     }
@@ -180,7 +180,7 @@ def _packed(files: Mapping[str, bytes]) -> bytes:
     """Return a .tar.gz with nothing in it that differs between two exports."""
     out = io.BytesIO()
     with (
-        # Weights hardly shrink, however long it takes.
+        # Weights hardly compress, at any level.
         gzip.GzipFile(filename="", mode="wb", fileobj=out, mtime=0, compresslevel=1) as packed,
         tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as archive,
     ):
@@ -195,24 +195,24 @@ def _notes(sensors: tuple[str, ...]) -> list[str]:
     notes = []
     if "STEREO_CAMERAS" in sensors:
         notes.append(
-            "STEREO_CAMERAS: the car reads the two pictures right with OpenVINO 2021, as AWS's own software does; with "
-            "TensorFlow Lite or OpenVINO 2024 (deepracer-custom-car) it mixes up their pixels"
+            "STEREO_CAMERAS: with OpenVINO 2021, as in AWS's own software, the car reads the two pictures correctly; "
+            "with TensorFlow Lite or OpenVINO 2024 (deepracer-custom-car) it mixes up their pixels"
         )
     if len(sensors) > 1:
         notes.append(
             f"{' and '.join(sensors)}: deepracer-custom-car with OpenVINO 2024 takes the two in random order, "
-            "and fails to load the model in one of them; a restart draws another"
+            "and in one of the two orders fails to load the model; a restart draws again"
         )
     if "LIDAR" in sensors:
         notes.append(
-            "lidar_config: with it the car's distances reach as far as those of the training; the service's archives "
-            "have none, with which the car's end at 0.5 m"
+            "lidar_config: with it, the car's distances reach as far as in the training; the service's archives have "
+            "none, and there they end at 0.5 m"
         )
     return notes
 
 
 def describe_commands(metadata: ModelMetadata) -> list[str]:
-    """Return a line on what the car makes of each action, of a continuous space of its ends and middle."""
+    """Return a line on what the car makes of each action; for a continuous space, of its ends and middle."""
     scale = full_scale(metadata)
     if metadata.low is not None and metadata.high is not None:
         ends = np.array([metadata.low, metadata.high])

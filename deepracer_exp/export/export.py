@@ -1,4 +1,4 @@
-"""The command `export`: write a policy as ONNX or for a car, or a run's files or logs in the layouts of AWS."""
+"""The command `export`: a policy as ONNX, for a car or as a model of the service; a run's files or logs for AWS."""
 
 import json
 import logging
@@ -33,7 +33,7 @@ from .car_archive import ENDING, car_archive, describe_commands, name_on_car
 
 POLICY, COMMAND = "policy", "command"
 CHECKED, CHECKED_PICTURES = 1000, 100
-"""Number of observations on which the file is compared with the network."""
+"""Number of observations, without and with pictures, on which the file is compared with the network."""
 TOLERANCE = 1e-4
 """Largest accepted difference, with a margin over single-precision rounding."""
 
@@ -43,7 +43,7 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
 
     Raises:
         BadInput: the run, the checkpoint or the output cannot be used, or a package is missing.
-        RunFailed: the ONNX file differs from the network.
+        RunFailed: the written file differs from the network.
     """
     run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     names = {"onnx": "policy.onnx", "car": name_on_car(run.path.name) + ENDING}
@@ -158,10 +158,10 @@ def _aws(run: StoredRun, folder: Path) -> _Written:
 class DeployedPolicy(nn.Module):
     """The deterministic policy of an actor-critic, without value network and sampling.
 
-    `observation` (N, features), or `pixels` (N, channels, height, width), bytes, and `lidar` (N, readings) -> `policy`,
-    the probabilities of the actions (N, n), of a continuous policy the mean of [steering, speed] clipped to -1..1
-    (N, 2); and `command` (N, 2), degrees (positive to the left) and metres per second: of the likeliest action, or of
-    that mean.
+    In: `observation` (N, features); or `pixels` (N, channels, height, width), bytes, and/or `lidar` (N, readings).
+    Out: `policy`, the probabilities of the actions (N, n), or for a continuous policy the mean of [steering, speed]
+    clipped to -1..1 (N, 2); and `command` (N, 2), degrees (positive to the left) and metres per second, of the
+    likeliest action or of that mean.
     """
 
     def __init__(self, networks: ActorCritic, actions: ActionSpace):
@@ -197,9 +197,9 @@ class DeployedPolicy(nn.Module):
 def write_onnx(
     model: DeployedPolicy, observed: ObservationShape, facts: Mapping[str, Any], path: Path
 ) -> float:
-    """Write the file atomically and return its largest difference from the network, on `CHECKED` observations.
+    """Write the file atomically and return its largest difference from the network on random observations.
 
-    `facts` are metadata of the file, JSON types.
+    `facts` are metadata of the file, as JSON types.
 
     Raises:
         BadInput: the required packages are not installed, or the file cannot be written.
@@ -207,7 +207,7 @@ def write_onnx(
     """
     try:
         import onnx
-        import onnxruntime  # noqa: F401 - checked before the work
+        import onnxruntime  # noqa: F401 - missing packages are reported before the work
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise BadInput(
@@ -229,7 +229,7 @@ def write_onnx(
 
 
 def _observations(observed: ObservationShape) -> list[Tensor]:
-    """Return pictures of noise, and standard normal features or readings."""
+    """Return random pictures, and standard normal features or readings, by the keys of `observed.seen` in order."""
     generator = torch.Generator().manual_seed(0)
     count = CHECKED if observed.picture is None else CHECKED_PICTURES
     return [
@@ -241,7 +241,7 @@ def _observations(observed: ObservationShape) -> list[Tensor]:
 
 
 def largest_difference(model: DeployedPolicy, content: bytes, observations: Sequence[Tensor]) -> float:
-    """Return how far any `policy` of a file is from the network's."""
+    """Return the largest difference between the outputs `policy` of a file and of the network."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()

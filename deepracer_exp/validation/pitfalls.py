@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 _SPEEDS = 5
 _LATERAL_MPS2 = (2.0, 1.0)
 """Lateral acceleration in bends; the second is used where the first leaves the track."""
-# Gains of the driver, chosen so that both the fitted car, whose wheels lag commands by half a second, and the ideal
-# car complete every track of the catalogue at 1 to 3 m/s.
+# Gains of the driver, chosen so that both the car of version 4, whose wheels lag commands by half a second, and the
+# ideal car complete every track of the catalogue at 1 to 3 m/s.
 _FORESIGHT_S = 0.25
 _AHEAD_M, _AHEAD_S = 0.45, 0.2
 _UNDERSTEER = 1.5
@@ -62,7 +62,7 @@ def drive_laps(setup: RaceSetup, speed_mps: Floats, lateral_mps2: Floats) -> lis
     Args:
         setup: the track, the car and the lowest speed, which also holds in bends.
         speed_mps: target speed of each car, (n,).
-        lateral_mps2: acceleration in bends, (n,).
+        lateral_mps2: lateral acceleration in bends, (n,).
     """
     n = len(speed_mps)
     car = setup.car

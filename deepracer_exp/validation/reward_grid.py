@@ -25,8 +25,8 @@ Sampler = Callable[..., tuple[Floats, NDArray[np.bool_]]]
 def reward_sampler(setup: RaceSetup, state: State) -> Sampler:
     """Return a function that returns the rewards of poses and whether they are off the track.
 
-    It takes the arguments of `situations.poses` but the race; both results have their broadcast shape. A reward that
-    depends on earlier calls is called with the step before first.
+    It takes the arguments of `situations.poses` after the race; both results have their broadcast shape. A reward that
+    depends on earlier calls is first called with the step before.
     """
     probe = Probe(setup)
 
@@ -49,7 +49,7 @@ class RewardGrid:
     headings_rad: Floats
     """Against the centre line, (H,)."""
     offsets_m: Floats
-    """To the left of the centre line, (W,)."""
+    """To the left of the centre line, in ascending order, (W,)."""
     reward: Floats
     """By speed, position, heading and offset, (3, P, H, W)."""
     off_track: NDArray[np.bool_]
@@ -68,7 +68,7 @@ class RewardGrid:
 
 
 def sample_reward_grid(setup: RaceSetup, rewards: Sampler, detail: float) -> RewardGrid:
-    """Sample the rewards of a grid all over the track; `detail` is 1, or less for slow functions."""
+    """Sample the rewards on a grid over the whole track; `detail` is 1, or less for slow functions."""
     low, high = setup.actions.low, setup.actions.high
 
     def points(n: int) -> int:

@@ -135,7 +135,7 @@ def _draw_course(axes: Axes, setup: RaceSetup) -> None:
     axes.plot(
         *np.stack([track.inner[0], track.outer[0]]).T, color=INK, linewidth=3.0, zorder=4, path_effects=halo
     )
-    # An arrow ahead of the start line shows which way round.
+    # An arrow ahead of the start line shows the driving direction.
     pose = track.start_pose(np.array([0.35, 0.9]) / track.length_m)
     tail, head = zip(pose.x.tolist(), pose.y.tolist(), strict=True)
     look = {"arrowstyle": "-|>,head_width=0.35,head_length=0.7", "color": INK, "linewidth": 2.2}
@@ -152,7 +152,7 @@ def _draw_cuts(
         axes = figure.add_axes((left + k * (width + gap), bottom, width, height))
         mean = np.nanmean(of.reward[k], axis=0) if np.isfinite(of.reward[k]).any() else of.reward[k][0]
         _draw_cut(axes, mean, (of.offsets_m, np.degrees(of.headings_rad)), colors, norm)
-        # Left of the road is on the left.
+        # The left side of the road is on the left.
         axes.set_xlim(*axes.get_xlim()[::-1])
         for border in (-half_m, half_m):
             axes.axvline(border, color=GROUND, linewidth=2.6)

@@ -22,7 +22,7 @@ class Situations:
     """Params of n situations on one road."""
 
     columns: dict[str, np.ndarray]
-    """`env.params.COLUMNS`, each (n,), `closest_waypoints` (n, 2)."""
+    """`rewards.params.COLUMNS`, each (n,), `closest_waypoints` (n, 2)."""
     road: TrackParams
 
     def __len__(self) -> int:
@@ -78,9 +78,9 @@ def poses(
     *,
     lateness: ArrayLike = 1.0,
 ) -> Poses:
-    """Return poses with the number of steps it takes to get there; the arguments are broadcast together.
+    """Return poses, with the number of steps it takes to get there; the arguments are broadcast together.
 
-    `lateness` is the number of steps taken so far relative to driving at the commanded speed.
+    `lateness` is the number of steps taken so far, relative to driving at the commanded speed all the way.
     """
     values = np.broadcast_arrays(ndist, offset_m, heading_error_rad, speed_mps, steering_deg, lateness)
     ndist_, offset_m_, error_rad, speed, steering, late = (np.array(v, np.float64).ravel() for v in values)

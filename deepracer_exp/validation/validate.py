@@ -1,4 +1,4 @@
-"""The command `validate`: check a reward function, print the findings, draw the map, train for a moment."""
+"""The command `validate`: check a reward function, print the findings, draw the map, train briefly."""
 
 import shlex
 from collections.abc import Mapping, Sequence

@@ -57,7 +57,7 @@ def exported(*overrides: str) -> Exported:
         experiment.network, observation_shape(experiment.observation), actions.n, generator
     )
     layers = [module for module in networks.policy_head.modules() if isinstance(module, nn.Linear)]
-    with torch.no_grad():  # a fresh head is all but indifferent
+    with torch.no_grad():  # a fresh head's outputs hardly differ
         layers[-1].weight.mul_(300.0)
         layers[-1].bias.normal_(generator=generator)
     return Exported(DeployedPolicy(networks, actions).eval(), car_archive(networks, experiment, actions))

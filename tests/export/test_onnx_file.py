@@ -30,7 +30,7 @@ def policy(*overrides: str, seed: int = 0) -> tuple[ActorCritic, ActionSpace]:
     actions = build_action_space(experiment.action_space)
     generator = torch.Generator().manual_seed(seed)
     networks = build_actor_critic(experiment.network, SHAPE, actions.n, generator)
-    with torch.no_grad():  # a fresh head is all but indifferent
+    with torch.no_grad():  # a fresh head's outputs hardly differ
         for parameter in networks.policy_head.parameters():
             parameter.mul_(3.0)
     return networks, actions

@@ -38,7 +38,7 @@ def laps(race: RaceSetup) -> list[DrivenLap]:
 
 @pytest.fixture
 def race_with(race: RaceSetup, tmp_path: Path) -> Callable[..., RaceSetup]:
-    """Return the race with the reward function of a text."""
+    """Return the race with a reward function given as text."""
 
     def build(text: str, time_limit_s: float = 60.0) -> RaceSetup:
         file = tmp_path / "mine.py"
@@ -51,7 +51,7 @@ def race_with(race: RaceSetup, tmp_path: Path) -> Callable[..., RaceSetup]:
 
 @pytest.fixture
 def coarsely(laps: list[DrivenLap], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ask fewer questions than a racer would want asked, and drive the laps once."""
+    """Sample fewer situations than the command does, and drive the laps once."""
 
     def driven(setup: RaceSetup) -> list[DrivenLap]:
         same = (setup.track.name, setup.track.reversed, setup.actions.n) == ("reinvent_base", False, 15)
@@ -65,7 +65,7 @@ def coarsely(laps: list[DrivenLap], monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None) -> Callable[..., Check]:
-    """Find out everything about the reward function of a text."""
+    """Check a reward function given as text, completely."""
 
     def build(text: str, time_limit_s: float = 60.0) -> Check:
         check = Check(setup=race_with(text, time_limit_s), console=[])

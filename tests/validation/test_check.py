@@ -117,7 +117,7 @@ def test_a_constant_reward_is_reported_in_one_line(check_of):
     assert "always returns 1, whatever the car does" in found
 
 
-def test_a_reward_of_chance_is_reported(check_of):
+def test_a_random_reward_is_reported(check_of):
     found = check_of(function("return random.random()", "import random\n")).warnings
     assert any("draws random numbers" in line for line in found)
 
