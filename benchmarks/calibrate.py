@@ -100,10 +100,8 @@ class Fit(NamedTuple):
 
     car: CarConfig
     observer: Observer
-    cost: float
-    """Of the recordings, a window."""
     undetermined: tuple[str, ...] = ()
-    """Parameters that the recordings do not determine; they are where they began."""
+    """Parameters that the recordings do not determine; they keep their first values."""
 
 
 def fit(
@@ -128,15 +126,13 @@ def fit(
         observer: where its gains begin.
     """
     parameters = list(parameters)
-    found, known = _solve(car, observer, windows, parameters, evaluations, Fit(car, observer, np.inf))
+    found, known = _solve(car, observer, windows, parameters, evaluations, Fit(car, observer))
     undetermined: list[str] = []
     while parameters and min(known) < _UNDETERMINED:
         least = parameters.pop(int(np.argmin(known)))
         undetermined.append(least.key)
         begin = dataclasses.replace(found.car, **{least.key: getattr(car, least.key)})
-        found, known = _solve(
-            car, observer, windows, parameters, evaluations, Fit(begin, found.observer, np.inf)
-        )
+        found, known = _solve(car, observer, windows, parameters, evaluations, Fit(begin, found.observer))
     return found._replace(undetermined=tuple(undetermined))
 
 
@@ -148,7 +144,7 @@ def _solve(
     evaluations: int,
     begin: Fit,
 ) -> tuple[Fit, list[float]]:
-    """Fit from `begin` on with the prior around the given car; return what share of each parameter is known by it."""
+    """Fit from `begin` with the prior around the given car; return also how well each parameter is known, 0 to 1."""
     count = len(parameters)
     every = (*parameters, *GAINS)
     centre = np.array([_to_scale(p, _value(p.key, car, observer)) for p in every])
@@ -183,11 +179,9 @@ def _solve(
         xtol=1e-4,
     )
     prior = len(solved.fun) - len(every) + np.arange(len(every))
-    off = solved.fun[: prior[0]]
-    cost = float(np.sum(np.sqrt(1.0 + off**2) - 1.0)) / len(windows)
     variance = np.diag(np.linalg.inv(solved.jac.T @ solved.jac))
     known = 1.0 - variance * solved.jac[prior, np.arange(len(every))] ** 2
-    return Fit(*driven(solved.x), cost), [float(one) for one in known[:count]]
+    return Fit(*driven(solved.x)), [float(one) for one in known[:count]]
 
 
 def _value(key: str, car: CarConfig, observer: Observer) -> float:
@@ -231,7 +225,7 @@ def _comment(key: str, option: str) -> list[str]:
 
 
 def parameter_table(before: CarConfig, fitted: Fit, parameters: Sequence[Parameter]) -> str:
-    """Return what became of the parameters as text."""
+    """Return the parameters before and after the fit as text."""
     rows = [
         (
             p.key,

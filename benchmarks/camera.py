@@ -41,7 +41,6 @@ TRACKS = ("reinvent_base", "2022_summit_speedway_cw", "Spain_track")
 BOXES = 40
 WIDTH, HEIGHT = 160, 120
 ROUNDS = 5
-WANTED = {"times": 100.0, "difference_of_255": 4.0}
 
 
 def service_lens(width: int, height: int) -> Lens:
@@ -164,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--poses", type=int, default=200)
     options = parser.parse_args(arguments)
     if "MUJOCO_GL" not in os.environ:
-        # MuJoCo reads it when it is imported, which has happened.
+        # MuJoCo reads it when it is imported, which has already happened.
         os.environ["MUJOCO_GL"] = "egl"
         os.execv(sys.executable, [sys.executable, "-m", "benchmarks.camera", *(arguments or sys.argv[1:])])
     summary = compare_with_mujoco(options.poses)
