@@ -7,7 +7,7 @@ the last 50 training episodes completed the lap, or until the budget's end. Read
 over all cars and wall seconds since the start of the process until then (null where the budget ended the run), the
 share of laps among the last 50 episodes, and the fastest lap of the whole training, in simulated seconds.
 
-Seconds mean something with one job only; several share the cores.
+Seconds are meaningful only with one job; several share the cores.
 """
 
 import tempfile

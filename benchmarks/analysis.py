@@ -12,8 +12,8 @@ and settings. deepracer-utils reads the training with the one call that its docu
 `DeepRacerLog(...).load()`: of a console archive from the text log, of others from the CSVs. `read_ratio_csv` is the
 harder comparison, with its quickest way to all drives: training and evaluations from the CSVs, races from the logs.
 
-With `--long-gb` also a report of a text log of so many gigabytes, the longest log of the folder again and again:
-`long_s`, `long_peak_gb`, `long_steps` in the log. Of it the last steps are held (deepracer/sim_trace.py).
+With `--long-gb` also a report of a text log of so many gigabytes, the longest log of the folder repeated: `long_s`,
+`long_peak_gb`, and `long_steps` in the log, of which the last are held in memory (deepracer/sim_trace.py).
 
 Wanted: at most 20 s and 1.5 GB on two cores for the 44,247 steps of the console training, `read_ratio` at least 1.
 """
@@ -41,7 +41,7 @@ WANTED = {"report_s": 20.0, "peak_gb": 1.5, "read_ratio": 1.0}
 REPORTS = 3
 _STEP = re.compile(rb"(.*?SIM_TRACE_LOG:)(\d+),(.*)", re.DOTALL)
 _TIME = 13
-"""Place of the time stamp among the values behind the episode's number."""
+"""Place of the time stamp among the values after the episode's number."""
 
 
 def report(path: Path, page: Path) -> tuple[float, float]:
@@ -115,7 +115,7 @@ def measure_long(path: Path, gigabytes: float) -> dict[str, float]:
 
 
 def write_long_log(source: Path, target: Path, size_bytes: int) -> int:
-    """Write the log again and again, whole, until the target has the size; return the number of trace lines.
+    """Write the whole log repeatedly until the target has the size; return the number of trace lines.
 
     Lines that number episodes themselves are left out: their numbers would differ from those of the steps.
 

@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 
 
 def command_line(*arguments: str) -> list[str]:
-    """Return `deepracer-exp ARGUMENTS` of the environment this Python is of."""
+    """Return `deepracer-exp ARGUMENTS` of this Python's environment."""
     return [str(Path(sys.executable).with_name("deepracer-exp")), *arguments]
 
 
@@ -51,7 +51,7 @@ def trained(folder: Path, overrides: Sequence[str]) -> Path:
 
 
 def at_once(jobs: int, calls: Sequence[Callable[[], Result]]) -> list[Result]:
-    """Make the calls, so many at once, and return their results in order; the first failure calls off the rest."""
+    """Make the calls, `jobs` at once, and return their results in order; the first failure cancels the rest."""
     with ThreadPoolExecutor(jobs) as pool:
         waiting = [pool.submit(call) for call in calls]
         try:

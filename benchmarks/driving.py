@@ -40,12 +40,12 @@ def scalar_setup(experiment: Experiment) -> RaceSetup:
 class SameDriving:
     """One pass of random driving that can be timed with the whole environment and with the physics alone.
 
-    Both times the same cars do the same: the actions are drawn beforehand, the race begins again from its seed, and
+    The same cars do the same both times: the actions are drawn beforehand, the race begins again from its seed, and
     every step of the bare physics starts from the state in which the environment's began.
     """
 
     def __init__(self, experiment: Experiment, n_cars: int):
-        """Drive the pass once to write down each step's state."""
+        """Drive the pass once to record each step's state."""
         setup = scalar_setup(experiment)
         self._env = RaceEnv(Race(setup, n_cars, threads=1))
         torch.manual_seed(experiment.seed)
@@ -92,7 +92,7 @@ class SameDriving:
 
 
 class _Noting:
-    """Cars that note the state in which each of their steps begins, its command, and the state after the last one."""
+    """Cars that record the state in which each step begins, its command, and the state after the last step."""
 
     def __init__(self, cars: CarBatch):
         self._cars = cars

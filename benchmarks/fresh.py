@@ -1,4 +1,4 @@
-"""Stored policies put to a test that did not choose them."""
+"""Stored policies raced on fresh laps, by which none of them was chosen."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -17,15 +17,15 @@ from deepracer_exp.runs.resolve import resolve
 
 TRIALS = 64
 _SEED = 20_181_128
-"""Of what held-out conditions draw; a training's evaluations have 0."""
+"""Seed of the held-out conditions; a training's evaluations have 0."""
 _SHIFT = 0.25
-"""Of the places where laps begin, as a share of their distance: evaluations of a training begin at multiples of an
-eighth and sixteenth of the lap."""
+"""Shift of the starts, as a share of the distance between them: evaluations of a training start at multiples of an
+eighth or a sixteenth of the lap."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Driven:
-    """What a policy did, single laps from standing starts all around the track."""
+    """How a policy drove single laps from standing starts all around the track."""
 
     completion: float
     """Per cent of the lap, mean; usual conditions."""

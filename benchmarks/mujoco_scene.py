@@ -31,7 +31,7 @@ from deepracer_exp.tracks.track import Track
 _UNSEEN_M = 1e-3
 """Thickness of what is flat; dashes lie half of it above the road."""
 _HIDDEN_M = 1e-4
-"""By which a box stands out of those of its other faces' colours."""
+"""How far the faces of one colour stand out of the boxes that have the colours of the other faces."""
 
 
 def build_scene(

@@ -1,4 +1,4 @@
-"""Does a policy of pictures drive under conditions it has never seen? With and without image randomisation in training.
+"""Does a camera policy drive under conditions it has never seen? With and without image randomization in training.
 
     python -m benchmarks.picture_conditions [--seeds 5] [--steps 200000] [--json FILE] [OVERRIDE...]
 
@@ -9,8 +9,8 @@ taking the most probable action, under each of these conditions:
 
 - `usual`: none of it;
 - `trained on`: every quantity drawn from the range that the second has trained with;
-- one quantity at a time, all others at rest, half a range beyond the range's end: below and above it, where values
-  beyond that end make sense. Neither has ever seen these.
+- one quantity at a time, all others off, half a range beyond the range's end: below and above it, where values beyond
+  that end make sense. Neither has ever seen these.
 - `all beyond`: every quantity drawn from a range of twice the width.
 
 Completion is the mean share of the lap that was driven, 0 to 1. Intervals are those of the mean over seeds (95 %, t).

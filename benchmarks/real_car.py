@@ -1,4 +1,4 @@
-"""What is lost between the simulator and the physical car? For a camera policy trained with and without `sim2real`.
+"""What does a camera policy lose between the simulator and the physical car, trained with and without `sim2real`?
 
     python -m benchmarks.real_car [--seeds 5] [--folder FOLDER] [--json FILE] [OVERRIDE...]
 
@@ -6,10 +6,10 @@ For each seed a policy that sees features is trained for TEACHER_STEPS with `ran
 policies learn that see what the car sees (`observation=camera`), ITERATIONS of `algorithm=distill` each, at a falling
 learning rate: one in the simulator as it is, one with `randomization=sim2real`. Their last policies then drive laps
 from STARTS starts spread evenly over the lap under `evaluation=real_car`: as in the simulator, with each of the car's
-ways alone, and with all of them.
+differences from it alone, and with all of them.
 
 `lap_share` is the share of complete laps, `completion` the mean share of the lap that was driven, `lap_time_s` the mean
-of the complete laps. Intervals are those of the mean over seeds (95 %, t); `gain` is with less without, seed by seed.
+of the complete laps. Intervals are those of the mean over seeds (95 %, t); `gain` is with minus without, seed by seed.
 
 FOLDER keeps runs and results, so that a second call continues the first; overrides are those of the two policies.
 """
@@ -45,7 +45,7 @@ def drive(run: Path) -> Figures:
 
 
 def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figures]:
-    """Train and drive with one seed, as far as the folder does not have it."""
+    """Train and drive with one seed whatever the folder does not have yet."""
     folder.mkdir(parents=True, exist_ok=True)
     every = ["stopping=none", "checkpoints.every=null", "tracking=off", "report=false", f"seed={seed}"]
     driven = {}
@@ -68,7 +68,7 @@ def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figu
 
 
 def summarize(seeds: Sequence[dict[str, Figures]]) -> dict[str, Any]:
-    """Return mean and interval of each figure by what is as on the car, with, without, and the gain."""
+    """Return mean and interval of each figure with, without, and of the gain, by what is as on the car."""
     found: dict[str, Any] = {}
     for name in seeds[0]["with"]:
         found[name] = {}

@@ -27,7 +27,7 @@ BANDS = {"low": (0.0, 1.5), "middle": (1.5, 2.5), "high": (2.5, np.inf)}
 """Mean commanded speed over a window, m/s: from, to below."""
 _EVERY_ROWS = 5
 _TRIED = 1000
-"""Windows by which the version of a recording is found that does not state it."""
+"""Windows by which the version of a recording is found if the recording does not state it."""
 _RESAMPLED = 500
 _CONFIDENCE = 0.95
 _ARCHIVE = re.compile(r"\.(?:tar|tgz|tar\.(?:gz|bz2|xz)|(?:log|txt)\.(?:gz|bz2|xz))$")
@@ -128,14 +128,14 @@ def _nearest(cars: dict[int, CarConfig], windows: Windows) -> int:
 
 
 def held_out(iteration: NDArray[np.int64]) -> Mask:
-    """Say of each window whether it belongs to an iteration that is not fitted to: every fourth, or the last of few."""
+    """Return for each window whether its iteration is held out of the fit: every fourth, or the last of fewer."""
     iterations = np.unique(iteration)
     held: Mask = np.isin(iteration, iterations[3::4] if len(iterations) > 3 else iterations[-1:])
     return held
 
 
 def join(parts: Sequence[Windows]) -> Windows:
-    """Return the windows of several recordings as one; episodes keep apart."""
+    """Return the windows of several recordings as one; their episodes stay distinct."""
     apart, begin = [], 0
     for part in parts:
         apart.append(part.episode + begin)
@@ -155,7 +155,7 @@ def mean_speed_mps(windows: Windows) -> Floats:
 
 
 def in_band(windows: Windows, band: str) -> Mask:
-    """Say of each window whether its mean commanded speed is in a band."""
+    """Return for each window whether its mean commanded speed is in a band."""
     low, high = BANDS[band]
     mean_mps = mean_speed_mps(windows)
     inside: Mask = (mean_mps >= low) & (mean_mps < high)
@@ -163,7 +163,7 @@ def in_band(windows: Windows, band: str) -> Mask:
 
 
 def sample(windows: Windows, most: int, seed: int) -> Windows:
-    """Return at most so many windows, as many of each band as there are, or an equal share."""
+    """Return at most `most` windows: an equal share from each band, or all of a smaller one."""
     rng = np.random.default_rng(seed)
     groups = [rng.permutation(np.flatnonzero(in_band(windows, band))) for band in BANDS]
     chosen: list[NDArray[np.intp]] = []

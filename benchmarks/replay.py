@@ -206,13 +206,13 @@ class Errors(NamedTuple):
 
     @property
     def distance_m(self) -> Floats:
-        """How far the prediction is off."""
+        """Distance between prediction and recording."""
         distance: Floats = np.hypot(self.x_m, self.y_m)
         return distance
 
 
 def errors(predicted: Floats, windows: Windows) -> Errors:
-    """Hold predicted poses, (M, steps, 3), against the recorded ones."""
+    """Return how far predicted poses, (M, steps, 3), are from the recorded ones."""
     off = predicted - windows.truth
     return Errors(off[..., 0], off[..., 1], np.pi - np.remainder(np.pi - off[..., 2], 2.0 * np.pi))
 

@@ -5,13 +5,13 @@
 A small run, once undisturbed; and once killed (SIGKILL, all its processes) at random moments and continued each time by
 `deepracer-exp resume RUN`. What must be equal bit for bit at the end: the last checkpoint's networks, optimizer and
 schedule, all rows of metrics.jsonl but their times, and the simulation trace; and MLflow must have each point of
-metrics.jsonl once. The killed run's rows are held against the undisturbed one's, its points against its own rows.
+metrics.jsonl once. The killed run's rows are compared with the undisturbed one's, its points with its own rows.
 
-A moment is drawn uniformly from the start of the process on: over the time that it takes to begin and twice its share
-of what is left to do, so that the kills spread over the whole run and some fall into the beginning. The last is drawn
-over all that is left. A kill before the run has a folder is followed by a new `deepracer-exp train`. Should a run
-end before its moment, everything is put back as it was before that process, and a moment within the time it took is
-drawn.
+The moment of a kill is drawn uniformly from the start of the process on: over the time that it takes to begin plus
+twice its share of the work left, so that the kills spread over the whole run and some fall into the beginning. The last
+is drawn over all the work left. A kill before the run has a folder is followed by a new `deepracer-exp train`. If a run
+ends before its moment, everything is restored to what it was before that process, and a moment within the time it took
+is drawn.
 """
 
 import contextlib
@@ -116,7 +116,7 @@ def killed(
             known_s = took_s
             shutil.rmtree(folder)
             as_it_was.rename(folder)
-            print(f"at its end before its moment came: back to iteration {before}", flush=True)
+            print(f"ended before it was to be killed: back to iteration {before}", flush=True)
             continue
         kill = {
             "after_s": round(took_s, 2),
@@ -130,7 +130,7 @@ def killed(
 
 
 def compare(whole: Path, resumed: Path) -> dict[str, str | None]:
-    """Say for each thing that must be equal what differs; None for what does not."""
+    """Return for each thing that must be equal what differs; None for what does not."""
     lasts = [(run / "checkpoints" / "last").resolve() for run in (whole, resumed)]
     named = lasts[0].name != lasts[1].name
     return {
@@ -142,7 +142,7 @@ def compare(whole: Path, resumed: Path) -> dict[str, str | None]:
 
 
 def different_in_mlflow(run: Path) -> str | None:
-    """Say what MLflow has not, or not once, of a run's metrics."""
+    """Return which of a run's metrics MLflow does not have exactly once."""
     from mlflow import MlflowClient
 
     client = MlflowClient(tracking_uri=f"sqlite:///{run.parents[1].resolve() / 'mlflow.db'}")
@@ -158,7 +158,7 @@ def different_in_mlflow(run: Path) -> str | None:
 
 @contextlib.contextmanager
 def _started(folder: Path, *arguments: str) -> "Iterator[subprocess.Popen[bytes]]":
-    """Start a command; in the end kill it and all that it has started."""
+    """Start a command; at the end kill it and all that it has started."""
     with (folder / "output.txt").open("ab") as output:
         process = subprocess.Popen(
             command_line(*arguments),
@@ -211,7 +211,7 @@ def _run_in(folder: Path) -> Path | None:
     """Return the run that can be continued."""
     runs = [path.parent for path in folder.glob("runs/*/*/config.yaml")]
     if len(runs) > 1:
-        raise SystemExit(f"{folder}: {len(runs)} runs: a continued run has got a new folder")
+        raise SystemExit(f"{folder}: {len(runs)} runs: a resumed run has got a new folder")
     return runs[0] if runs else None
 
 
@@ -226,11 +226,11 @@ def _rows(run: Path) -> int:
 
 
 def _hit(run: Path | None, before: int, iterations: int, since: float) -> str:
-    """Say what a process was at when it was killed.
+    """Return what a process was doing when it was killed.
 
     Args:
         run: its folder.
-        before: the iteration it went on from.
+        before: the iteration it resumed from.
         iterations: of the whole run.
         since: when it was started, seconds since the epoch.
     """

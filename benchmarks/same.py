@@ -1,4 +1,4 @@
-"""Whether two runs are the same, bit for bit, save for what clocks say."""
+"""Whether two runs are the same, bit for bit, except for times."""
 
 import json
 import math
@@ -20,17 +20,17 @@ History = Mapping[str, Sequence[tuple[int, float]]]
 
 
 def different_rows(one: Sequence[Row], other: Sequence[Row]) -> str | None:
-    """Say where two runs' metrics differ first, None where they are the same."""
+    """Return where two runs' metrics first differ, None if they are the same."""
     for number, (left, right) in enumerate(zip(one, other, strict=False), 1):
         for key in {**left, **right}:
-            # JSON text holds every bit of a number, and takes NaN for the same as NaN.
+            # JSON text keeps every bit of a number, and NaN equals NaN.
             if key not in TIMES and json.dumps(left.get(key)) != json.dumps(right.get(key)):
                 return f"row {number}: {key} is {left.get(key)} and {right.get(key)}"
     return None if len(one) == len(other) else f"{len(one)} and {len(other)} rows"
 
 
 def different_tensors(one: Path, other: Path) -> str | None:
-    """Say which tensor of two checkpoints' agents (networks, optimizer, schedule) differs first.
+    """Return which tensor of two checkpoints' agents (networks, optimizer, schedule) differs first.
 
     Args:
         one, other: folders of checkpoints.
@@ -43,7 +43,7 @@ def different_tensors(one: Path, other: Path) -> str | None:
 
 
 def different_traces(one: Path, other: Path) -> str | None:
-    """Say which column of two runs' traces differs."""
+    """Return which column of two runs' traces differs first."""
     left, right = (read_trace(run / "trace") for run in (one, other))
     if len(left) != len(right):
         return f"{len(left)} and {len(right)} rows"
@@ -51,16 +51,16 @@ def different_traces(one: Path, other: Path) -> str | None:
 
 
 def different_points(rows: Sequence[Row], history: History) -> str | None:
-    """Say what MLflow lacks of a run's metrics, or has twice.
+    """Return what MLflow lacks of a run's metrics, or has twice.
 
-    Of times only the steps are compared: an iteration that was done again took another time.
+    Of times only the steps are compared: a repeated iteration takes another time.
     """
     wanted: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
         for key, value in row.items():
             if key != "env_steps" and value is not None and math.isfinite(value):
                 wanted.setdefault(metric_name(key), []).append((row["env_steps"], float(value)))
-    # What the run came to at its end is no row's.
+    # The evaluation of the best checkpoint, recorded at the end, is in no row.
     for key in {key for key in {**wanted, **history} if not key.startswith(BEST)}:
         expected, found = (_points(key, of.get(key, ())) for of in (wanted, history))
         if expected != found:
@@ -74,7 +74,7 @@ def _points(key: str, points: Sequence[tuple[int, float]]) -> "Counter[Any]":
 
 
 def _agent(folder: Path) -> dict[str, bytes]:
-    """Return the contents of an agent's files; of an archive those of its members, since it has dates as well."""
+    """Return the contents of an agent's files; of archives, which have dates, those of their members."""
     contents: dict[str, bytes] = {}
     place = Checkpoint.manifest(folder)["components"]["agent"]["path"]
     for file in sorted(path for path in (folder / place).iterdir() if path.is_file()):

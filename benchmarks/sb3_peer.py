@@ -1,4 +1,4 @@
-"""Stable-Baselines3's PPO on the same cars: what `benchmarks.throughput` holds the training against.
+"""Stable-Baselines3's PPO on the same cars: what `benchmarks.throughput` compares the training with.
 
     python -m benchmarks.sb3_peer --iterations 20 [--physics-threads 0] [--torch-threads 1] [--car-racing] [OVERRIDE...]
 
@@ -61,7 +61,7 @@ class Convolutions(BaseFeaturesExtractor):
 
 
 class SB3Cars(VecEnv):
-    """A `DeepRacerVectorEnv` in Stable-Baselines3's interface, with as little in between as it allows."""
+    """A `DeepRacerVectorEnv` behind Stable-Baselines3's interface, with as little overhead as that allows."""
 
     def __init__(self, cars: DeepRacerVectorEnv):
         self.cars = cars

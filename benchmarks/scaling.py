@@ -1,4 +1,4 @@
-"""What a sweep asks of its database, of MLflow and of the disk, and what these two servers stand here.
+"""What a sweep demands of its database, of MLflow and of the disk, and what load these two servers bear here.
 
     python -m benchmarks.scaling --storage postgresql+psycopg://racer@127.0.0.1/study --tracking http://127.0.0.1:5000
 
@@ -43,7 +43,7 @@ _CLIENTS = (1, 8, 32)
 
 
 class Relay:
-    """Passes connections on to a server, and counts them, the requests of HTTP and the bytes either way."""
+    """Passes connections on to a server, and counts them, the HTTP requests and the bytes either way."""
 
     def __init__(self, host: str, port: int):
         self._to = (host, port)
@@ -87,7 +87,7 @@ class Relay:
 
 
 def commits(storage: Storage) -> int:
-    """Return how many transactions the database has seen end; what it reports late is there after a second."""
+    """Return how many transactions have ended in the database, whose statistics are up to a second late."""
     time.sleep(1.2)
     seen = sa.text(
         "SELECT xact_commit + xact_rollback FROM pg_stat_database WHERE datname = current_database()"
@@ -108,7 +108,7 @@ def through(relay: Relay, url: str) -> str:
 
 
 def real_sweep(args: argparse.Namespace, folder: Path, iterations: int) -> dict[str, Any]:
-    """Return what a sweep of the default experiment asks for, of so many iterations a trial."""
+    """Return what a sweep of the default experiment demands, with `iterations` in each trial."""
     database, tracking = Relay(*host_and_port(args.storage, 5432)), Relay(*host_and_port(args.tracking, 80))
     storage = open_storage(args.storage, folder)
     before, written = commits(storage), wal_bytes(storage)
@@ -149,7 +149,7 @@ def size(path: Path) -> int:
 
 
 def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Return what one call of those that are made again and again costs, with studies of several sizes."""
+    """Return the cost of one call of each kind that is made repeatedly, with studies of several sizes."""
     relay, found = Relay(*host_and_port(args.storage, 5432)), {}
     direct = open_storage(args.storage, folder)
     storage = open_storage(through(relay, args.storage), folder)
@@ -180,7 +180,7 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 
 def fill(storage: Storage, study: str, trials: int) -> None:
-    """Give a study so many trials that have ended, of the size that those of the default experiment have."""
+    """Give a study `trials` finished trials, as large as those of the default experiment."""
     run = {
         "run_dir": "x" * 120,
         "reason": "x" * 60,
@@ -208,7 +208,7 @@ def fill(storage: Storage, study: str, trials: int) -> None:
 
 
 def renewals_a_second(args: argparse.Namespace, folder: Path, clients: int, seconds: float = 8.0) -> float:
-    """Return how many leases the database renews, asked by so many clients, each connection for one transaction."""
+    """Return how many leases a second the database renews for `clients`, with a connection for each transaction."""
     storage, study = open_storage(args.storage, folder), f"rate-{uuid.uuid4().hex[:8]}"
     claims = [TrialClaims(storage.engine, study).claim(f"bench:{n}:a", clients, 3600) for n in range(clients)]
     return rate(
@@ -218,7 +218,7 @@ def renewals_a_second(args: argparse.Namespace, folder: Path, clients: int, seco
 
 
 def batches_a_second(args: argparse.Namespace, clients: int, seconds: float = 8.0) -> float:
-    """Return how many iterations, of 20 metrics each, MLflow's server takes from so many clients."""
+    """Return how many iterations a second, of 20 metrics each, MLflow's server takes from `clients`."""
     client = MlflowClient(tracking_uri=args.tracking)
     known = client.get_experiment_by_name("scaling-rate")
     experiment = known.experiment_id if known else client.create_experiment("scaling-rate")
@@ -233,7 +233,7 @@ def batches_a_second(args: argparse.Namespace, clients: int, seconds: float = 8.
 
 
 def rate(calls: list[Callable[[], object]], seconds: float) -> float:
-    """Return how often a second the calls are answered, each made again and again by a thread of its own."""
+    """Return how many calls a second are answered, each made repeatedly by a thread of its own."""
     until = time.monotonic() + seconds
 
     def again(call: Callable[[], object]) -> int:

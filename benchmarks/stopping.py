@@ -9,7 +9,7 @@ beginning of that one: the rule is applied to its metrics.jsonl. One run, the fi
 run with the rule; it must end after the same iteration with the same metrics and best, or this benchmark fails.
 
 The kept checkpoint is the best one of the beginning by the evaluations every few iterations, the other the best of the
-whole run. (A run that ends has its last policy evaluated, too; of the beginning that is not known.) Then both drive
+whole run. (When a run ends, its last policy is evaluated, too; the beginning lacks that evaluation.) Then both drive
 again: 64 laps on usual and 64 on held-out conditions, with starts and draws that no evaluation of the training had, so
 that the figures are not those by which they were chosen.
 
@@ -22,7 +22,7 @@ that the figures are not those by which they were chosen.
 The tracks differ in length and shape: the default one (17.7 m, 0.76 m wide), the narrowest (Oval_track, 19.6 m, 0.67 m
 wide) and a real circuit more than three times as long, driven clockwise (Spain_track, 60.0 m).
 
-The thresholds of the rule were chosen by looking at the seeds 0 to 4 of these tracks; `--first-seed 5` asks seeds that
+The thresholds of the rule were chosen by looking at the seeds 0 to 4 of these tracks; `--first-seed 5` takes seeds that
 no one has looked at.
 
 `--reuse DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark continues,
@@ -71,7 +71,7 @@ def best_within(run: Path, iteration: int) -> str:
         SystemExit: none had been evaluated by then.
     """
     folders = sorted(path for path in run.glob("checkpoints/[0-9]*") if int(path.name) <= iteration)
-    # Each knows the best until then, so that a resumed training does.
+    # Each stores the best until then, for a resumed training.
     best = read_training(folders[-1])["best"] if folders else None
     if best is None:
         raise SystemExit(f"{run}: no policy was evaluated within {iteration} iterations")
@@ -79,7 +79,7 @@ def best_within(run: Path, iteration: int) -> str:
 
 
 def prove(full: Path, stopped: Path, iteration: int, kept: str) -> dict[str, Any]:
-    """Hold a run that its rule has really ended against the beginning of the full one.
+    """Compare a run that its rule has really ended with the beginning of the full one.
 
     Args:
         full: the run without a rule.
@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Train in `folder` what is not there yet, and measure."""
+    """Train what is not in `folder` yet, and measure."""
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     places = [(track, seed) for track in options.tracks.split(",") for seed in seeds]
     overrides = partial(training_overrides, steps=options.steps, overrides=options.overrides)

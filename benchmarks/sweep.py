@@ -99,11 +99,11 @@ def winner_of(found: Sequence[Ended], objective: str, rerank: int, again: Callab
 
 
 def figures(ended: Sequence[Ended], minutes: float, unpruned: Sequence[Ended]) -> dict[str, Any]:
-    """Return what a way to make the trials came to, without its laps.
+    """Return the figures of one way to prune the trials, without those of its laps.
 
     Args:
         ended: its trials.
-        minutes: that it took.
+        minutes: how long it took.
         unpruned: the same trials without pruning.
     """
     steps, every = (sum(one.env_steps for one in each) for each in (ended, unpruned))
@@ -154,7 +154,7 @@ def markdown(result: dict[str, Any]) -> str:
 
 
 def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Make in `folder` what is not there yet, and measure."""
+    """Run what is not in `folder` yet, and measure."""
     torch.set_num_threads(1)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     overrides = [*READY, *options.overrides]
@@ -204,7 +204,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     evaluations = max(len(course.points) for course in courses) or None
     for rival in RIVALS:
         ended[rival] = again(courses, build_pruner(replace(config, pruners=(rival,)), evaluations), rival)
-    # Start, re-ranking and page, and what the model of the workers leaves out.
+    # Start, re-ranking and report, and what the model of the workers leaves out.
     besides_s = max(noted["seconds"] - makespan_s(ended[OWN]), 0.0)
 
     test = fresh(request.protocol, config.rerank_laps)

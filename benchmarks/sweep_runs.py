@@ -1,4 +1,4 @@
-"""The runs of a sweep, the same trials trained to the end of their budget, and what another pruner makes of these.
+"""The runs of a sweep, the same trials trained to the end of their budget, and how another pruner would end these.
 
 A pruner sees nothing of a trial but the values it reports and their steps. So the values of a complete training,
 reported to a study in memory step by step, give the decisions that the pruner would have made during that training; a
@@ -35,7 +35,7 @@ from .command import command_line, read_metrics, read_summary
 from .fresh import stored_policy
 
 _LEFT_BEHIND = ("trace", TRACKING)
-"""Of a trial's run: most of its bytes, and its run in MLflow."""
+"""Not copied from a trial's run: most of its bytes, and its link to MLflow."""
 _NOTED, _SCORES = "sweep_started.json", "scores.json"
 _NOTE_S = 5.0
 
@@ -115,7 +115,7 @@ def replay(
 def _worker(
     study: optuna.Study, waiting: Iterator[Course], outcome: str, pace: Pace, ended: list[Ended]
 ) -> Iterator[float]:
-    """Make trial after trial; yield the time of the next event, which happens at the next call."""
+    """Run trial after trial; yield the time of the next event, which happens at the next call."""
     now_s = 0.0
     for course in waiting:
         trial, began_s, pruned_at = study.ask(), now_s, None
@@ -185,7 +185,7 @@ def started(overrides: Sequence[str], folder: Path) -> dict[str, Any]:
 
 
 def refuse_others(request: SweepRequest) -> None:
-    """Refuse sweeps whose trials are not one run each from scratch.
+    """Refuse sweeps other than local ones of one objective whose trials are one run each from scratch.
 
     Raises:
         SystemExit: naming the key.
@@ -204,7 +204,7 @@ def refuse_others(request: SweepRequest) -> None:
 
 
 def whole_run(run: Path, folder: Path) -> Path:
-    """Return a copy of a trial's run that has used its budget; a copy that is in `folder` already is resumed.
+    """Return a copy of a trial's run, resumed until it has used its budget; a copy already in `folder` is reused.
 
     It may have failed on the way: trials do.
 
@@ -242,7 +242,7 @@ def _is_whole(run: Path) -> bool:
 
 
 def hold_against(trial: FrozenTrial, course: Course) -> None:
-    """Refuse a trial whose complete run reports something else than the trial has reported to Optuna.
+    """Refuse a trial whose complete run reports something other than the trial reported to Optuna.
 
     Raises:
         SystemExit: naming the trial and the difference.

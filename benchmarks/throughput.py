@@ -1,10 +1,10 @@
-"""Control steps per second, from bare physics to a whole training, each beside what it is held against.
+"""Control steps per second, from bare physics to a whole training, each beside what it is compared with.
 
     python -m benchmarks.throughput [--seconds 3] [--rounds 7] [--cars 256] [--json FILE] [OVERRIDE...]
 
 A step is one control step (1/15 s) of one car. Everything is the default experiment unless overridden.
 
-- `physics_steps_per_s`: `CarBatch.drive` alone, tyres and MuJoCo, one thread, 256 cars. It is given the very commands
+- `physics_steps_per_s`: `CarBatch.drive` alone, tyres and MuJoCo, one thread, 256 cars. It gets exactly the commands
   and starts of the next figure's driving and is checked to end in the same state; only the time inside the call
   counts.
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
@@ -171,7 +171,7 @@ def summarize(rates: Rates) -> dict[str, Any]:
     middle = {name: round(statistics.median(values), 1) for name, values in rates.items()}
     ratios = {}
     for name, above, below, wanted in RATIOS:
-        if below not in rates:  # CarRacing-v3 is held only against learning from pictures
+        if below not in rates:  # only learning from pictures is compared with CarRacing-v3
             continue
         by_round = [a / b for a, b in zip(rates[above], rates[below], strict=True)]
         ratios[name] = {
