@@ -44,7 +44,7 @@ TRACKS = (
     "reinvent_concrete",
     "reinvent_wood",
 )
-"""Of all kinds: 6 to 69 m long, 0.6 to 1.4 m wide, three floors."""
+"""Of all kinds: 6 to 69 m long, 0.6 to 1.4 m wide, on several floors."""
 
 
 def measure(option: str, track: Track, overrides: Sequence[str]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """What stopping in time saves, and what it costs.
 
     python -m benchmarks.stopping [--seeds 5] [--first-seed 0] [--tracks A,B,C] [--jobs 2] [--steps 3000000]
-                                  [--reuse DIR] [--json FILE] [OVERRIDE...]
+                                  [--trials 64] [--reuse DIR] [--json FILE] [OVERRIDE...]
 
 For each track and seed, `deepracer-exp train` runs the default experiment for the full budget, without a stopping
 rule. Since a seed gives the same run every time (synchronous collection), the run that `stopping=entropy` ends is the

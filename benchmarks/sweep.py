@@ -1,6 +1,6 @@
 """What pruning by entropy saves a sweep, and what it costs, compared with Optuna's pruners.
 
-    python -m benchmarks.sweep [--trials 60] [--workers 2] [--reuse DIR] [--json FILE] [OVERRIDE...]
+    python -m benchmarks.sweep [--trials 60] [--workers 2] [--laps 64] [--reuse DIR] [--json FILE] [OVERRIDE...]
 
 1. `deepracer-exp sweep sweep=lr_entropy track=reinvent_base` really runs, with its defaults (MLflow included).
 2. Its trials that were ended early are resumed, without stopping rule and pruner, until they have used their budget, in

@@ -295,7 +295,7 @@ def _as_rewards(value: object, n: int) -> NDArray[np.float64]:
         raise Unusable(_no_reward(value)) from error
     if rewards.shape != (n,) or rewards.dtype.kind not in "biuf":
         shape = f"{rewards.dtype} of shape {rewards.shape}"
-        raise Unusable(f"returned {shape}; accepted: one number a car, shape ({n},)")
+        raise Unusable(f"returned {shape}; accepted: one number per car, shape ({n},)")
     return rewards.astype(np.float64)
 
 

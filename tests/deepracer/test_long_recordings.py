@@ -34,7 +34,7 @@ def most_steps(monkeypatch):
     return most
 
 
-def test_of_a_log_longer_than_memory_the_last_steps_are_held_and_the_others_counted(most_steps):
+def test_the_last_steps_of_a_log_too_long_for_memory_are_kept_and_the_others_counted(most_steps):
     raw = "".join(made.log_text(made.drives([episode], seed=episode)) for episode in range(4000)).encode()
     assert len(raw) > 2**21
     lines = raw.count(b"SIM_TRACE_LOG")
@@ -68,7 +68,7 @@ def test_memory_does_not_grow_with_a_log_of_nothing_but_steps(most_steps):
     assert peak_of_arrow((LINE * 50_000).encode()) > 5 * short
 
 
-def test_of_many_files_the_first_of_the_training_go_and_evaluations_stay(tmp_path, most_steps):
+def test_of_many_files_the_first_training_steps_are_dropped_and_evaluations_stay(tmp_path, most_steps):
     made.write_folder(made.console(), tmp_path)
     whole = read_recording(tmp_path)
     training = (whole.steps["stream"] == "training").sum()
@@ -88,7 +88,7 @@ def test_of_many_files_the_first_of_the_training_go_and_evaluations_stay(tmp_pat
     assert all(str(tmp_path) in problem.file for problem in reported)
 
 
-def test_of_a_run_of_ours_the_last_iterations_are_read(trained, most_steps):
+def test_the_last_iterations_of_our_own_run_are_read(trained, most_steps):
     folder = trained().folder
     trace = read_trace(folder / "trace")
     counts = np.bincount(trace["iteration"])
@@ -107,7 +107,7 @@ def test_of_a_run_of_ours_the_last_iterations_are_read(trained, most_steps):
     assert len(last.updates) == np.count_nonzero(counts)  # iterations are numbered from 1
 
 
-def test_of_a_rolled_log_the_oldest_pieces_go(tmp_path, most_steps):
+def test_the_oldest_pieces_of_a_rolled_log_are_dropped(tmp_path, most_steps):
     pieces = {".10": [0, 1], ".2": [2, 3], ".1": [4, 5], "": [6, 7]}
     for ending, episodes in pieces.items():
         log = made.log_text(made.drives(episodes, seed=episodes[0] + 1))
@@ -119,7 +119,7 @@ def test_of_a_rolled_log_the_oldest_pieces_go(tmp_path, most_steps):
     assert set(read_recording(tmp_path).steps["episode"]) == {6, 7}
 
 
-def test_of_several_workers_the_first_iterations_go(tmp_path, most_steps):
+def test_the_first_iterations_of_several_workers_are_dropped(tmp_path, most_steps):
     made.write_folder(made.drfc_workers(), tmp_path)
     whole = read_recording(tmp_path)
     counts = whole.steps.groupby("iteration").size()

@@ -75,7 +75,7 @@ def test_settings_are_found_in_every_layout_that_has_them(place, layout):
 
 
 @pytest.mark.parametrize("name", ["ip/hyperparameters.json", "sagemaker.log"])
-def test_one_hyperparameter_of_another_kind_is_listed_and_the_others_stay(tmp_path, name):
+def test_a_hyperparameter_that_is_not_accepted_is_listed_and_the_others_are_kept(tmp_path, name):
     known = {**made.HYPERPARAMETERS, "exploration_type": "additive_noise", "sac_alpha": 0.3}
     files = made.training_csvs("training-simtrace")
     files[name] = json.dumps(known)

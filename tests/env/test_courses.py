@@ -143,7 +143,7 @@ def test_a_start_inside_an_open_course_is_refused_among_others(setup_of):
         setup_of(*THREE, "episode.start_offset=0.5")
 
 
-def test_a_floor_is_felt_by_its_own_cars(setup_of):
+def test_a_floor_acts_on_its_own_cars_alone(setup_of):
     """On ice a car is slow to start, and the car beside it on the road is not."""
     setup = setup_of("track=[reinvent_base,Oval_track]", "track.reinvent_base.floor.friction=0.05")
     race = Race(setup, 2)

@@ -63,8 +63,8 @@ def test_the_vector_environment_is_made_by_name():
     env.close()
 
 
-def test_one_batch_of_cars_is_as_good_as_gymnasiums_row_of_single_cars():
-    """What each car gives over 100 steps, the infos of ended episodes included; their starts differ by car."""
+def test_one_batch_of_cars_equals_gymnasiums_vector_of_single_cars():
+    """Over 100 steps, the infos of ended episodes included; all cars start at one place, as single cars do."""
     overrides = ["action_space=continuous", "episode.max_steps=35", "episode.start_advance=0"]
     ours = DeepRacerVectorEnv(3, overrides)
     row = SyncVectorEnv([lambda: DeepRacerEnv(overrides)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)

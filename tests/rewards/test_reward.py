@@ -329,7 +329,7 @@ def test_a_batch_function_is_called_once_for_all_active_cars() -> None:
         (
             "return None",
             None,
-            "returned object of shape (); accepted: one number a car, shape (3,) (3 cars)",
+            "returned object of shape (); accepted: one number per car, shape (3,) (3 cars)",
         ),
         ("return params['x'][:2]", None, "returned float64 of shape (2,)"),
         ("return params['x'] * 1j", None, "returned complex128 of shape (3,)"),

@@ -139,7 +139,7 @@ def test_a_module_that_cannot_be_run_is_bad_input(check_of):
 
 def test_a_reward_batch_that_fails_is_a_failure(check_of):
     check = check_of(GOOD + "\n\ndef reward_batch(params):\n    return 1.0\n")
-    assert "one number a car" in check.failures[0]
+    assert "one number per car" in check.failures[0]
 
 
 @pytest.mark.parametrize(
