@@ -63,7 +63,7 @@ def by_episode(trace: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 @pytest.fixture
 def disturb_commands(monkeypatch) -> Callable[[Race], list]:
-    """Write down what reaches the cars of a race: steering in degrees, speed, and whether they may move."""
+    """Record what reaches the cars of a race: steering in degrees, speed, and whether they may move."""
 
     def spy(race: Race) -> list:
         log, through = [], race._batch.drive

@@ -65,7 +65,7 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
     rules = RaceRules(setup, cars)
     source = RewardSource("follow", "follow.py", FOLLOW + FOLLOW_MANY, "", {}, {})
     reward = RewardFunction(source, cars, 30.0, None)
-    # The service does not write where an episode began: it is where the first progress says.
+    # The service does not log where an episode began; the first progress implies it.
     first = rows.groupby("episode").first()
     begun = setup.track.project(first[["X", "Y"]].to_numpy()).ndist - first["progress"].to_numpy() / 100
     rules.reset(start_ndist=begun % 1)
@@ -164,7 +164,7 @@ def test_episodes_end_where_and_why_they_ended(both):
     rows, ours = both
     differs = ours["status"] != rows["episode_status"]
     assert differs.sum() <= 5
-    # Only a wheel on the border can be seen otherwise: the log has no lean of the car.
+    # Only a wheel on the border may be judged differently: the log does not have the car's lean.
     assert set(rows["episode_status"][differs]) | set(ours["status"][differs]) <= {"off_track", "in_progress"}
     np.testing.assert_array_equal(ours["done"].astype(bool)[~differs], rows["done"][~differs])
 

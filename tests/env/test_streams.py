@@ -27,7 +27,7 @@ def test_another_seed_or_car_gives_other_numbers(one, other):
 
 
 def test_every_stream_has_numbers_of_its_own():
-    """A seed's, a purpose's, a car's and a stream's number do not stand for one another."""
+    """The numbers of seed, purpose, car and stream are not interchangeable."""
     numbers = [
         CarStreams(seed, [car], purpose).at(0, number).random(50)
         for seed, purpose, car, number in itertools.product((0, 1, 2), Purpose, (0, 1, 2), (0, 1, 2, 700))

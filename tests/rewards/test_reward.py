@@ -46,7 +46,7 @@ def function(
     prints: RewardPrints | None = None,
     **overrides: float,
 ) -> RewardFunction:
-    """Make a reward of a module, or of the body of a function where there is no `def`."""
+    """Build a reward function from the text of a module, or of a function's body if there is no `def`."""
     text = body if "def " in body else f"def reward_function(params):\n    {body}\n"
     digest = hashlib.sha256(text.encode()).hexdigest()
     source = RewardSource("mine", "/somewhere/mine.py", text, digest, dict(overrides), overrides)

@@ -1,4 +1,4 @@
-"""The camera against rays followed one by one, which know of nothing but geometry."""
+"""The camera against rays that are followed one by one through the geometry."""
 
 import math
 from dataclasses import replace
@@ -138,7 +138,7 @@ def followed(track: Track, pose: np.ndarray, lens: Lens, per_pixel: int) -> np.n
     [(0.1, 0.0, (0.0, 0.0, 0.0)), (0.4, 0.2, (0.5, 0.05, -0.04)), (0.8, -0.25, (-2.0, -0.08, 0.06))],
 )
 def test_a_pixel_is_the_mean_of_what_its_rays_meet(name, ndist, side, angles):
-    """Of the far centre line only the colour that dashes run together to is drawn: it and dashes count as one."""
+    """The far centre line has the colour that its dashes run together to: this and `dash` count as one material."""
     track = world_track(name)
     pose = pose_on(track, ndist, side, angles)
     ours, theirs = shares(name, pose)[0], followed(track, pose[0], LENS, 16)

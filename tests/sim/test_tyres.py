@@ -79,7 +79,7 @@ def test_braking_and_sliding_are_bounded_by_friction():
     slid = cars.read()
     lost = 3.5 - np.hypot(slid.speed_mps, slid.lateral_mps)
     assert (lost <= most * CAR.control_period_s * 1.001).all()
-    # Across, nothing but friction is in the way, and all of it.
+    # Sideways only friction brakes, and all of it.
     assert lost[1] > 0.9 * most * CAR.control_period_s
 
 

@@ -1,4 +1,4 @@
-"""The worlds of the service, held against its own route files and against what it recorded."""
+"""The worlds of the service, compared with its own route files and with recordings."""
 
 import numpy as np
 import pytest
