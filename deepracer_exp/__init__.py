@@ -48,7 +48,7 @@ _MODULES = {
     "tracking.tracker": ("Tracker",),
     "training.trainer": ("Callback", "Trainer", "TrainResult"),
 }
-"""The modules of the classes; a worker process imports only those that the user's own classes derive from."""
+"""The module of each class; a worker process imports only those whose classes the user's own classes derive from."""
 
 
 def __getattr__(name: str) -> Any:

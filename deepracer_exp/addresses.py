@@ -1,4 +1,4 @@
-"""Passwords in addresses of servers and databases: removed where text comes in, put back to connect.
+"""Passwords in addresses of servers and databases: removed where text comes in, restored to open a connection.
 
 In between, the program has only addresses without passwords, so that nothing it prints or writes can contain one.
 """

@@ -55,7 +55,7 @@ def writing(
         what: as for `reading`.
         accepted: as for `reading`.
         failure: raised in its place.
-        also: another error to turn.
+        also: another type of error to turn.
     """
     try:
         yield

@@ -45,7 +45,7 @@ class Watchdog:
         self._waiting.set()
         self._over = threading.Event()
         self.verdict: dict[int, str] = {}
-        """Why each worker that was ended was ended, by its number."""
+        """Why workers were ended, by their numbers."""
         self.first_dead: int | None = None
         """The worker whose process ended first."""
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)

@@ -86,8 +86,8 @@ class EpisodeRules:
     ) -> np.ndarray:
         """Return each car's status code, (N,) int64, for its control steps and its progress in per cent.
 
-        The prepare step is step 1; `moved_m` is the distance since the step before; off the track, no wheel is on the
-        road. Where several rules hold, the service's priority decides: time_up, lap_complete, then the others.
+        The prepare step is step 1; `moved_m` is the distance since the step before, and `off_track` means that no wheel
+        is on the road. Where several rules hold, the service's priority decides: time_up, lap_complete, the others.
         """
         config = self._config
         running = steps > 1
@@ -322,7 +322,7 @@ class RaceRules:
         return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
 
     def _wheels_on_road(self) -> Bools:
-        """Return which wheel centres are on the road, (N, 4), on a level car: from x, y and yaw, as logged."""
+        """Return which wheel centres are on the road, (N, 4); the cars count as level, as in the service's log."""
         now = self.now
         cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
         wheel_x, wheel_y = self._wheels.T

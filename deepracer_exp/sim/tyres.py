@@ -196,7 +196,7 @@ def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ign
 
 @njit(cache=True)
 def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignore[no-untyped-def]
-    """Advance a car's steering and the command that its motors follow by physics step `step` of a control period's.
+    """Advance a car's steering, and the command that its motors follow, by one physics step.
 
     A command takes effect after the car's delay: in part in the physics step in which the delay ends.
 
