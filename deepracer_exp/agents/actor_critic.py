@@ -26,9 +26,8 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "e
 _HIDDEN_GAIN, _POLICY_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
 _CRITIC_HIDDEN = (64, 64)
 """Units of a value network that sees features beside a policy that sees pictures."""
-_INITIAL_STD = (
-    0.5  # of a continuous policy, unless a network of the user's own has an attribute `initial_std`
-)
+_INITIAL_STD = 0.5
+"""Of a continuous policy on a network of the user's own that has no attribute `initial_std`."""
 
 
 class ActorCritic(nn.Module):
@@ -36,8 +35,8 @@ class ActorCritic(nn.Module):
 
     Attributes:
         trunk: The shared part, -> `hidden`; None for separate networks.
-        policy_head: What follows the trunk to the policy; all of it without a trunk.
-        value_head: What follows the trunk to the value; all of it without a trunk.
+        policy_head: The policy's layers after the trunk; without a trunk, all of them.
+        value_head: The value's layers after the trunk; without a trunk, all of them.
     """
 
     def __init__(
@@ -51,14 +50,12 @@ class ActorCritic(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """What collectors carry: what is seen -> `action` and `action_log_prob`, on these very parameters.
+        """What collectors drive with: what is seen -> `action` and `action_log_prob`; it shares these parameters.
 
-        What is seen is `observation`, or `pixels` and `lidar` where there are such sensors.
-
-        It samples; `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action.
-        A discrete action is an int64 index of shape [...], a continuous one two unbounded float32 numbers,
-        which the environment clips to -1..1. The distribution's parameters are written beside them
-        (`logits`, or `loc` and `scale`).
+        What is seen is `observation`, or `pixels` and `lidar` where there are such sensors. It samples;
+        `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action. A discrete action is
+        an int64 index of shape [...], a continuous one two unbounded float32 numbers, which the environment clips to
+        -1..1. The distribution's parameters are written beside them (`logits`, or `loc` and `scale`).
         """
         if self.trunk is None:
             return self.policy_head
@@ -90,7 +87,7 @@ def build_actor_critic(
 
     Args:
         network: Sizes and kind, or a class of the user's own: a `torch.nn.Module` called with the numbers of inputs and
-            outputs, of which there is one for the policy and one for the value. With a camera the inputs are channels,
+            outputs, once for the policy and once for the value. With a camera the inputs are channels,
             height and width of `pixels`; the number of a LIDAR's readings follows as an argument of its own.
         observed: What there is to read.
         action_count: Number of discrete actions, or None for the two continuous ones.
@@ -155,12 +152,12 @@ class SensorNet(nn.Module):
     """Convolutions for pictures, layers for a LIDAR, and a perceptron that joins them.
 
     Called with what there is of pictures, uint8 [..., channels, height, width], and readings, float32 [..., readings];
-    returns float32 [..., outputs]. Beside pictures, products are in bfloat16 on a GPU, and on processors with matrix
+    returns float32 [..., outputs]. With pictures, products are in bfloat16 on a GPU, and on processors with matrix
     units for it (Intel AMX: three times as fast).
     """
 
     def __init__(self, config: CNNConfig, observed: ObservationShape, outputs: int | None) -> None:
-        """Build the layers; without `outputs` the last hidden layer is what comes out."""
+        """Build the layers; without `outputs` the last hidden layer is the output."""
         super().__init__()
         activation = _ACTIVATIONS[config.activation]
 
@@ -219,8 +216,8 @@ class SensorNet(nn.Module):
 class Attention(nn.Module):
     """A weighted sum of the places of a column of a picture, [n, channels, height, width] -> [n, channels, 1, width].
 
-    The weights of a column's places sum to 1, so that what is seen keeps its direction. Source: deepracer-simapp,
-    `bundle/markov/presets/left_stereo_attention.py`.
+    The weights of a column's places sum to 1; columns stay apart, so that the direction of what is seen is kept.
+    Source: deepracer-simapp, `bundle/markov/presets/left_stereo_attention.py`.
     """
 
     def __init__(self, channels: int, units: int) -> None:

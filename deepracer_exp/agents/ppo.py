@@ -23,7 +23,7 @@ from .schedules import Schedule, build_schedule
 _CPU = torch.device("cpu")
 _PICTURES_AT_ONCE = 1024
 _TEMPERATURE = 0.1
-"""Of a teacher's distribution of actions."""
+"""Temperature to which a teacher's distribution of actions is sharpened."""
 _VALUE_LOSSES = {"huber": "smooth_l1", "mean squared error": "l2"}
 _LOSS_NAMES = {"loss_objective": "policy loss", "loss_critic": "value loss", "loss_entropy": "entropy"}
 
@@ -49,10 +49,10 @@ class UpdateMetrics:
 
 
 class _Loss(ClipPPOLoss):
-    """ClipPPOLoss for distributions that know their entropy.
+    """ClipPPOLoss for distributions with an entropy in closed form.
 
     The library's version looks at every entropy of the minibatch and falls back to sampling where one is not
-    finite, which would end in torch.multinomial's complaint instead of the name of the offender.
+    finite, which would end in an error of torch.multinomial instead of the name of what is not finite.
     """
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
@@ -298,11 +298,11 @@ class Distillation(PPO):
     """PPO that first learns to act like a teacher.
 
     For `teacher_iterations` the policy's loss is the KL divergence of its distribution of actions from the teacher's,
-    in the states that the policy's own driving leads to (DAgger, Ross et al. 2011). Before that the teacher's
-    distribution is sharpened, as in policy distillation (Rusu et al. 2015): policies here take actions at random
-    until the end, and what they would like best is clearer than what they do. Every step is learned from once, in
-    small minibatches: with labels there is less to gain from a second look than from another step. The value network
-    learns as in PPO, which follows.
+    in the states that the policy's own driving leads to (DAgger, Ross et al. 2011). The teacher's distribution is
+    sharpened first, as in policy distillation (Rusu et al. 2015): policies here sample their actions to the end, and
+    their likeliest action is better than a sampled one. Every step is learned from once, in small minibatches: with
+    labels there is less to gain from a second look than from another step. The value network learns as in PPO, which
+    follows.
     """
 
     def __init__(
@@ -314,7 +314,7 @@ class Distillation(PPO):
         teacher: TensorDictModuleBase,
         device: torch.device = _CPU,
     ) -> None:
-        """Set up both; the teacher keeps its weights."""
+        """Set up PPO and the teacher, whose weights stay as they are."""
         super().__init__(actor_critic, config, schedule, seed, device)
         self._teacher = teacher.to(device)
         self._imitates = False

@@ -1,7 +1,7 @@
 """Learning-rate schedules, as factors of `algorithm.lr`.
 
-Pure functions of the progress: a resumed or cloned run needs no replay of past steps, and lengths may be in
-iterations or in fractions of the budget, neither of which torch.optim.lr_scheduler's step counting can say.
+Functions of the progress, where torch.optim.lr_scheduler counts steps: lengths may be fractions of the budget, and a
+resumed run needs no replay of past steps. Only `adaptive_kl` has a state.
 """
 
 import math
@@ -34,7 +34,7 @@ class Schedule:
         raise NotImplementedError
 
     def observe(self, kl: float) -> None:
-        """Take note of how far the last update moved the policy (KL divergence)."""
+        """Take note of how far the last update moved the policy: KL divergence in nats."""
 
     def state_dict(self) -> dict[str, float]:
         """Return what a resumed run needs of `observe`."""
@@ -55,7 +55,7 @@ class PresetSchedule(Schedule):
         """Return the product of warm-up and decay."""
         by_iteration = self._config.by == "iteration"
         position = iteration if by_iteration else fraction
-        # The first of n warm-up iterations is worth 1/n, the last the full rate.
+        # The first of n warm-up iterations has 1/n of the rate, the last all of it.
         return self._warmup(iteration + 1 if by_iteration else fraction) * self._decay(position)
 
     def observe(self, kl: float) -> None:

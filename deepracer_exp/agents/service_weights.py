@@ -1,4 +1,4 @@
-"""The parameters of our networks as the tensors of the service's: names and layouts of its TensorFlow models.
+"""Our networks' parameters as tensors of the service's TensorFlow models: their names and layouts.
 
 Source: deepracer-simapp, `rl_coach/architectures/tensorflow_components` (embedder, general_network, heads, savers), and
 the index of a checkpoint of the AWS console.
@@ -31,14 +31,14 @@ _LOG_STD = f"{POLICY_HEAD}/policy_log_std"
 _RESCALER = "gradients_from_head_0-0_rescalers"
 """A factor on gradients that the service keeps among the weights of each network; always 1."""
 _LOG_STD_RANGE = (-20.0, 3.0)
-"""To which the service clips the logarithm of the standard deviation."""
+"""Range to which the service clips the logarithm of the standard deviation."""
 _UNUSED = re.compile(r"/target/|/(?:Adam(?:_1)?|Variable|global_step)$|(?:^|/)beta[12]_power$")
-"""Tensors beside the weights that the service acts by: target networks, optimizer, counters."""
+"""Tensors other than the weights that the service drives with: target networks, optimizer, counters."""
 
 
 class _Layer(NamedTuple):
     name: str
-    """Of the service, without `/kernel` and `/bias`."""
+    """The service's, without `/kernel` and `/bias`."""
     module: nn.Linear | nn.Conv2d
     inputs: npt.NDArray[np.int64] | None = None
     """Our number of each of the service's inputs; None: the same."""
@@ -70,9 +70,8 @@ class _Layer(NamedTuple):
             weight[self.inputs] = kernel
             weight = weight.T
         with torch.no_grad():
-            self.module.weight.copy_(
-                torch.from_numpy(weight.copy())
-            )  # of a file's bytes it could not be written
+            # Copies, because arrays over a file's bytes are read-only.
+            self.module.weight.copy_(torch.from_numpy(weight.copy()))
             self.module.bias.copy_(torch.from_numpy(bias.copy()))  # type: ignore[union-attr]
 
 
@@ -134,8 +133,8 @@ def match_service(
         where: file of the tensors, for messages.
 
     Returns:
-        The tensors by the names of `to_service`; and what there is none for: scopes or names of what a frozen graph
-        does not hold (the value network, the standard deviation).
+        The tensors by the names of `to_service`; and what has none, because a frozen graph does not hold it: the value
+        network by its scope, the standard deviation by its name.
 
     Raises:
         BadInput: a tensor is missing, has another shape, is not finite, or is none of these networks'.
@@ -234,8 +233,8 @@ def _trunk(net: nn.Module, scope: str, sensors: Sequence[str]) -> Iterator[_Laye
     odd = [one for one in net.modules() if not isinstance(one, known)]
     if odd:
         raise BadInput(
-            f"network: has {type(odd[0]).__name__} layers; the service's networks have convolutions, dense layers and "
-            "network.activation=relu alone"
+            f"network: has {type(odd[0]).__name__} layers; the service's networks have only convolutions, dense layers "
+            "and network.activation=relu"
         )
     if not isinstance(net.embedder, nn.Identity):
         raise BadInput(

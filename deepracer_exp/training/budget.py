@@ -26,7 +26,7 @@ from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, INTERRUPTED
 _log = logging.getLogger(__name__)
 
 _PATIENCE_S = 20.0
-"""That an alert may take."""
+"""Time that an alert may take."""
 _REFRESH_S = 10.0  # between two looks at what other runs have used
 _TAIL_BYTES = 16_384  # more than any line of metrics.jsonl
 _WORDS: dict[str, Callable[[float], str]] = {
@@ -65,7 +65,7 @@ class Budget:
     def used(self, env_steps: int, iterations: int, wall_clock_s: float) -> tuple[str, float]:
         """Return the limit that is nearest and the share of it that is used, 1 or more once it is reached.
 
-        Of a limit of the experiment, the share is that of what the other runs have left: 0 at this run's start.
+        Of a limit of the experiment, the share is that of what the other runs leave: 0 at this run's start.
         """
         shares = []
         for limit, own, others, most in self._spent(env_steps, iterations, wall_clock_s):
@@ -184,7 +184,7 @@ class Alerts:
         self._threads: list[threading.Thread] = []
 
     def send(self, message: str, run_dir: Path) -> None:
-        """Send a message of a run; what goes wrong is logged."""
+        """Send a message of a run; errors are logged."""
         for wanted, how in ((self._command, self._run), (self._address, self._post)):
             if wanted is not None:
                 arguments = (wanted, message, run_dir)

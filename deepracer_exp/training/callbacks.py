@@ -65,8 +65,8 @@ def standard_callbacks(
         names: what a racer calls the choices.
         tracker: records the run.
         console: shows the progress.
-        own: the caller's; they see evaluations and stopping rule, and come before anything is recorded: their columns
-            of `trainer.row` are, and what they refuse is not.
+        own: the caller's, called after evaluation and stopping rule and before anything is recorded: columns that they
+            add to `trainer.row` are recorded, and an iteration at which one raises is not.
 
     Raises:
         BadInput: files or values of the evaluation or the alerts cannot be used.
@@ -229,7 +229,7 @@ class ReportCallback(Callback):
         write_pictures(trainer.folder.path, trainer.setup.courses)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
-        """Write report.html, unless the run may be resumed or did not learn: then there is nothing to report."""
+        """Write report.html if `report` is on and the run is over, with at least one iteration."""
         if trainer.experiment.report and trainer.iteration and result.status in (FINISHED, STOPPED_EARLY):
             result.note = _write_page(trainer.folder.path, trainer.experiment.car)
 
@@ -327,7 +327,7 @@ class BestCallback(Callback):
         """Iteration and env steps of the policy, what it was ranked by, its rank and its evaluation, JSON types."""
 
     def on_batch(self, trainer: Trainer, finished: Finished) -> None:
-        """Save a policy that drove better than any before; the update makes another one of it."""
+        """Save a policy that drove better than any before, ahead of its update."""
         if not self._by_driving:
             return
         rank = self._ranking.rank(finished)
@@ -373,7 +373,7 @@ class BestCallback(Callback):
 
 def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration."""
-    # Half a second of import that no training waits for.
+    # Imported here: it takes half a second, which the start of a training need not wait for.
     import pandas as pd
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -392,7 +392,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
 
 
 def _write_page(run_dir: Path, car: CarConfig) -> str | None:
-    """Write `report.html`; return a line where there is none: nothing that happens here spoils a training."""
+    """Write `report.html`; return a line if that fails: no error here ends a training."""
     try:
         from deepracer_exp.analysis.findings import findings
         from deepracer_exp.analysis.log_report import LogPage, write_page

@@ -39,14 +39,14 @@ class Clone:
     start: tuple[ActorCritic, Lineage]
     """The networks to begin with, and whose they were."""
     notes: tuple[str, ...]
-    """What the user is to know of it, a line each."""
+    """Notes for the user, a line each."""
 
 
 def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | None) -> Clone:
-    """Read the parent and its checkpoint, and change its configuration; the checkpoint may no longer be removed.
+    """Read the parent and its checkpoint, and change its configuration; the checkpoint is pinned.
 
     Args:
-        overrides: `run=` (it is there), perhaps `checkpoint=`, and what is to be different from the parent.
+        overrides: `run=` (required), perhaps `checkpoint=`, and what differs from the parent.
         runs_dir: where the parent is.
         tracking_uri: where ids and aliases are looked up; None: in `runs_dir`.
 
@@ -92,7 +92,7 @@ def _changed(parent: StoredRun, changes: Sequence[str]) -> Composition:
     if "runs_dir" not in keys:
         composition.mapping["runs_dir"] = str(parent.path.parent.parent)
     if parent.experiment.teacher is not None and "teacher" not in keys:
-        # What it had to teach, the parent has learned.
+        # The parent has already learned from it.
         composition.mapping["teacher"] = None
         composition.mapping["algorithm"]["teacher_iterations"] = 0
     return composition

@@ -102,7 +102,7 @@ class ProgressDisplay:
         self, console: Console, header: RunHeader, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._console, self._header, self._clock = console, header, clock
-        # A terminal that is called dumb cannot draw in place.
+        # A terminal with TERM=dumb cannot draw in place.
         self._live = Live(console=console, auto_refresh=False) if console.is_interactive else None
         self._started_s, self._shown_s = 0.0, -math.inf
         self._pending = False
@@ -180,7 +180,7 @@ class ProgressDisplay:
         return " · ".join(parts)
 
     def _panel(self) -> Panel:
-        # On a very wide terminal the eye would have to travel between the halves.
+        # On a wider terminal the halves would be too far apart to be read together.
         width, height = min(self._console.width, 100), self._console.height
         inner = width - 6  # less the border and two columns of padding on each side
         if width < _HALVES:
@@ -283,7 +283,7 @@ class TrackTable:
                     known[label] = value
 
     def least(self) -> str:
-        """Name the track on which the car comes least far."""
+        """Name the track with the lowest completion."""
         if not self._completion:
             return f"least {NOTHING}"
         label = min(self._completion, key=self._completion.__getitem__)
@@ -294,7 +294,7 @@ class TrackTable:
 
         Args:
             width: columns of the terminal to fill.
-            room: lines that are free; tracks that find none are counted at the end.
+            room: lines that are free; tracks that do not fit are counted at the end.
         """
         columns = max(1, (width + _TABLE_GAP) // (_CELL + _TABLE_GAP))
         cell = (width + _TABLE_GAP) // columns - _TABLE_GAP

@@ -45,7 +45,7 @@ class Imported:
     """What a model became."""
 
     folder: Path
-    """Of the run."""
+    """The run's."""
     options: list[Path]
     """Files written to `./conf`."""
     notes: list[str]
@@ -56,9 +56,9 @@ def import_model(path: str, name: str, overrides: Sequence[str]) -> Imported:
     """Make a run and options of a model of the service; nothing of it is run.
 
     Args:
-        path: of its folder or archive.
+        path: the model's folder or archive.
         name: of the experiment and the options.
-        overrides: of the experiment, and `checkpoint=best` or `last`, of the service's.
+        overrides: of the experiment, and `checkpoint=best` or `last`, as the service marks its checkpoints.
 
     Raises:
         BadInput: there is no model, it cannot be used here, or the run cannot be written; nothing is left.
@@ -107,7 +107,7 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
 def _fit(
     model: StoredModel, files: CustomFiles, seen: Sequence[str], name: str, changes: Sequence[str]
 ) -> tuple[Experiment, Composition, ActorCritic, list[str], list[str]]:
-    """Return the experiment with the one of the service's networks that the weights are of, and what is absent."""
+    """Return the experiment with that network of the service that the weights belong to, and what is absent."""
     metadata, refused = files.metadata, None
     assert metadata is not None
     for kind in _kinds(metadata, model):
@@ -118,7 +118,7 @@ def _fit(
             raise BadInput("network: the weights are of a network of the service; leave network= off")
         shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
         try:
-            with torch.device("meta"):  # of shapes alone: that of a model may be of gigabytes
+            with torch.device("meta"):  # shapes only: the weights of a model may take gigabytes
                 networks = build_actor_critic(experiment.network, *shapes, None)
             absent = match_service(model.tensors, networks, metadata.sensor, model.source)[1]
         except BadInput as error:
@@ -168,8 +168,7 @@ def _remarks(files: CustomFiles, model: StoredModel, world: str | None, absent: 
     notes = []
     if VALUE in absent:
         notes.append(
-            "a frozen graph holds the policy alone: the value network starts fresh, and a clone first learns it with a "
-            "policy that is good already"
+            "a frozen graph holds only the policy: the value network starts fresh, and a clone has to learn it first"
         )
     if any(name != VALUE for name in absent):
         notes.append(

@@ -20,7 +20,7 @@ _FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the p
 
 
 def track_names(setup: RaceSetup) -> list[str]:
-    """Return the names of the courses: one by its own name, which may stand in a file; several by their options."""
+    """Return the names of the courses: of one its own name, which a file may give; of several those of the options."""
     courses = setup.courses
     return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
 
@@ -66,7 +66,7 @@ class Record:
         return sum(last) / len(last) if len(last) == last.maxlen else None
 
     def add(self, finished: Finished) -> None:
-        """Note episodes."""
+        """Add episodes."""
         self.finished += len(finished.lap)
         self.laps += int(finished.lap.sum())
         self._laps_of_last.extend(finished.lap.tolist())
@@ -99,7 +99,7 @@ class EpisodeBook:
     """
 
     def __init__(self, n_cars: int, n_tracks: int, remembered: int, step_s: float):
-        """Open the book.
+        """Start without an episode.
 
         Args:
             n_cars: cars over all processes.
@@ -114,12 +114,12 @@ class EpisodeBook:
         self.tracks = tuple(Record(remembered) for _ in range(n_tracks))
 
     def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
-        """Note a batch of driving.
+        """Number and count the episodes of a batch.
 
         Args:
-            trace: rows of `formats.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T. A car that
-                stands there twice (of asynchronous collection, where one process was faster than the others)
-                drove the lower row later.
+            trace: rows of `deepracer.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T. A car that
+                appears twice (in asynchronous collection, where one process was faster than the others) drove the
+                lower row later.
 
         Returns:
             The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and
@@ -177,7 +177,7 @@ class EpisodeBook:
 
 
 def _each_car_once(cars: np.ndarray) -> list[np.ndarray]:
-    """Return the rows at which each car stands for the first time, for the second time, and so on."""
+    """Return the rows in which each car appears for the first time, for the second time, and so on."""
     order = np.argsort(cars, kind="stable")
     _, first, counts = np.unique(cars[order], return_index=True, return_counts=True)
     turn = np.empty(len(cars), np.int64)
@@ -200,7 +200,7 @@ class RunMetrics(EpisodeBook):
             names: of the tracks, in the order of their numbers in the trace.
             n_cars: cars over all processes.
             step_s: simulated seconds of a control step.
-            stopping: its rule says of how many episodes `lap_share` is taken.
+            stopping: its rule decides over how many episodes `lap_share` is taken.
         """
         self.track_names = names
         self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else REMEMBERED_EPISODES

@@ -89,7 +89,7 @@ def run_training(
         TakenOver: a callback raised it.
     """
     console = console or Console(quiet=True)
-    # From here on, so that Ctrl-C during the start leaves a whole folder, too.
+    # Signals are caught from here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
         setup = read_files(experiment)
         memory = memory_of_pictures(experiment)
@@ -355,7 +355,7 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
         trainer.release()
         raise
     except KeyboardInterrupt:
-        # No checkpoint, which might be of a half-made update, and no pictures.
+        # No checkpoint, since an update may be half done, and no pictures.
         return trainer.end(INTERRUPTED, "ended at once by a second signal", interruption.exit_code or 130)
     except Exception as error:
         if is_refused_memory(error):
@@ -374,7 +374,7 @@ def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> l
     """Return why a resumed run cannot equal an uninterrupted one bit for bit."""
     why = []
     if experiment.collector.mode == "async":
-        why.append("with collector=async the cars begin new episodes, and workers take turns as they come")
+        why.append("with collector=async the cars begin new episodes, and the order of the workers varies")
     clocks = ("minutes", "max_cost", "experiment_minutes", "experiment_max_cost", "experiment_env_steps")
     by_clock = [name for name in clocks if getattr(experiment.budget, name) is not None]
     if by_clock and getattr(experiment.lr_schedule, "by", "fraction") == "fraction":

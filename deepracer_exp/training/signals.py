@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, heard at the end of an iteration."""
+"""Ctrl-C and SIGTERM, acted on at the end of an iteration."""
 
 import signal
 from collections.abc import Callable
@@ -6,13 +6,13 @@ from types import FrameType
 
 
 class Interruption:
-    """Notes a request to end and answers it; the second Ctrl-C ends at once.
+    """Records a request to end and answers it; a second signal ends at once.
 
     Where one is entered within another, as a training within a worker of a sweep, both have the same request.
     """
 
     def __init__(self, answer: Callable[[str], None] | None = None) -> None:
-        """Hear nothing yet.
+        """Do not listen yet.
 
         `answer` is called with a line when the first signal comes; None: nothing is shown.
         """

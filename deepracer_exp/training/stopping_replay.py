@@ -1,4 +1,4 @@
-"""Where a stopping rule would have ended runs that went on."""
+"""Where a stopping rule would have ended runs that continued."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from .display import NOTHING
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """A run and what a stopping rule would have made of it."""
+    """A run and where a stopping rule would have ended it."""
 
     run: str
     rule: str
-    """The rule that was applied, in its overrides' words."""
+    """The rule that was applied, as its overrides."""
     decision: Decision | None
     """None: it would not have stopped the run."""
     iteration: int
@@ -64,7 +64,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
     if not rows:
         raise BadInput(f"{record.path / METRICS}: has no iteration; nothing to apply a rule to")
     if isinstance(config, ReliableStopping):
-        _check_memory(record, config)
+        _check_episodes(record, config)
     stopping = build_rule(config, action_count(record))
     decision, count = None, len(rows)
     for number, row in enumerate(rows, 1):
@@ -132,8 +132,8 @@ def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) 
         ) from error
 
 
-def _check_memory(record: RunRecord, config: ReliableStopping) -> None:
-    """Refuse a number of episodes that the run's lap_share was not taken of."""
+def _check_episodes(record: RunRecord, config: ReliableStopping) -> None:
+    """Refuse another number of episodes than the run's lap_share was taken over."""
     own = record.config.get("stopping", {}).get("episodes", REMEMBERED_EPISODES)
     if own != config.episodes:
         raise BadInput(
@@ -146,7 +146,7 @@ def action_count(record: RunRecord) -> int | None:
     """Return how many actions a run's policy chooses between, None for a continuous one.
 
     Raises:
-        BadInput: its configuration names no rule.
+        BadInput: its configuration has no valid action space.
     """
     try:
         adapter: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
@@ -157,7 +157,7 @@ def action_count(record: RunRecord) -> int | None:
 
 
 def _ended_with(rows: Sequence[Row]) -> float | None:
-    """Return the mean completion of the last ten iterations: single ones wobble."""
+    """Return the mean completion of the last ten iterations, because single ones vary."""
     known = [row["completion"] for row in rows[-10:] if row["completion"] is not None]
     return sum(known) / len(known) if known else None
 

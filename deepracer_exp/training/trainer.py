@@ -1,4 +1,4 @@
-"""The trainer: one loop, and the callbacks that hang on it."""
+"""The trainer: one loop, and the callbacks that it calls."""
 
 import contextlib
 import json
@@ -195,14 +195,14 @@ class Trainer:
         self._cars: dict[str, Any] | None = None
         self._first_lap: dict[str, float] | None = None
         self._began = self._saved_at = time.monotonic()
-        # The clock of a racer starts with the command, not with the loop.
+        # A racer counts from the start of the command, not of the loop.
         self._process_began = psutil.Process().create_time()
         folder.open_log()
 
     def fit(self, interruption: Interruption) -> str:
         """Train until there is a reason to stop, and return it.
 
-        A signal to `interruption`, which is entered, ends the loop after the iteration in progress.
+        `interruption` must have been entered; a signal to it ends the loop after the iteration in progress.
 
         Raises:
             RunFailed: a worker was lost, a number became NaN or infinite, or the disk is full.
