@@ -300,9 +300,9 @@ class Distillation(PPO):
     For `teacher_iterations` the policy's loss is the KL divergence of its distribution of actions from the teacher's,
     in the states that the policy's own driving leads to (DAgger, Ross et al. 2011). The teacher's distribution is
     sharpened first, as in policy distillation (Rusu et al. 2015): policies here sample their actions to the end, and
-    their likeliest action is better than a sampled one. Every step is learned from once, in small minibatches: with
-    labels there is less to gain from a second look than from another step. The value network learns as in PPO, which
-    follows.
+    their likeliest action is a clearer label than a sampled one. Every step is learned from once, in small minibatches:
+    with labels there is less to gain from a second look than from another step. The value network learns as in PPO,
+    which follows.
     """
 
     def __init__(

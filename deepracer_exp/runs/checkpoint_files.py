@@ -35,7 +35,7 @@ def verify(folder: Path) -> None:
 
 
 def find_checkpoint(folder: Path, name: str) -> Path:
-    """Return the folder of a checkpoint, or the link to it; a `last` that is missing has others in its place.
+    """Return the folder of a checkpoint, or the link to it; it may be a missing `last` if there are other checkpoints.
 
     `folder` is `checkpoints/` of a run, `name` is `best`, `last` or the number of an iteration.
 

@@ -226,8 +226,8 @@ class CheckpointStore:
         Args:
             run_dir: folder of the run.
             keep: how many of the newest checkpoints stay.
-            every: iterations between two evaluations: only evaluated checkpoints stay, so that all that are there at
-                the end compare; None: there are no evaluations, and any checkpoint stays.
+            every: iterations between two evaluations: only evaluated checkpoints stay, so that all of them can be
+                compared at the end; None: there are no evaluations, and any checkpoint stays.
 
         Raises:
             BadInput: it is not known which checkpoints must stay.
@@ -270,7 +270,7 @@ class CheckpointStore:
         self._prune()
 
     def mark_best(self, iteration: int) -> None:
-        """Let `best` lead to an iteration's checkpoint; the one before stays, for a run that resumes with it."""
+        """Let `best` lead to an iteration's checkpoint; the one before stays, for a resumed run, whose best it is."""
         self._link("best", checkpoint_name(iteration))
 
     def rewind(self, iteration: int, best: int | None) -> None:
@@ -301,7 +301,7 @@ class CheckpointStore:
             checkpoint.save(aside, metadata=dict(counters))
             write_hashes(aside)
             aside.rename(self.folder / name)
-        except (RuntimeError, OSError) as error:  # RuntimeError: torch's word for a full disk
+        except (RuntimeError, OSError) as error:  # RuntimeError: torch's, for a full disk
             with contextlib.suppress(OSError):
                 _remove(aside)
             reason = str(error).splitlines()[0]
@@ -316,7 +316,7 @@ class CheckpointStore:
     def _prune(self) -> None:
         own = self._own()
         kept = {str(path.readlink()) for path in self.folder.iterdir() if path.is_symlink()}
-        # The one of the start is of no use once there is another.
+        # That of the start is of no use once there is another.
         evaluated = [path.name for path in own if int(path.name) and int(path.name) % self._every == 0]
         kept |= {*evaluated[-self._keep :]} | pinned(self.folder).keys()
         for path in own:

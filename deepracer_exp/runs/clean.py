@@ -70,7 +70,7 @@ class Removables:
 def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
     """Find what may be removed; nothing is changed.
 
-    Without `overview`, what MLflow knows, nothing of a run that is recorded there goes but its trace.
+    Without `overview`, which is what MLflow knows, only the trace of a run that is recorded there may be removed.
 
     Raises:
         BadInput: a file that says what must be kept cannot be read.
@@ -88,7 +88,7 @@ def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
 
 
 def remove(item: Removable) -> bool:
-    """Remove it and return True, unless a training or a pin came meanwhile.
+    """Remove it and return True, unless a training has begun in it meanwhile or it was pinned.
 
     Raises:
         RunFailed: it cannot be removed.

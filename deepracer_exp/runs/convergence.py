@@ -51,7 +51,7 @@ LOG_RULE = ConvergedRule(
     best_patience=60,
     best_gain=0.01,
 )
-"""The values of `conf/stopping/entropy.yaml`, with the patience that suits the shorter logs of others."""
+"""The values of `conf/stopping/entropy.yaml`, with the warm-up and patience that suit the shorter logs of others."""
 PATIENCE_SHARE = 0.2
 """Share of all iterations of such a log that must be without growth."""
 POOR = 50.0
@@ -108,9 +108,9 @@ def entropy_share(entropy: float, at_start: float, action_count: int | None) -> 
         action_count: number of discrete actions, None for the two continuous ones.
 
     Returns:
-        For a discrete policy its entropy over that of a choice by chance, log(n): 1 to 0. A continuous policy's
-        entropy may be negative, so no ratio has a meaning; exp((entropy - start) / 2), for two normal
-        distributions, is the ratio of their scatter (geometric mean of the standard deviations): 1 at the start.
+        For a discrete policy its entropy over that of a uniform choice, log(n): 0 to 1. A continuous policy's entropy
+        may be negative, so a ratio has no meaning; exp((entropy - start) / 2), for two normal distributions, is the
+        ratio of their spread (geometric mean of the standard deviations): 1 at the start.
     """
     if action_count is None:
         return math.exp(min((entropy - at_start) / 2, 700.0))
@@ -171,7 +171,7 @@ class _Average:
 
     @property
     def now(self) -> float:
-        """The newest average; asked for once it is known."""
+        """The newest average, which must be known."""
         (last,) = self.last(1)
         return last
 
@@ -417,7 +417,7 @@ def _entropy_change(entropy: NDArray[np.float64], action_count: int | None, pati
     known = known[np.isfinite(known)]
     if len(known) <= patience:
         return math.nan
-    # Of a continuous policy exp((a - b) / 2) is the ratio of two scatters, for two normal distributions.
+    # Of a continuous policy exp((a - b) / 2) is the ratio of two spreads, as in `entropy_share`.
     scale = 2.0 if action_count is None else math.log(max(action_count, 2))
     return float(np.ptp(known[-patience:])) / scale
 
@@ -488,7 +488,7 @@ def _entropy_stopping(stopping: Mapping[str, Any] | None) -> EntropyStopping | N
 
 
 def moving_average(values: NDArray[np.float64], over: int = 3) -> NDArray[np.float64]:
-    """Return the mean of each value and those before it without unknown ones; NaN where the value itself is NaN."""
+    """Return for each value the mean of the known ones among the last `over`; NaN where the value itself is NaN."""
     import pandas as pd  # takes half a second, and only reports need it
 
     series = pd.Series(values, dtype=np.float64)

@@ -14,10 +14,10 @@ from .files import CRASH_DUMPS
 
 
 def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = None) -> None:
-    """Write the error's line, its `params` and `arrays` where it has them under `faults/`, as JSON and .npz.
+    """Write the error's line, and its `params` and `arrays` if it has them, under `faults/` as JSON and .npz.
 
-    A disk that takes no more is no reason to lose the error: what does not fit is left out. `worker` is the number
-    of the process, None for the training process.
+    On a full disk, what does not fit is left out, so that the error itself is not lost. `worker` is the number of the
+    process, None for the training process.
     """
     folder = run_dir / CRASH_DUMPS
     stem = "training" if worker is None else f"worker-{worker}"

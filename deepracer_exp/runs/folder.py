@@ -115,7 +115,7 @@ class RunFolder:
             RunFailed: the folder is not the one that was opened.
             OSError: it takes no more.
         """
-        # Others who write into it would make a folder that is gone again, with nothing else in it.
+        # Other writers would create a removed folder again, with nothing else in it.
         if not (self.path / RUNNING).exists():
             raise RunFailed(f"{self.path}: the folder of the run is gone")
         with self._metrics.open("a", encoding="utf-8") as file:
@@ -217,7 +217,7 @@ def _make_new(parent: Path, name: str) -> Path:
 
 
 class _LogFile(logging.FileHandler):
-    """Says nothing of a full disk: the end of the run reports it in one line."""
+    """Is silent about a full disk, which the end of the run reports in one line."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the base class's name
         pass

@@ -1,4 +1,4 @@
-"""A run of ours as a recording, in the schema of everybody's."""
+"""A run of ours as a recording, in the schema that all recordings share."""
 
 import json
 import math
@@ -194,7 +194,7 @@ def _number(value: Any) -> float:
 
 
 def _metadata(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> ModelMetadata | None:
-    """Return the action space; our policies have no camera, and the service's default stands in for it."""
+    """Return the action space; the sensors are the service's default, whatever the policy sees."""
     if config.get("action_space") is None:
         return None
     try:
@@ -205,7 +205,7 @@ def _metadata(folder: Path, config: Mapping[str, Any], problems: list[LogProblem
 
 
 def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return what the service has a word for."""
+    """Return the hyperparameters that the service has, too, by its names."""
     own = config.get("algorithm")
     if not isinstance(own, Mapping):
         return None

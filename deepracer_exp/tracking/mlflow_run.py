@@ -1,7 +1,7 @@
 """One run in an MLflow store, by MlflowClient alone: no global tracking uri, no active run.
 
-Importing this module imports MLflow (1.2 s alone, 2 to 3 s beside a starting training), so only the
-recorder's thread does it. Every call may be repeated: MLflow keys a metric point by run, key, step,
+Importing this module imports MLflow (1.2 s alone, 2 to 3 s beside a starting training), so a training
+does it in the thread that records. Every call may be repeated: MLflow keys a metric point by run, key, step,
 timestamp and value, and parameters, tags, files and the end status are the same when written twice. So a
 request of a killed process that a slow server handles late does no harm either.
 """

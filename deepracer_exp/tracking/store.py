@@ -1,6 +1,6 @@
 """MLflow stores: where runs are recorded. Addresses without secrets, clients, errors, and how long to wait.
 
-MLflow takes seconds to import, so that only what opens a store imports it.
+MLflow takes seconds to import, so only the code that opens a store imports it.
 """
 
 import logging
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
 
 # MLflow reads these at each call and offers no parameter. Its own 7 retries would hold the queue for
-# minutes after a server is back, and a request may hang for its whole 120 s: the recorder retries itself.
+# minutes after a server is back, and a request may hang for its whole 120 s: `StoreThread` retries instead.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
 # It would print the address of each ended run, with its password.
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
-# A machine without network would retry it during the whole run.
+# Without a network it would be retried during the whole run.
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
 _SERVERS = ("http", "https")
@@ -227,7 +227,7 @@ def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowC
             f"{what}: {runs_dir} has no mlflow.db to look it up in; give tracking.uri=URI or a run's folder"
         )
     store = resolve_store(uri, runs_dir)
-    # Three seconds of import that nothing else needs.
+    # Imported here: it takes three seconds, and nothing else needs it.
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
 

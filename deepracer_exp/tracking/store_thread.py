@@ -69,7 +69,7 @@ class StoreThread:
         self._thread.start()
 
     def put(self, what: str, do: "Callable[[MLflowRun, bool], object]", vital: bool = False) -> None:
-        """Make a call later; its bool says whether it is a repetition, `what` it writes is for the log."""
+        """Make a call later; its bool says whether it is a repetition, `what` names in the log what it writes."""
         with self._changed:
             self._calls.append(_Call(what, do, vital))
             self._changed.notify()

@@ -40,7 +40,7 @@ class Progress:
     env_steps: int
     """Control steps of all trials together."""
     best_trial: int | None = None
-    """Its number; None, like the five below, until a trial is complete."""
+    """Its number; None until a trial is complete, like the fields below."""
     best_values: Mapping[str, float] = field(default_factory=dict)
     """By objective."""
     best_shown: str | None = None
