@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 _PATIENCE_S = 20.0
 """Time that an alert may take."""
 _REFRESH_S = 10.0  # between two looks at what other runs have used
-_TAIL_BYTES = 16_384  # more than any line of metrics.jsonl
+_TAIL_BYTES = 131_072  # more than a line of metrics.jsonl with all tracks of the catalogue
 _WORDS: dict[str, Callable[[float], str]] = {
     "env_steps": lambda used: count(round(used), "step"),
     "iterations": lambda used: count(round(used), "iteration"),

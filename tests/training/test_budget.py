@@ -7,6 +7,7 @@ import pytest
 
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.metrics import TRACK_METRICS
 from deepracer_exp.training import budget as module
 from deepracer_exp.training.budget import Budget, refuse_spent
 
@@ -79,6 +80,12 @@ def test_minutes_and_costs_are_summed_at_each_runs_own_price(run):
 
 def test_a_run_that_continues_or_was_killed_counts_with_its_last_whole_row(run):
     sibling(run, "continues", ended=False, env_steps=500)
+    assert Budget(limits(experiment_env_steps=1000), run).used(250, 0, 0.0)[1] == 0.5
+
+
+def test_a_run_on_every_track_of_the_catalogue_counts_though_its_rows_are_long(run):
+    columns = {f"{metric}/{number:080d}": 100 / 3 for metric in TRACK_METRICS for number in range(127)}
+    sibling(run, "everywhere", ended=False, env_steps=500, **columns)
     assert Budget(limits(experiment_env_steps=1000), run).used(250, 0, 0.0)[1] == 0.5
 
 
