@@ -127,7 +127,9 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     if recording.metadata is not None:
         actions = recording.metadata.actions
         space = "continuous" if not actions else f"{len(actions)} actions"
-        found.append(("Action space", f"{space}; sensors {', '.join(recording.metadata.sensor) or NONE}"))
+        if recording.best is None:  # a run of ours has default sensors there, whatever its policy sees
+            space += f"; sensors {', '.join(recording.metadata.sensor) or NONE}"
+        found.append(("Action space", space))
     driven = view.evaluation_episodes
     if len(driven):
         streams = count(driven["stream"].nunique(), "evaluation")

@@ -10,11 +10,12 @@ import pytest
 from deepracer_exp.analysis.findings import FIGURES, findings
 from deepracer_exp.analysis.log_report import SECTIONS, LogPage, write_report
 from deepracer_exp.analysis.log_report import html as page_html
-from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, headline, iteration_rows
+from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, facts, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_comparison import compare_rewards
 from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.result import RunResult
 from tests.browser import needs_chromium
 from tests.page_html import Html
 
@@ -184,6 +185,13 @@ def test_a_recording_without_a_step_has_no_page_and_the_old_one_stays(tmp_path):
     with pytest.raises(BadInput, match="no control steps"):
         write_report(season(1, steps=season(1).steps.iloc[:0]), old)
     assert old.read_text() == "old"
+
+
+def test_the_sensors_of_a_log_are_named_but_no_default_ones_of_a_run_of_ours(view):
+    best = RunResult(measure="race_score", rank=(0.0, 0.0), iteration=10, completion=90.0, lap_time_s=None)
+    own = dataclasses.replace(view, recording=dataclasses.replace(view.recording, best=best))
+    spaces = [dict(facts(one))["Action space"] for one in (view, own)]
+    assert spaces[0] == f"{spaces[1]}; sensors FRONT_FACING_CAMERA"
 
 
 def test_of_very_many_iterations_the_table_has_every_second_or_third_and_the_last():
