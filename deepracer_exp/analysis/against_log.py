@@ -1,4 +1,4 @@
-"""Simulated laps of a policy beside the laps of a log: the numbers of both, and where on the track they part."""
+"""Simulated laps of a policy beside the laps of a log: the numbers of both, and where on the track they differ."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +22,7 @@ from .tables import add_derived, episode_table, first_rows
 PLACES = np.arange(100) / 100
 """Lap positions at which laps are compared."""
 STRETCH = 10
-"""Places of the stretch where they part."""
+"""Places of the stretch where they differ most."""
 MOST_TRAINING_LAPS = 10
 """Laps of a training that stand for a log without an evaluation: its policy still explores."""
 _MISTAKES = ("off_track", "crashed", "reversed", "immobilized")
@@ -140,7 +140,7 @@ def logged_laps(view: LogView, course: Track) -> Laps:
 
 
 def _company(view: LogView) -> str:
-    """Say that the log was not driven alone, as its crashes show; without a crash it does not record bots or boxes."""
+    """Say that the log was not driven alone if it has crashes; nothing else in it shows bots or obstacles."""
     steps = view.recording.steps
     crashed = (steps["episode_status"] == "crashed") | (steps["obstacle_crash_counter"] > 0)
     return "; driven among bots or obstacles, the simulated car drives alone" if crashed.any() else ""
@@ -266,7 +266,7 @@ class AgainstLog:
 
     @property
     def sentences(self) -> list[str]:
-        """What it comes to: lap times, line, and where they part."""
+        """The result in words: lap times, line, and where they differ most."""
         logged, simulated = (laps.episodes["lap_time_s"] for laps in (self.logged, self.simulated))
         if not len(simulated.dropna()):
             found = ["The simulated car completes no lap."]
@@ -286,7 +286,7 @@ class AgainstLog:
         return [
             *found,
             f"The lines are {np.nanmean(offset_m):.2f} m apart on average, the speeds {np.nanmean(speed_mps):.2f} m/s.",
-            f"They part most from {one.begin} to {one.end} % of the track (waypoints {one.first_waypoint} to "
+            f"They differ most from {one.begin} to {one.end} % of the track (waypoints {one.first_waypoint} to "
             f"{one.last_waypoint}, sector {one.sector}): there the simulated car is {abs(one.offset_m):.2f} m further "
             f"{'left' if one.offset_m > 0 else 'right'} and {abs(one.speed_mps):.2f} m/s "
             f"{'faster' if one.speed_mps > 0 else 'slower'}.",

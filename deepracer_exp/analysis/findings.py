@@ -264,7 +264,7 @@ def _time_lost(view: LogView) -> Finding | None:
         for name, seconds in lost.items()
     ]
     where = (
-        f"To the best time of each sector the median time loses most in {'; '.join(places)}"
+        f"Compared with the best time of each sector, the median loses most in {'; '.join(places)}"
         if places
         else "No sector loses time to its best"
     )

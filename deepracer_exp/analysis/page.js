@@ -92,7 +92,7 @@
   desk.addEventListener("change", unfold);
   contents.addEventListener("click", (event) => { if (event.target.closest("a")) unfold(); });
 
-  // Of a page that is served while its contents change.
+  // A page that is served while its contents change has a version.
   const version = document.querySelector("meta[name=version]")?.content;
   if (version) setInterval(async () => {
     const now = await fetch("version").then((answer) => answer.text(), () => version);

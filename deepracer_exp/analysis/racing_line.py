@@ -80,7 +80,7 @@ def minimum_curvature_line(course: Track) -> Line:
     for _ in range(ROUNDS):
         velocity = first @ (center + offset_m[:, None] * sideways)
         pace = np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
-        # n / pace**2 turns a second difference into curvature; sqrt(pace) makes the sum one over the way.
+        # n / pace**2 turns a second difference into curvature; sqrt(pace) weights the sum by length.
         weight = _turned_left(velocity) / pace[:, None] ** 2.5
         matrix = weight[:, :1] * second * sideways[:, 0] + weight[:, 1:] * second * sideways[:, 1]
         wanted_m = lsq_linear(matrix, -(weight * (second @ center)).sum(axis=1), bounds, tol=1e-4).x

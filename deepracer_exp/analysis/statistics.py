@@ -40,7 +40,7 @@ def histogram(values: Values, least: int = 8, most: int = 50) -> Histogram:
 
 
 def _grain(values: Values) -> float:
-    """Return of what all values are multiples, up to a constant; 0 where there is nothing like that."""
+    """Return the spacing of which all values are multiples, up to a constant; 0 where there is none."""
     apart = np.diff(np.unique(values.round(6)))
     if len(apart) == 0 or len(apart) > len(values) / 4:
         return 0.0
@@ -59,14 +59,14 @@ def median_band(curves: Values) -> tuple[Values, Values, Values]:
         median, low and high, each (m,).
     """
     median, low, high = np.full((3, curves.shape[1]), np.nan)
-    dice = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for column, values in enumerate(curves.T):
         known = values[np.isfinite(values)]
         if len(known) < max(1.0, len(values) / 2):
             continue
         median[column] = np.median(known)
         if len(known) > 1:
-            medians = np.median(dice.choice(known, (RESAMPLES, len(known))), axis=1)
+            medians = np.median(rng.choice(known, (RESAMPLES, len(known))), axis=1)
             tail = (1 - CONFIDENCE) / 2
             low[column], high[column] = np.quantile(medians, [tail, 1 - tail])
     return median, low, high

@@ -58,7 +58,7 @@ class Evaluator:
     All policies meet the same trials: random conditions depend only on `config.seed` and the trial's index.
 
     Attributes:
-        trials: of the rows of the batch.
+        trials: one for each row of the batch.
         race: the cars.
     """
 
@@ -93,7 +93,7 @@ class Evaluator:
             observation=experiment.observation,
             observation_parts=build_parts(experiment.observation),
             randomization=conditions[USUAL],
-            # Time is the protocol' business.
+            # The protocol limits the time.
             episode=replace(experiment.episode, max_steps=0),
             reward=_NO_REWARD,
             reward_time_limit_s=experiment.reward.time_limit_s,
@@ -112,7 +112,7 @@ class Evaluator:
         """Let the policy drive all trials and return the results.
 
         Args:
-            policy: reads `observation`, writes `action`.
+            policy: reads what the experiment observes, writes `action`.
             on_step: called after every control step.
 
         Raises:

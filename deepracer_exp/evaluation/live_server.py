@@ -8,7 +8,7 @@ HOST = "127.0.0.1"
 
 
 class LiveServer(ThreadingHTTPServer):
-    """Serves a page at `/` and its version at `/version`; the page loads itself again when that changes.
+    """Serves a page at `/` and its version at `/version`; the page reloads itself when that changes.
 
     Attributes:
         shown: the version and the page, replaced together.
@@ -20,7 +20,7 @@ class LiveServer(ThreadingHTTPServer):
         """Open a port, 0: a free one.
 
         Raises:
-            BadInput: the port is in use or none.
+            BadInput: the port is in use or invalid.
         """
         self.shown = ("0", "")
         try:
@@ -28,7 +28,7 @@ class LiveServer(ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             reason = str(getattr(error, "strerror", None) or error).lower()
             raise BadInput(
-                f"--port {port}: {reason} on {HOST}; accepted: a port that is free, or none for any"
+                f"--port {port}: {reason} on {HOST}; accepted: a free port, or no --port for any"
             ) from None
 
     @property

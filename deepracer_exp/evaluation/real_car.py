@@ -1,4 +1,4 @@
-"""What is lost between the simulator and the physical car, and by which of the car's ways."""
+"""How much worse a policy drives with the physical car's pictures, timing and controls, and with each alone."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -27,7 +27,7 @@ CURES = {
 
 
 def protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
-    """Return the protocol without the car's ways and with each of them alone, by name."""
+    """Return the protocol without any part of the real car and with each part alone, by name."""
     assert config.real_car is not None
     none = RealCarConfig(**dict.fromkeys(_PARTS))
     chosen = [name for name in _PARTS if getattr(config.real_car, name) is not None]
@@ -43,7 +43,7 @@ def protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
 def compare(
     experiment: Experiment, config: EvaluationConfig, policy: torch.nn.Module, of_car: Evaluation
 ) -> dict[str, Evaluation]:
-    """Race the policy as the simulator does, with each of the car's ways alone, and add the given of all of them."""
+    """Race the policy in the plain simulator and with each part of the car alone; add `of_car`, with all parts."""
     found = {name: Evaluator(experiment, one)(policy) for name, one in protocols(config).items()}
     return {**found, CAR: of_car}
 
@@ -62,7 +62,7 @@ def key_figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, An
 
 
 def losses_table(evaluations: Mapping[str, Evaluation]) -> Table:
-    """Return what is lost under usual conditions as a table: simulator, each of the car's ways alone, all of them."""
+    """Return what is lost under usual conditions as a table: simulator, each part of the car alone, all of them."""
     found = key_figures(evaluations)
     base = found[SIMULATOR]
     shown = Table(box=None, pad_edge=False, title="from the simulator to the car", title_justify="left")

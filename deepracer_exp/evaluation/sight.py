@@ -29,14 +29,14 @@ from .evaluator import Evaluator
 from .film import Lap, drive_best_lap, png
 
 SPACING, SPREAD = 12, 18
-"""Places in a row that are blurred, and how often the standard deviation of one fits into the picture's width."""
+"""Blurred places along the picture's width, and how many standard deviations of one that width has."""
 _BLUR = 0.04
 """Standard deviation of the blur, in picture widths."""
 _HEAT = matplotlib.colormaps["inferno"]
 _DIMMED, _COVER = 0.5, 0.8
-"""Brightness of a picture under its heat, and how much of it the greatest heat covers."""
+"""Brightness of a picture under its heat map, and how much of it the highest value covers."""
 GLIMPSES, _ENLARGED = 8, 240
-"""Pictures of a lap, and pixels that one under its heat is wide."""
+"""Pictures of a lap, and the width of one under its heat map, pixels."""
 
 
 def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Where two sets of laps part, known by construction."""
+"""Where two sets of laps differ, known by construction."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def compared(logged: list[Drive], simulated: list[Drive]) -> AgainstLog:
     return AgainstLog(course=course, logged=laps[0], simulated=laps[1])
 
 
-def test_they_part_where_the_speed_differs_and_the_time_is_lost_there():
+def test_they_differ_where_the_speed_differs_and_the_time_is_lost_there():
     both = compared([Drive(), Drive()], [Drive(sections=((0.4, 0.5, 1.0),))] * 2)
     one = both.stretch
     assert abs(one.begin - 40) <= 1

@@ -176,12 +176,12 @@ def test_time_is_lost_in_the_sectors_that_were_driven_slowly() -> None:
     assert names == sorted(lost, key=lambda name: -lost[name])
     assert {name: found.values[name] for name in lost} == pytest.approx(lost, abs=0.05)
     assert found.values["theoretical_best_s"] == pytest.approx(COURSE.length_m / 2.0, abs=0.05)
-    assert "To the best time of each sector the median time loses most in" in found.sentence
+    assert "Compared with the best time of each sector, the median loses most in" in found.sentence
     assert f"waypoints {SECTORS[1].first_waypoint} to {SECTORS[1].last_waypoint}" in found.sentence
 
 
 def off_at(*places: tuple[int, int, bool], unfinished: int = 0) -> LogView:
-    """Prepare drives that run off at waypoints, so and so often, spinning or not, among complete laps."""
+    """Prepare drives that run off at waypoints, each as often as given, spinning or not, among complete laps."""
     drives = [Drive()] * 6 + [Drive(until=0.3)] * unfinished
     for waypoint, times, spins in places:
         drives += [Drive(off_at=waypoint + k % 3 - 1, spins=spins) for k in range(times)]

@@ -1,4 +1,4 @@
-"""Protocols of the physical car: with each of its ways alone, and with all of them."""
+"""Protocols of the physical car: with each of its parts alone, and with all of them."""
 
 from dataclasses import replace
 

@@ -22,12 +22,12 @@ _RANGES = (
 
 
 def lines_compared(both: AgainstLog) -> Chart:
-    """Draw the lines of all laps and their medians on the course, and the stretch where they part most."""
+    """Draw the lines of all laps and their medians on the course, and the stretch where they differ most."""
     layers: list[Layer] = []
     if (one := both.stretch) is not None:
         end = one.end if one.end > one.begin else one.end + 100
         there = both.course.points_at(np.linspace(one.begin, end, 60) / 100.0 % 1.0)
-        layers.append(line(there[:, 0], there[:, 1], VERMILION, "where they part most", width=9.0))
+        layers.append(line(there[:, 0], there[:, 1], VERMILION, "where they differ most", width=9.0))
     for laps, color in zip((both.logged, both.simulated), SIDES.values(), strict=True):
         # NaN between the laps.
         apart = laps.steps[["X", "Y"]].to_numpy(np.float64)

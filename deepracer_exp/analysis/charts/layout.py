@@ -13,7 +13,7 @@ from .style import FAINT, GRID, INK, SPINE, WIDTH, base_layout, escaped
 
 # All in pixels. Letters have mean widths: 9 in a panel's title, 7 in legends and names.
 _LEFT, _RIGHT, _COLOR_BAR = 74.0, 14.0, 86.0
-"""Room beside the axes of a panel for its numbers, for nothing and for a colour bar."""
+"""Room beside the axes of a panel: for its numbers to the left, free to the right, and for a colour bar there."""
 _LEGEND_ROW, _TITLE_ROW = 21.0, 24.0
 
 

@@ -86,7 +86,7 @@ class TrackLines:
 
     track: Track
     words: str
-    """Said above it."""
+    """Shown above it."""
     lines: Sequence[NDArray[np.float64]]
     """Columns x_m, y_m and speed_mps, of each line (n, 3)."""
 
@@ -140,7 +140,7 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     tracks = [name.removeprefix("completion/") for name in metrics if name.startswith("completion/")]
     figure = Figure((10.0, 6.0 + 0.3 * math.ceil(len(tracks) / 5)), dpi=150, layout=_LAYOUT)
     driving, returns, laps, entropy = figure.subplots(2, 2, sharex=True).flat
-    # A column that only other runs have, or only nulls, is of no number.
+    # A column of nulls alone has no numeric type.
     numbers = metrics.apply(pd.to_numeric).assign(lap_share=100 * metrics["lap_share"].astype(float))
     laps_label = "share of complete laps" + (", on the track where it is lowest" if tracks else "")
     _curves(
