@@ -83,12 +83,12 @@ class Claim:
     """One row of the table: a trial, the worker that owns it, and what earlier owners left."""
 
     index: int
-    """Place of the trial in the study, from 0; Optuna's number differs where a worker died while it made the trial."""
+    """Place of the trial in the study, from 0; Optuna's number differs where a worker died while it created one."""
     attempt: int
     """1 for the first owner, one more for each takeover."""
     owner: str
     state: str
-    """`claimed`, `settled` (has its result) or another: Optuna has the result, too."""
+    """`claimed`, `settled` (has its result) or `reported` (Optuna has it, too; `told` in older studies)."""
     result: TrialResult | None
     trial_id: int | None
     """Optuna's id of the trial."""
@@ -291,14 +291,14 @@ class TrialClaims:
 
 
 class Lease:
-    """Keeps a claim while its trial is made: renews it from a thread, and checks it before each write; a context.
+    """Keeps a claim while its trial is made: a context that renews it from a thread and checks it before each write.
 
     A process that was suspended for longer than its lease, and whose trial was taken over meanwhile, finds out by
     `confirm`, which precedes everything that is written.
     """
 
     def __init__(self, claims: TrialClaims, claim: Claim, lease_s: float, patience_s: float):
-        """Hold a fresh claim, valid for `lease_s` seconds without renewal."""
+        """Hold a fresh claim, valid for `lease_s` seconds without renewal; a database may be away for `patience_s`."""
         self.claim = claim
         self._claims, self._lease_s, self._patience_s = claims, lease_s, patience_s
         self.progress: Mapping[str, Any] = {}

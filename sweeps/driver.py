@@ -19,10 +19,10 @@ from .worker_config import WorkerConfig, is_gone
 
 _LOOK_S = 0.5
 _LEAVE_S = 6.0
-"""For a worker that was asked to end, to write a checkpoint and to log to MLflow. What it has not done by then is done
-when its trial resumes; together with what follows, the whole sweep is gone within ten seconds."""
+"""Time for a worker that was asked to end to write a checkpoint and to log to MLflow. What it has not done by then is
+done when its trial resumes; with all that follows, the sweep has ended within ten seconds."""
 _FEW = 3
-"""Trials all of which must have failed before a sweep is given up."""
+"""Failed trials, without any other, after which a sweep is given up."""
 
 
 class Driver:
@@ -53,7 +53,7 @@ class Driver:
             RunFailed: all trials fail, workers keep dying, or the database does not answer.
         """
         self._config.folder.mkdir(parents=True, exist_ok=True)
-        # Workers killed on this machine, mostly with their driver: their trials need not wait for the end of a lease.
+        # Workers killed on this machine, mostly with their driver: their trials need not wait until a lease runs out.
         for owner in {one.owner for one in self._look() if one.result is None and is_gone(one.owner)}:
             self._release(owner)
         try:

@@ -71,7 +71,7 @@ def figures(study: optuna.Study) -> dict[str, go.Figure]:
                 study, objective, _target(at) if several else None, axis, title
             )
             if len(complete) >= FEWEST_COMPLETE and len(keys) > 1:
-                # PED-ANOVA takes low values for good.
+                # PED-ANOVA considers low values good.
                 sign = 1.0 if MEASURES[objective].minimize else -1.0
                 importance, ranked = _importance(study, keys, _target(at, sign) if several else None, title)
                 if importance is not None:
@@ -175,7 +175,7 @@ def _history(
 ) -> go.Figure:
     figure = plot_optimization_history(study, target=target, target_name=MEASURES[objective].title)
     _styled(figure, f"Values of the complete trials{title}", 440)
-    # Few trials would have ticks between them.
+    # With few trials, Plotly would put ticks between them.
     every = 1 if len(study.trials) <= 10 else None
     return figure.update_xaxes(title_text="trial", tickformat="d", dtick=every).update_yaxes(**axis)
 
@@ -199,7 +199,7 @@ def _importance(
 ) -> tuple[go.Figure | None, list[str]]:
     """Return the bars, None if all trials have the same values, and the keys, the most important first."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of any target: that low values are taken for good
+        warnings.simplefilter("ignore", UserWarning)  # for any target: that low values are considered good
         figure = plot_param_importances(study, evaluator=_EVALUATOR, target=target)
     (bars,) = figure.data
     ranked = sorted(keys, key=dict(zip(bars.y, bars.x, strict=True)).__getitem__, reverse=True)
@@ -367,5 +367,5 @@ def _plain(text: object, longest: int = 90) -> str:
 
 
 def _short(value: float) -> float:
-    """Return a value with the digits that are visible, because a page has tens of thousands of values."""
+    """Return a value with only the digits that can be seen, because a page has tens of thousands of values."""
     return float(f"{value:.5g}")

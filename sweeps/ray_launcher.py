@@ -26,8 +26,8 @@ _LOST = -9
 class RayLauncher:
     """Starts workers where the cluster has room; methods as of `LocalLauncher`.
 
-    Each is a process below a `WorkerActor` that reserves the cores. The process is that of a sweep on one machine, so
-    that it takes signals, ends with its parent, and loses its trial when its lease runs out.
+    Each is a process below a `WorkerActor` that reserves the cores. It is the same as in a sweep on one machine: it
+    takes signals, ends with its parent, and loses its trial when its lease runs out.
     """
 
     def __init__(self, config: SweepConfig, executor: RayExecutor, runs_dir: Path, store: Store | None):
@@ -145,7 +145,7 @@ class RayWorker:
                 raise error.cause from None
             raise RunFailed(f"a worker did not start: {type(error.cause).__name__}: {error.cause}") from error
         except ray.exceptions.RayError:
-            # Its process may live on out of sight, until it finds its lease gone.
+            # Its process may still run, until it finds that its lease is lost.
             self._exitcode, self.is_seen = _LOST, False
 
 
@@ -172,7 +172,7 @@ class WorkerActor:
         # For a trial with collector=ray.
         os.environ["RAY_ADDRESS"] = ray.get_runtime_context().gcs_address
         log = str(config.folder / f"workers-{os.uname().nodename}.log")
-        # The actor's process is its parent, which it does not outlive.
+        # Its parent is the actor's process, which it does not outlive.
         self._process = multiprocessing.get_context("spawn").Process(
             target=run_worker, args=(config, token, log)
         )

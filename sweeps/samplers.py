@@ -59,7 +59,7 @@ class _PerTrialSampler(BaseSampler):
     """
 
     def __init__(self, make: Callable[[int], BaseSampler]):
-        """Start without any sampler; `make` returns that of the trial with an index."""
+        """Start without any sampler; `make` returns the sampler of a trial by the trial's index."""
         self._make = make
         self._open: dict[int, BaseSampler] = {}
 
@@ -121,7 +121,7 @@ class _EndlessGrid(GridSampler):
 class _LearnsFromPruned(GPSampler):
     """Learns from the last values of pruned trials, too.
 
-    Optuna's own knows complete and running trials only: where the best guess is pruned it guesses the same again.
+    Optuna's own looks at complete and running trials only: if its best guess is pruned, it guesses the same again.
     """
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
@@ -159,7 +159,7 @@ _SAMPLERS: dict[str, Callable[[SweepConfig, SearchSpace, int, int], BaseSampler]
     "tpe": lambda config, space, index, seed: TPESampler(
         n_startup_trials=config.startup_trials, seed=seed, multivariate=True, group=True, constant_liar=True
     ),
-    # No warning at each trial that keys which only some trials have are drawn at random.
+    # Keys that only some trials have are drawn at random; Optuna would warn of it at each trial.
     "gp": lambda config, space, index, seed: _LearnsFromPruned(
         n_startup_trials=config.startup_trials, seed=seed, warn_independent_sampling=False
     ),

@@ -46,7 +46,7 @@ _DRIVERS = {"psycopg": "psycopg[binary]", "pymysql": "pymysql", "mysqldb": "mysq
 """Package of each driver."""
 _CONNECT_S = 10
 _STUCK_S = 60
-"""How long a process may leave a transaction open, or wait for one: a suspended machine blocks others no longer."""
+"""How long a process may leave a transaction open, or wait for one: a suspended machine blocks others this long."""
 _LOCK, _LOCK_NUMBER = "deepracer_exp sweeps", 0x64726578
 
 _log = logging.getLogger("deepracer_exp")
@@ -282,7 +282,7 @@ def _write_ahead(file: Path) -> None:
     try:
         connection.execute("PRAGMA journal_mode=WAL")
     except sqlite3.OperationalError as error:
-        # Another process has it open. It stays as it is, which is slower and as safe.
+        # Another process has it open. It stays as it is, which is slower but just as safe.
         _log.warning("%s: %s", file, error)
     finally:
         connection.close()

@@ -49,7 +49,7 @@ from .view import SweepView
 from .worker import Interrupted
 from .worker_config import WorkerConfig
 
-_DELIVERY_S, _FAREWELL_S = 30.0, 2.0
+_DONE_S, _INTERRUPTED_S = 30.0, 2.0
 """How long to wait for MLflow when a sweep is done, and when it was interrupted and can resume."""
 REPORT = "sweep.html"
 """A study's page, in the folder of its runs."""
@@ -119,7 +119,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
             status, code = "KILLED", 130
         finally:
             if study_run is not None:
-                study_run.finish(status, _FAREWELL_S if code else _DELIVERY_S)
+                study_run.finish(status, _INTERRUPTED_S if code else _DONE_S)
         return study, worker_config.folder, code
 
 
@@ -207,7 +207,7 @@ def _conclude(
     Raises:
         Interrupted: the process was asked to end during the fresh laps.
     """
-    # It takes seconds to import, and the workers are to start before.
+    # Imported here: it takes seconds, and the workers start first.
     from .report import write_study_page
 
     if complete_trials(study) and worker_config.config.rerank:

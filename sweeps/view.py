@@ -21,14 +21,14 @@ from .objectives import NONE, cost, shown_values
 from .worker_config import WorkerConfig
 
 _POINTS = 16
-"""Of a sparkline."""
+"""Characters of a sparkline."""
 _LEAST_MADE = 0.05
 """Trials made in this start before their pace shows how long the others take."""
 _STATES = {"COMPLETE": "done", "PRUNED": "pruned", "FAIL": "failed"}
 
 
 class SweepView:
-    """Shows a running sweep; a context.
+    """Shows a running sweep; use as a context manager.
 
     On a terminal one panel is redrawn in place and stays at the end; elsewhere, each trial that ends is a line.
     """

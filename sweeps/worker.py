@@ -127,7 +127,7 @@ class Worker:
         except Exception as error:
             if isinstance(error, TakenOver | Interrupted | RunFailed):
                 raise
-            # A fault of ours ends its trial, with its traceback, and not the other trials.
+            # A bug of ours ends this trial, with its traceback, and not the others.
             return run.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
 
     def _trial_id(self, lease: Lease) -> int:
@@ -154,7 +154,7 @@ class Worker:
 class TrialRun(Callback):
     """Makes the runs of a trial, or resumes those that an earlier worker began.
 
-    It is a callback of each run: keeps the claim, reports evaluations to Optuna and asks the pruners.
+    It is a callback of each run that keeps the claim, reports evaluations to Optuna and asks the pruners.
     """
 
     hurries_when_interrupted = True
@@ -326,7 +326,7 @@ class TrialRun(Callback):
 
     def _trained(self, index: int, overrides: Sequence[str]) -> TrainResult:
         own = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
-        # How a worker runs what was drawn: no part of the trial, and left out of the command that repeats it.
+        # How a worker runs what was drawn is no part of the trial, and left out of the command that repeats it.
         given = {key_of(override) for override in overrides}
         usual = ("collector=in_process", f"collector.threads={self._config.cores}", "report=false")
         own += [override for override in usual if key_of(override) not in given]

@@ -1,4 +1,4 @@
-"""What a worker process is given, and the name it goes by."""
+"""What a worker process is given, and its name."""
 
 import socket
 from collections.abc import Mapping
