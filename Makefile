@@ -6,7 +6,7 @@ RACER := $(VENV)/.installed-racer
 STAMP := $(VENV)/.installed
 DOCS := $(VENV)/.installed-docs
 
-# uv reads no settings of pip's: where packages come from, and whose certificates are trusted.
+# uv does not read pip's settings: where packages come from, and whose certificates are trusted.
 ifdef PIP_INDEX_URL
 export UV_DEFAULT_INDEX ?= $(PIP_INDEX_URL)
 endif
@@ -46,8 +46,8 @@ race: $(RACER)  ## train the default experiment until the car drives reliably
 	@echo "training: $(BIN)/deepracer-exp train stopping=reliable"
 	@$(BIN)/deepracer-exp train stopping=reliable
 
-# One process a core, and a file's tests together: they share what the file trains.
-test: $(STAMP)  ## the tests
+# Two processes, with a file's tests in one of them: they share what the file trains.
+test: $(STAMP)  ## the tests, without the long ones
 	@$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile
 
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each
