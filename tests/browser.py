@@ -38,7 +38,7 @@ class Tab:
         self.renew()
 
     def renew(self) -> None:
-        """Be a new page, which knows nothing of the one before."""
+        """Switch to a new page, which knows nothing of the one before."""
         before, self._session = self._target, None
         self._target = self.call("Target.createTarget", url="about:blank")["targetId"]
         if before is not None:

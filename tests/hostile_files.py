@@ -1,4 +1,4 @@
-"""Files that a reader must neither wait for, nor choke on, nor take."""
+"""Files that a reader must refuse, without hanging and without a traceback."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Files that are never half there."""
+"""Files that are never half written."""
 
 import multiprocessing
 

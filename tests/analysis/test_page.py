@@ -1,4 +1,4 @@
-"""Laws of the two pages, that of a training and that of a sweep, in a real browser."""
+"""What always holds of the two pages, that of a training and that of a sweep, in a real browser."""
 
 import re
 from pathlib import Path

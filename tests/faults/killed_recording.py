@@ -55,7 +55,7 @@ def record(run_dir: Path, uri: str) -> None:
             tracker.set_tag("half", str(2 * iteration // ITERATIONS))
             atomic_write(checkpoint, str(iteration))
             tracker.safe_until(100 * iteration)
-            while tracker.waiting:  # kills shall find the recorder at work, not far behind
+            while tracker.waiting:  # so that kills come while the tracker is recording, not later
                 time.sleep(0.001)
         time.sleep(0.01)
     tracker.log_artifact(metrics)

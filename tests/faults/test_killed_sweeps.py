@@ -46,7 +46,7 @@ class Sweep:
         return self.command.workers()
 
     def is_over(self):
-        """Whether the sweep has ended, on a machine that shows the test too few of its moments."""
+        """Return whether the sweep has ended; on a busy machine it may, before the test looks again."""
         return self.command.popen.poll() is not None
 
     def rows(self):

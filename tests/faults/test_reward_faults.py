@@ -84,7 +84,7 @@ def test_a_reward_that_leaves_the_process_never_ends_a_command_with_0(
 
 
 @pytest.mark.slow
-def test_workers_that_die_without_a_word_are_not_looked_for_in_an_empty_log(run_at, tmp_path):
+def test_workers_that_die_silently_are_reported_without_naming_an_empty_log(run_at, tmp_path):
     (tmp_path / "mine.py").write_text(
         "import multiprocessing, os\n"
         "if multiprocessing.parent_process() is not None: os._exit(0)\n"

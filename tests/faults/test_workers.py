@@ -57,7 +57,7 @@ def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
 
 @pytest.mark.slow
 def test_a_worker_killed_while_the_learner_learns_ends_the_run(start_training):
-    """Hardly any driving, much learning: it is learning that the kill interrupts, or the giving out of weights."""
+    """Little driving and much learning, so that the kill interrupts the update or the sending of weights."""
     training = start_training("algorithm.epochs=100", "algorithm.batch_size=32")
     training.wait_for_iterations(1)
     training.workers()[0].send_signal(signal.SIGKILL)

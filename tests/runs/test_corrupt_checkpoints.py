@@ -1,4 +1,4 @@
-"""What is read where a checkpoint is not as it was written."""
+"""What is read if a checkpoint is not as it was written."""
 
 import json
 import os
@@ -77,7 +77,7 @@ def empty(path: Path) -> None:
 
 
 class Trap:
-    """Tells when it is unpickled."""
+    """Leaves a folder behind when it is unpickled."""
 
     def __reduce__(self):
         return os.mkdir, ("unpickled",)

@@ -1,4 +1,4 @@
-"""Runs of ours in everybody's schema."""
+"""Runs of ours in the schema that all recordings share."""
 
 import shutil
 

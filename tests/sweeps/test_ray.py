@@ -59,7 +59,7 @@ class TwoNodes:
         return [raylet, *raylet.children(recursive=True)]
 
     def kill_the_second(self):
-        """Let the second node be gone, as if its plug was pulled."""
+        """Kill the second node, as if its plug were pulled."""
         for process in self.of_the_second():
             process.kill()
         self._cluster.remove_node(self.second(), allow_graceful=False)

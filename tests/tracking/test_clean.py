@@ -94,7 +94,7 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
     assert reasons["2"] == "deleted in MLflow, but needed: 000020 registered as model"
 
 
-def test_a_run_that_a_training_holds_stays_until_it_lets_go(season):
+def test_a_run_that_a_training_holds_stays_until_it_is_released(season):
     run = season.run("1", status="failed")
     with (run / ".running").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
@@ -103,7 +103,7 @@ def test_a_run_that_a_training_holds_stays_until_it_lets_go(season):
     assert [what for _, what, _ in listed(season)] == [SPARE_CHECKPOINTS, FAILED_TRACE]
 
 
-def test_a_run_without_an_end_stays_for_an_hour_after_its_last_sign(season):
+def test_a_run_without_an_end_stays_for_an_hour_after_its_last_change(season):
     run = season.run("1", status=None)
     assert listed(season) == []
     assert "has not ended" in kept(season)["1"]

@@ -75,7 +75,7 @@ TINY = (
 
 @contextmanager
 def guarded(uri: str) -> Iterator[str]:
-    """Serve an MLflow server again, to those who know user and password only; yield the address with both."""
+    """Put an MLflow server behind a user and a password; yield the address with both."""
     right = "Basic " + base64.b64encode(f"{USER}:{PASSWORD}".encode()).decode()
 
     class Guard(http.server.BaseHTTPRequestHandler):

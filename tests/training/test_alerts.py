@@ -87,7 +87,7 @@ def test_a_webhook_that_is_down_is_logged_without_its_address(tmp_path, webhook,
     assert "secret-path" not in caplog.text
 
 
-def test_a_command_that_fails_is_logged_with_its_last_word(tmp_path, caplog):
+def test_a_command_that_fails_is_logged_with_its_last_line(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     command = script(tmp_path, "echo no such phone >&2; exit 7")
     send(tmp_path, "50 % used", f"budget.alert_command={command}")

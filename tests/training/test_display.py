@@ -1,4 +1,4 @@
-"""Laws of the terminal view."""
+"""What always holds of the terminal view."""
 
 import dataclasses
 import io

@@ -1,4 +1,4 @@
-"""A training under randomisation, and what its trace can be asked."""
+"""A training under randomisation, and what its trace shows of it."""
 
 import contextlib
 import io
