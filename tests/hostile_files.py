@@ -1,4 +1,4 @@
-"""Files that a reader must refuse, without hanging and without a traceback."""
+"""Files that a reader must read or refuse in one line, without hanging."""
 
 import os
 from collections.abc import Callable
