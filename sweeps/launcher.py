@@ -80,7 +80,8 @@ class LocalWorker:
 def run_worker(config: WorkerConfig, token: str, log: str) -> None:
     """Run a worker; the target of its process, whose output goes to the file `log`.
 
-    Exits with 0 when the study has all its trials, 130 or 143 when asked to end, 3 if the database does not answer.
+    Exits with 0 when the study has all its trials, 130 or 143 when asked to end, 2 if the database cannot be used, 3
+    if it does not answer.
     """
     take_over(config.addresses)
     # A session of its own: Ctrl-C in the terminal goes to the driver, which asks its workers to end.

@@ -66,7 +66,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
 
     Raises:
         BadInput: before anything is begun; nothing is left behind.
-        RunFailed: all trials fail, or the database does not answer.
+        RunFailed: all trials fail, workers keep dying, or the database does not answer.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     overrides, request, known = load_request(overrides)

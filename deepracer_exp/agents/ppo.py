@@ -79,7 +79,7 @@ class Algorithm:
         """Learn from one batch.
 
         Args:
-            batch: Leading dimensions [..., T], time last and contiguous. Holds `observation` (and `pixels`),
+            batch: Leading dimensions [..., T], time last and contiguous. Holds `observation` (`pixels`, `lidar`),
                 `action`, `action_log_prob` and `next` with `observation` (of a finished episode: its last one, not
                 the first of the new one), `reward`, `done`, `terminated`, each of the latter [..., T, 1].
             iteration: Updates made before this one.
@@ -159,8 +159,8 @@ class PPO(Algorithm):
         """Return the losses of a minibatch; override it for a loss of your own.
 
         Args:
-            minibatch: [N] steps with `observation` (and the trunk's `hidden`), `action`, `action_log_prob`,
-                `advantage` and `value_target`.
+            minibatch: [N] steps with what the networks read (and the trunk's `hidden`), `action`,
+                `action_log_prob`, `advantage` and `value_target`.
 
         Returns:
             `loss_objective`, `loss_critic` and `loss_entropy`, which are added up, and `entropy`, `clip_fraction`,

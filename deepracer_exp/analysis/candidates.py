@@ -9,7 +9,7 @@ from .log_view import LogView
 LEAST_LAPS = 3
 """Complete laps of an iteration below which its 25th percentile means nothing."""
 DENSE = 0.5
-"""Share of complete laps an iteration must have, of the highest share that any iteration has."""
+"""Share of complete laps an iteration must have, over the highest share of an iteration with `LEAST_LAPS`."""
 MOST = 3
 
 
@@ -21,8 +21,8 @@ def candidates_of(view: LogView) -> pd.DataFrame:
 def candidates(iterations: pd.DataFrame) -> pd.DataFrame:
     """Return the iterations whose policy is worth submitting, the best first, at most `MOST`.
 
-    Fast and dense (after TheRayG/deepracer-log-analysis): at least `LEAST_LAPS` complete laps and `DENSE` of the
-    highest share of complete laps; among those the ones with the lowest 25th percentile of the lap time.
+    Fast and dense (after TheRayG/deepracer-log-analysis): at least `LEAST_LAPS` complete laps, and `DENSE` of the
+    highest share of complete laps among these; of them the ones with the lowest 25th percentile of the lap time.
     """
     enough = iterations["lap_time_p25_s"].notna() & (iterations["complete"] >= LEAST_LAPS)
     dense = iterations["lap_share"] >= DENSE * iterations.loc[enough, "lap_share"].max()

@@ -158,7 +158,7 @@ def evaluations(view: LogView) -> Chart | None:
         low, high = np.nanmin([low, best_s]), np.nanmax([high, best_s])
         rim = max(0.1 * (high - low), 0.1)
         panels.append(("Lap time", "lap time, s", laps, (low - rim, high + rim)))
-    slower = " Most laps are slower than the best of the training, which is the fastest of many."
+    slower = " The best lap of the training is the fastest of many."
     short = [name if len(name) <= 26 else f"{name[:17]}…{name[-8:]}" for name in names]
     axis: dict[str, Any] = {"x_names": short, "x_range": (-0.5, len(names) - 0.5)}
     return Chart(
