@@ -354,7 +354,7 @@ def _rows(study: optuna.Study, trial: FrozenTrial) -> list[list[dict[str, Any]]]
 
 
 def thinned(rows: Sequence[Any], most: int) -> list[Any]:
-    """Return at most so many rows at even distances, the first and the last among them."""
+    """Return at most `most` rows at even distances, the first and the last among them."""
     if len(rows) <= most:
         return list(rows)
     return [rows[round(at * (len(rows) - 1) / (most - 1))] for at in range(most)]

@@ -11,7 +11,7 @@ class OutcomeStyle(NamedTuple):
 
     color: str
     dash: str
-    """Of Plotly."""
+    """Plotly's name of the dash."""
     meaning: str
 
 

@@ -52,7 +52,7 @@ class OffTrackPlace:
     passes: int
     """Episodes that came here."""
     low: float
-    """Of the 95 per cent interval of the risk."""
+    """95 per cent interval of the risk, with `high`."""
     high: float
     judgement: str | None
     """Key of `JUDGEMENTS` for at least half of the times, None where there is none."""
@@ -172,7 +172,7 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
 
 
 def _before(values: Values, rows: int) -> Values:
-    """Return the values of so many rows before, 0 where there is none."""
+    """Return each row's value `rows` rows earlier, 0 where there is none."""
     return values if not rows else np.concatenate([np.zeros(min(rows, len(values))), values[:-rows]])
 
 

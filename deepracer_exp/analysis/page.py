@@ -36,7 +36,7 @@ class Plot:
     phone_height: int
     """The same on a narrow screen."""
     least_width: int
-    """Pixels below which it scrolls in itself; 0: it gets as narrow as the page."""
+    """Pixels below which it scrolls sideways; 0: it gets as narrow as the page."""
     packed: str
     """Its JSON, gzip in base64."""
 

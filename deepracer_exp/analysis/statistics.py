@@ -73,7 +73,7 @@ def median_band(curves: Values) -> tuple[Values, Values, Values]:
 
 
 def subsample(count: int, most: int) -> NDArray[np.intp]:
-    """Return the indices of at most so many of `count` rows, evenly spaced, with the first and the last."""
+    """Return the indices of at most `most` of `count` rows, evenly spaced, with the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
 
 

@@ -1,4 +1,4 @@
-"""What stands beside the tensors of checkpoints: hashes of their files, and which of them must stay."""
+"""What is stored beside the tensors of checkpoints: hashes of their files, and which of them must stay."""
 
 import hashlib
 import json
@@ -63,7 +63,7 @@ def kept_checkpoints(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    # `best` is a folder of its own where links were followed as the run was copied.
+    # `best` is a real folder if links were followed when the run was copied.
     known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
     return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
 

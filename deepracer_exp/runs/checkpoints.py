@@ -231,7 +231,7 @@ class CheckpointStore:
 
         Raises:
             BadInput: it is not known which checkpoints must stay.
-            OSError: the folder takes no more.
+            OSError: the folder cannot be written.
         """
         self.folder = run_dir / CHECKPOINTS
         self.folder.mkdir(exist_ok=True)
@@ -258,7 +258,7 @@ class CheckpointStore:
             best: it is the best so far.
 
         Raises:
-            OSError, RunFailed: the disk takes no more; what was there before is as it was.
+            OSError, RunFailed: the folder cannot be written; what was there before is unchanged.
         """
         name = checkpoint_name(counters["iteration"])
         if not (self.folder / name).exists():  # nothing is learned between two updates

@@ -37,7 +37,7 @@ _Found = tuple[str, dict[str, float]]
 EVALUATED = ("eval_completion", "held_out_completion")
 """Columns that only the rows of evaluated iterations have."""
 _ALWAYS = ("completion", "mean_return", "laps_per_1000_steps", "entropy")
-_STEPS = 1000  # laps are counted per so many control steps: iterations differ in length
+_STEPS = 1000  # control steps per which laps are counted, because iterations differ in length
 
 
 LOG_RULE = ConvergedRule(

@@ -62,7 +62,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, runs_dir: str, experiment: str, label: str) -> "RunFolder":
-        """Create a folder of its own, named by the time and `label`.
+        """Create a new folder, named by the time and `label`.
 
         Raises:
             BadInput: the folder cannot be created.
@@ -113,7 +113,7 @@ class RunFolder:
 
         Raises:
             RunFailed: the folder is not the one that was opened.
-            OSError: it takes no more.
+            OSError: the file cannot be written.
         """
         # Other writers would create a removed folder again, with nothing else in it.
         if not (self.path / RUNNING).exists():
@@ -160,7 +160,7 @@ class RunFolder:
         if self._log is not None:
             logger.removeHandler(self._log)
             self._log.close()
-        with contextlib.suppress(OSError):  # a disk that takes no more
+        with contextlib.suppress(OSError):  # a full disk
             (self.path / RUNNING).unlink(missing_ok=True)
         self._lock.release()
 

@@ -79,7 +79,7 @@ class RunResult:
 
 
 def read_result(run: Path) -> RunResult | None:
-    """Return what a run came to, None if that is not known.
+    """Return the result of a run, None if it is not known.
 
     Raises:
         BadInput: its summary.json is not what a training writes.
@@ -93,7 +93,7 @@ def read_result(run: Path) -> RunResult | None:
 
 
 def result_of(summary: Mapping[str, Any]) -> RunResult | None:
-    """Return what a run came to by its summary, None if that is not known."""
+    """Return the result of a run from its summary, None if it is not known."""
     best = summary.get("best")
     if best is not None and best["eval_completion"] is not None:
         first, second = best["rank"]

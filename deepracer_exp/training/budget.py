@@ -171,7 +171,7 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
 
 
 class Alerts:
-    """Sends alerts to a command and to a webhook, where the budget names them; neither holds the training up."""
+    """Sends alerts to a command and to a webhook, where the budget names them; neither delays the training."""
 
     def __init__(self, config: BudgetConfig):
         """Parse the command and look up the webhook's address.

@@ -96,7 +96,7 @@ class EvalCallback(Callback):
         self._every = experiment.checkpoints.every
         self._metric = experiment.checkpoints.metric
         self._console = console
-        # The cars of the training rest meanwhile, so that all cores are free.
+        # The cars of the training wait meanwhile, so that all cores are free.
         self._evaluator = None if self._every is None else Evaluator(experiment, experiment.evaluation)
 
     def on_replay(self, trainer: Trainer) -> None:
@@ -113,7 +113,7 @@ class EvalCallback(Callback):
     def on_train_end(self, trainer: Trainer) -> None:
         """Evaluate the policy of the last iteration, if that was not due: it may be the best.
 
-        The evaluation stands in metrics.jsonl and in the summary and in no checkpoint, so that a run which resumes
+        The evaluation is written to metrics.jsonl and the summary but to no checkpoint, so that a run which resumes
         here is the one that was never interrupted.
         """
         if self._evaluator is not None and trainer.iteration and not self._is_due(trainer.iteration):

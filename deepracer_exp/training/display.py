@@ -228,7 +228,7 @@ class ProgressDisplay:
         return row
 
     def _halves(self, width: int) -> list[Text]:
-        pairs = _PAIRS_OF_TRACKS if self._tracks else _PAIRS  # lap times stand at each track
+        pairs = _PAIRS_OF_TRACKS if self._tracks else _PAIRS  # lap times are in the table
         left = width - _GAP - _RIGHT
         both = [
             Text(" " * _GAP).join((self._cell(one, left), self._cell(other, _RIGHT)))

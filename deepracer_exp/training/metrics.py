@@ -221,7 +221,7 @@ class RunMetrics(EpisodeBook):
     def row(self, finished: Finished) -> dict[str, float | None]:
         """Return the figures of the episodes of an iteration, means over episodes.
 
-        Lap times of different tracks have no common measure: with several tracks they stand at each track only.
+        Lap times of different tracks do not compare: with several tracks there are only those of each.
         """
         figures = _figures(finished, self.all)
         if self.labels:

@@ -315,7 +315,7 @@ class Trainer:
         """Write summary.json and release the run.
 
         Raises:
-            OSError: the folder takes no more; not if the run failed.
+            OSError: the file cannot be written; not if the run failed.
         """
         summary = {
             "status": status,

@@ -22,7 +22,7 @@ SPEED_EDGES = (1 / 3, 2 / 3)
 SPEED_NAMES = ("slow", "middle", "fast")
 COLUMNS = ("X", "Y", "lap_position", "closest_waypoint", "iteration", "steer", "throttle", "action")
 MOST_CLASSES = 40
-"""With more different actions than these the action space is not a list."""
+"""Different actions up to which an action space counts as a list of them."""
 STRAIGHT_SHARE = 0.05
 """Steering below this share of the largest angle counts as none, unless every action of the list steers more."""
 TOP_SHARE = 0.99

@@ -63,7 +63,7 @@ class Chart:
 
 
 def in_rows(panels: Sequence[Panel], columns: int = 2) -> list[Sequence[Panel]]:
-    """Return panels in rows of so many."""
+    """Return panels in rows of `columns`."""
     return [panels[at : at + columns] for at in range(0, len(panels), columns)]
 
 

@@ -186,7 +186,7 @@ def time_lost_panel(title: str, delta: pd.DataFrame, sectors: Sequence[Sector], 
         line(scale * delta["lap_position"], delta["delta_s"], VERMILION, width=2.5),
     ]
     low, high = delta["delta_s"].min(), delta["delta_s"].max()
-    # The names of the sectors stand above the line.
+    # The names of the sectors are above the line.
     y_range = (low - 0.05 * (high - low), high + 0.7 * (high - low)) if sectors and high > low else None
     return Panel(title=title, y_label="s", layers=layers, y_range=y_range)
 

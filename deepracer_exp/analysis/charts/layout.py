@@ -85,7 +85,7 @@ class _Box:
 
     @property
     def upright(self) -> bool:
-        """Return whether the legend must go down, because others stand beside it and it does not fit into one row."""
+        """Return whether the legend runs downwards: there are panels beside it, and it does not fit into one row."""
         return self.columns > 1 and self.legend_rows_along > 1
 
     @property
@@ -137,7 +137,7 @@ class _Box:
 
 @dataclass(frozen=True, kw_only=True)
 class _Axes:
-    """Where the axes of a panel stand in the figure: shares of its width and height, which are in pixels."""
+    """Where the axes of a panel are in the figure: shares of its width and height, which are in pixels."""
 
     suffix: str
     x: tuple[float, float]

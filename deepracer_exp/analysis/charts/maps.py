@@ -23,7 +23,7 @@ _SIDES_M = (0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0
 _RIM_M = 0.4
 """How much of the ground around the road belongs to a grid."""
 _NUMBERED = 10
-"""Every so many waypoints have their number on a map."""
+"""Waypoints from one number on a map to the next."""
 _LABEL = 0.035
 """Distance of a waypoint's number from the border, as a share of the longer side of the map."""
 
@@ -114,7 +114,7 @@ def waypoint_panel(layers: Sequence[Layer], label: str, n: int, **more: Any) -> 
 
 
 def beside(course: Track, place: Values, offset_m: Values) -> Values:
-    """Return the points (n, 2) so many m to the left of the centre line at neighbouring lap positions (n,)."""
+    """Return the points (n, 2) `offset_m` to the left of the centre line at neighbouring lap positions (n,)."""
     center = course.points_at(place)
     ahead = np.gradient(center, axis=0)
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
@@ -122,7 +122,7 @@ def beside(course: Track, place: Values, offset_m: Values) -> Values:
 
 
 def _road(rings: Sequence[Values], center: Values) -> list[go.layout.Shape]:
-    """Return the road and its centre line as shapes, because traces stand above every heat map."""
+    """Return the road and its centre line as shapes, because traces are drawn above every heat map."""
     common = {"type": "path", "xref": "x", "yref": "y", "layer": "below"}
     outline = "".join(_path(ring) + "Z" for ring in rings)
     edge, dashes = {"color": ROAD_EDGE, "width": 1.4}, {"color": ROAD_CENTER, "width": 1, "dash": "dash"}
