@@ -260,7 +260,7 @@ class PPO(Algorithm):
         steps = steps.select(*self._learner.value.in_keys)
         if "pixels" not in steps:
             return self._learner.value(steps)["state_value"]
-        # All steps' first layer at once would take gigabytes.
+        # The outputs of the first layer for all steps at once would take gigabytes.
         parts = steps.reshape(-1).split(_PICTURES_AT_ONCE)
         values = torch.cat([self._learner.value(part)["state_value"] for part in parts])
         return values.reshape(*steps.shape, 1)

@@ -143,7 +143,7 @@ def _company(view: LogView) -> str:
     """Say that the log was not driven alone if it has crashes; nothing else in it shows bots or obstacles."""
     steps = view.recording.steps
     crashed = (steps["episode_status"] == "crashed") | (steps["obstacle_crash_counter"] > 0)
-    return "; driven among bots or obstacles, the simulated car drives alone" if crashed.any() else ""
+    return "; driven among bots or obstacles, while the simulated car drives alone" if crashed.any() else ""
 
 
 @dataclass(frozen=True, kw_only=True)

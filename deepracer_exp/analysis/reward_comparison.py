@@ -72,7 +72,7 @@ def _sentences(
         best, fastest = laps.iloc[0], laps.loc[laps["time_s"].idxmin()]
         ranks = f"{_place(best['time_rank'])} by time, {_place(best['rank'])} by the recorded reward"
         found = [
-            f"Of {count(len(laps), 'complete lap')}{evaluated} {name} would have paid best the one of episode "
+            f"Of {count(len(laps), 'complete lap')}{evaluated} {name} would have paid most for the one of episode "
             f"{best['episode']} ({best['time_s']:.2f} s, {ranks}); the fastest lap ({fastest['time_s']:.2f} s) is "
             f"{_place(fastest['new_rank'])} instead of {_place(fastest['rank'])}."
         ]
@@ -84,13 +84,13 @@ def _sentences(
             for column in ("new_time", "old_time", "old_new")
         )
         found.append(
-            f"Rank correlation with lap time, -1 being a reward that ranks laps by speed alone: {name} {new}, recorded "
-            f"reward {old}; between both rewards {both}."
+            f"Rank correlation with lap time (-1: laps are ranked by speed alone): {name} {new}, recorded reward "
+            f"{old}; between both rewards {both}."
         )
     if len(places):
         up, down = places.loc[places["change"].idxmax()], places.loc[places["change"].idxmin()]
         found.append(
-            f"Against the other places of the track, waypoint {up['closest_waypoint']} gains most and waypoint "
+            f"Compared with the other places of the track, waypoint {up['closest_waypoint']} gains most and waypoint "
             f"{down['closest_waypoint']} loses most."
         )
     return found

@@ -237,8 +237,8 @@ class Replayed:
 def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
     comparison = compare_rewards(view, Replayed())
     assert comparison.sentences[0] == (
-        "Of 3 complete laps mine would have paid best the one of episode 0 (10.00 s, 1st by time, 3rd by the recorded "
-        "reward); the fastest lap (10.00 s) is 1st instead of 3rd."
+        "Of 3 complete laps mine would have paid most for the one of episode 0 (10.00 s, 1st by time, 3rd by the "
+        "recorded reward); the fastest lap (10.00 s) is 1st instead of 3rd."
     )
     assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in comparison.sentences[1]
     assert "waypoint 0 gains most and waypoint 20 loses most" in comparison.sentences[2]
