@@ -15,7 +15,7 @@ from .log_course import catalogue_track, directed, estimated_course, find_course
 from .tables import add_derived, episode_table, first_rows, iteration_table
 
 DISCOUNT = 0.99
-"""The service's default, for logs without hyperparameters."""
+"""For logs without hyperparameters: the default of our own trainings (the service's is 0.999)."""
 PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
 STARTING_STEPS = 10

@@ -281,12 +281,16 @@ def discount_factors(view: LogView) -> Chart | None:
         )
     what = "the fastest lap" if complete else "the longest drive"
     layers.append(mark(count, f"{what}: {count} steps", FAINT, in_legend=True))
-    half = np.log(0.5) / np.log(view.discount) if 0 < view.discount < 1 else np.inf
+    words = "rewards count the same however late they come."
+    if view.discount < 1:
+        half = np.log(0.5) / np.log(max(view.discount, 1e-9))
+        words = (
+            f"a reward counts half if it comes {half:.0f} steps ({half / STEP_HZ:.1f} s) later. Rewards far beyond "
+            "that, such as a bonus at the end of the lap, hardly reach the decisions of its beginning."
+        )
     return Chart(
         name="discount_factors",
         title="The weight of later rewards",
-        caption=f"With the discount factor of this training, {view.discount:g}, a reward counts half if it comes "
-        f"{half:.0f} steps ({half / STEP_HZ:.1f} s) later. Rewards far beyond that, such as a bonus at the end of the "
-        "lap, hardly reach the decisions of its beginning.",
+        caption=f"With the discount factor of this training, {view.discount:g}, {words}",
         rows=[[Panel(x_label="steps until a reward comes", y_label="weight, per cent", layers=layers)]],
     )
