@@ -33,7 +33,11 @@ def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def best_trial(study: optuna.Study) -> FrozenTrial:
-    """Return the winner: the best on fresh laps, or else the best complete trial."""
+    """Return the winner: the best on fresh laps, or else the best complete trial.
+
+    Raises:
+        BadInput: no trial is complete.
+    """
     complete = complete_trials(study)
     if not complete:
         raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
