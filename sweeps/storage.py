@@ -46,7 +46,7 @@ _DRIVERS = {"psycopg": "psycopg[binary]", "pymysql": "pymysql", "mysqldb": "mysq
 """Package of each driver."""
 _CONNECT_S = 10
 _STUCK_S = 60
-"""How long a process may leave a transaction open, or wait for one: a suspended machine blocks others this long."""
+"""How long a process may leave a transaction open, or wait for one: a suspended machine must not block others."""
 _LOCK, _LOCK_NUMBER = "deepracer_exp sweeps", 0x64726578
 
 _log = logging.getLogger("deepracer_exp")

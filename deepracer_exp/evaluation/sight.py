@@ -29,7 +29,7 @@ from .evaluator import Evaluator
 from .film import Lap, drive_best_lap, png
 
 SPACING, SPREAD = 12, 18
-"""Blurred places along the picture's width, and how many standard deviations of one that width has."""
+"""Blurred places along the picture's width, and the width in standard deviations of one of them."""
 _BLUR = 0.04
 """Standard deviation of the blur, in picture widths."""
 _HEAT = matplotlib.colormaps["inferno"]

@@ -12,7 +12,7 @@ class Interruption:
     """
 
     def __init__(self, answer: Callable[[str], None] | None = None) -> None:
-        """Do not listen yet.
+        """Set up, without listening yet.
 
         `answer` is called with a line when the first signal comes; None: nothing is shown.
         """
