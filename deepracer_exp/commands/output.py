@@ -14,6 +14,7 @@ from deepracer_exp.runs.files import BEST_LAP, LEARNING, REPORT
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from deepracer_exp.config.running import TrackingConfig
     from deepracer_exp.training.trainer import TrainResult
 
 _FILES = {REPORT: "findings and figures", BEST_LAP: "the fastest lap", LEARNING: "the learning curves"}
@@ -51,9 +52,10 @@ def print_start() -> None:
     print("starting", file=sys.stderr, flush=True)
 
 
-def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
+def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     """Print how a run ended, where its results are, and what to do next."""
     from deepracer_exp.analysis.next_steps import COMMAND, next_steps
+    from deepracer_exp.config.running import MLflowTracking
     from deepracer_exp.runs.result import result_of
 
     summary = outcome.summary
@@ -75,8 +77,10 @@ def print_result(outcome: "TrainResult", tracked_in: str | None) -> None:
             print(f"    {name:12}  {what}")
     if outcome.note is not None:
         print(f"warning: {outcome.note}", file=sys.stderr)
-    if tracked_in is not None:
-        where = "" if tracked_in == "runs" else f" {shlex.quote(f'runs_dir={tracked_in}')}"
+    if isinstance(tracking, MLflowTracking):
+        runs_dir = outcome.folder.parent.parent
+        store = f"runs_dir={runs_dir}" if tracking.uri is None else f"tracking.uri={tracking.uri}"
+        where = "" if store == "runs_dir=runs" else f" {shlex.quote(store)}"
         print(f"  compare runs  {_command()} ui{where}")
     steps = next_steps(outcome.folder, summary)
     shown = [(line.replace(COMMAND, _command(), 1), what) for line, what in steps]

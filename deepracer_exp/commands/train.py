@@ -144,7 +144,7 @@ def _train(args: argparse.Namespace) -> int:
         outcomes.append(outcome)
         if experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
-        print_result(outcome, experiment.runs_dir if experiment.tracking.kind == "mlflow" else None)
+        print_result(outcome, experiment.tracking)
         if outcome.status == "interrupted":
             break
     if args.multirun:
@@ -194,7 +194,7 @@ def _resume(args: argparse.Namespace) -> int:
 
     with warnings_on_stderr():
         outcome = resume(run_dir, overrides, Console(stderr=True))
-    print_result(outcome, str(run_dir.parent.parent) if experiment.tracking.kind == "mlflow" else None)
+    print_result(outcome, experiment.tracking)
     return outcome.exit_code
 
 
@@ -249,7 +249,7 @@ def _clone(args: argparse.Namespace) -> int:
     for line in clone.notes:
         print(line, file=sys.stderr)
     outcome = run_training(clone.experiment, clone.composition, Console(stderr=True), clone.start)
-    print_result(outcome, clone.experiment.runs_dir if clone.experiment.tracking.kind == "mlflow" else None)
+    print_result(outcome, clone.experiment.tracking)
     return outcome.exit_code
 
 
