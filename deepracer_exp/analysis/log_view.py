@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from deepracer_exp.deepracer.hyperparameters import Hyperparameters
 from deepracer_exp.deepracer.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
@@ -14,8 +15,8 @@ from deepracer_exp.tracks.track import Track
 from .log_course import catalogue_track, directed, estimated_course, find_courses, numbered_as_logged
 from .tables import add_derived, episode_table, first_rows, iteration_table
 
-DISCOUNT = 0.99
-"""For logs without hyperparameters: the default of our own trainings (the service's is 0.999)."""
+DISCOUNT = Hyperparameters().discount_factor
+"""For logs without hyperparameters: the service's default."""
 PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
 STARTING_STEPS = 10

@@ -159,9 +159,14 @@ def test_the_weight_of_a_reward_halves_where_the_caption_says() -> None:
     assert np.interp(69.0, own.x, own.y) == pytest.approx(50.0, abs=0.5)
 
 
+def test_a_log_without_hyperparameters_has_the_services_discount() -> None:
+    recording = replace(made_up_recording([Drive()]), hyperparameters=None)
+    assert "of 0.999 (the service's default), a reward counts half" in discount_factors(prepare(recording)).caption
+
+
 def test_without_a_discount_no_number_of_steps_halves_a_reward() -> None:
     caption = discount_factors(replace(prepare(made_up_recording([Drive()])), discount=1.0)).caption
-    assert caption.endswith("this training, 1, rewards count the same however late they come.")
+    assert caption.endswith("of 1 (this training), rewards count the same however late they come.")
 
 
 def test_marks_stand_at_mean_best_and_deviations_of_all_laps(lapping: LogView) -> None:

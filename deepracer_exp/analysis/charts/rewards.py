@@ -273,9 +273,11 @@ def discount_factors(view: LogView) -> Chart | None:
     ahead = np.arange(0, max(int(1.5 * count), 60), max(1, count // 150))
     layers: list[Layer] = []
     colors = (color for color in CATEGORIES if color != BLACK)
+    logged = "discount_factor" in (view.recording.hyperparameters or {})
+    whose = "this training" if logged else "the service's default"
     for gamma, color in zip(sorted({*GAMMAS, view.discount}), colors, strict=False):
         own = gamma == view.discount
-        name = f"{gamma:g}{' (this training)' if own else ''}"
+        name = f"{gamma:g}{f' ({whose})' if own else ''}"
         layers.append(
             line(ahead, 100 * gamma**ahead, BLACK if own else color, name, width=3.2 if own else 1.75)
         )
@@ -291,6 +293,6 @@ def discount_factors(view: LogView) -> Chart | None:
     return Chart(
         name="discount_factors",
         title="The weight of later rewards",
-        caption=f"With the discount factor of this training, {view.discount:g}, {words}",
+        caption=f"With a discount factor of {view.discount:g} ({whose}), {words}",
         rows=[[Panel(x_label="steps until a reward comes", y_label="weight, per cent", layers=layers)]],
     )
