@@ -361,7 +361,7 @@ def _add_edge(changes, height, width, ax, ay, bx, by, change):  # type: ignore[n
         ax, ay = ax + (height - ay) / slope, np.float64(height)
     if by > height:
         bx, by = bx + (height - by) / slope, np.float64(height)
-    _add_steep(changes, width, ax, ay, bx, by, 1.0 / slope, sign, change)
+    _add_steep(changes, width, ax, ay, by, 1.0 / slope, sign, change)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
@@ -389,7 +389,7 @@ def _add_flat(changes, height, width, ax, ay, bx, slope, sign, change):  # type:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
-def _add_steep(changes, width, ax, ay, bx, by, x_per_row, sign, change):  # type: ignore[no-untyped-def]
+def _add_steep(changes, width, ax, ay, by, x_per_row, sign, change):  # type: ignore[no-untyped-def]
     """Add an edge within the picture row by row; in one it crosses two columns at most."""
     x_at = ax - ay * x_per_row
     low, high = min(ay, by), max(ay, by)

@@ -30,9 +30,6 @@ _SHELL_RGBA = (0.32, 0.18, 0.62, 1.0)
 _DARK_RGBA = (0.08, 0.08, 0.09, 1.0)
 _RIM_RGBA = (0.75, 0.75, 0.78, 1.0)
 
-PHYSICS_GROUP = 3
-"""Geom group of the outline, hidden by MuJoCo's renderer; the visual geoms are in group 0."""
-
 
 class WheelPlace(NamedTuple):
     """Where a wheel's centre is in the chassis frame."""
@@ -78,16 +75,6 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     chassis.ipos = [car.com_x_m, 0, car.com_z_m]
     chassis.inertia = car.inertia_kgm2
     chassis.explicitinertial = True
-    # The outline that something else could touch; nothing does, the model has no contacts.
-    middle_x = 0.5 * (car.front_axle_x_m + car.rear_axle_x_m)
-    half = [0.5 * car.body_length_m, 0.5 * car.body_width_m, car.wheel_radius_m]
-    chassis.add_geom(
-        name="outline",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[middle_x, 0, 2 * car.wheel_radius_m],
-        size=half,
-        group=PHYSICS_GROUP,
-    )
     if visual:
         _add_visuals(spec, chassis, car)
     return spec

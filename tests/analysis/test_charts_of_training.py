@@ -161,7 +161,10 @@ def test_the_weight_of_a_reward_halves_where_the_caption_says() -> None:
 
 def test_a_log_without_hyperparameters_has_the_services_discount() -> None:
     recording = replace(made_up_recording([Drive()]), hyperparameters=None)
-    assert "of 0.999 (the service's default), a reward counts half" in discount_factors(prepare(recording)).caption
+    assert (
+        "of 0.999 (the service's default), a reward counts half"
+        in discount_factors(prepare(recording)).caption
+    )
 
 
 def test_without_a_discount_no_number_of_steps_halves_a_reward() -> None:
