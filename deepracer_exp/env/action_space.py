@@ -134,7 +134,7 @@ def _levels(name: str, bounds: SteeringRange | SpeedRange, levels: int) -> NDArr
 
 
 def metadata_of(actions: ActionSpace) -> ModelMetadata:
-    """Return an action space as model metadata, with the service's default camera, which our policies lack."""
+    """Return an action space as model metadata, with the service's default camera as its sensor."""
     if isinstance(actions, DiscreteActions):
         listed = map(Action, actions.steering_deg.tolist(), actions.speed_mps.tolist())
         return ModelMetadata(actions=tuple(listed))

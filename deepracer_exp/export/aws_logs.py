@@ -18,7 +18,7 @@ from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput, count, writing
 
-from .aws_files import hyperparameters_of, write_files
+from .aws_files import hyperparameters_of, sensor_keys, write_files
 
 TRACE_HEADER = (
     "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
@@ -60,7 +60,8 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", recording.name)
     job = f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{recording.name}"
     learning = replace(hyperparameters_of(experiment), num_episodes_between_training=numbered.per_iteration)
-    metadata = model_metadata_text(metadata_of(build_action_space(experiment.action_space)))
+    actions = metadata_of(build_action_space(experiment.action_space))
+    metadata = model_metadata_text(replace(actions, **sensor_keys(experiment.observation)))
     hyperparameters = hyperparameters_text(learning)
     head = _head(next(iter(experiment.tracks)), metadata, hyperparameters)
     texts = {

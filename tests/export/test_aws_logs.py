@@ -177,8 +177,8 @@ def test_what_is_left_out_is_reported(run, exported):
     assert f"{missing:,} rows of unfinished episodes are left out" in said
 
 
-def test_a_policy_without_action_numbers_writes_what_it_commanded(trained, export, caplog):
-    run = trained(*LONGER, "action_space=continuous")
+def test_a_continuous_policy_with_lidar_writes_its_commands_and_sensors(trained, export, caplog):
+    run = trained(*LONGER, "action_space=continuous", "observation=lidar")
     folder, _ = export(run.folder, "deepracer-for-cloud")
     theirs = loaded(folder, "deepracer-for-cloud", caplog).dataframe()
     assert set(theirs["action"]) == {-1}
@@ -189,6 +189,7 @@ def test_a_policy_without_action_numbers_writes_what_it_commanded(trained, expor
     assert back.problems == ()
     assert len(back.steps) == len(theirs)
     assert back.steps["action"].isna().all()
+    assert back.metadata.sensor == ("FRONT_FACING_CAMERA", "LIDAR")
 
 
 def test_our_own_reader_finds_in_the_files_what_the_run_had(run, exported):
