@@ -15,8 +15,6 @@ from deepracer_exp.sim.lidar import (
     RAYS,
     SCANS_PER_S,
     box_sides,
-    join_walls,
-    ring_walls,
     scan,
 )
 from deepracer_exp.sim.scenery import wall_ring
@@ -39,7 +37,7 @@ class Lidar:
     """
 
     def __init__(
-        self, config: LidarConfig, tracks: Sequence[Track], cars: Sequence[int], period_s: float
+        self, config: LidarConfig, tracks: Sequence[Track], cars: Sequence[int], period_s: float, boxes: int
     ) -> None:
         """Set up the walls; call `seed` and then `begin` next.
 
@@ -48,41 +46,50 @@ class Lidar:
             tracks: one per course.
             cars: their numbers over all processes.
             period_s: control period.
+            boxes: around each car.
         """
         self._config, self._cars = config, list(cars)
         rings = [None if track.floor.walls_height_m < MOUNT_Z_M else wall_ring(track) for track in tracks]
-        self._walls = join_walls([np.empty((0, 4)) if ring is None else ring_walls(ring) for ring in rings])
+        walls = [np.empty((0, 4)) if ring is None else np.hstack([ring[:-1], ring[1:]]) for ring in rings]
+        # Of each course, filled up with NaN, (courses, segments, 4).
+        self._walls = np.full((len(walls), max(map(len, walls)), 4), np.nan)
+        for row, some in zip(self._walls, walls, strict=True):
+            row[: len(some)] = some
+        self._segments = np.empty((len(self._cars), self._walls.shape[1] + 4 * boxes, 4))
         self._scans_per_step = SCANS_PER_S * period_s
         self._noise_at = np.zeros(len(self._cars), np.int64)
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS)
-        self._beside = np.empty((len(self._cars), 0, 4))
 
     def seed(self, seed: int) -> None:
         """Start all streams from `seed`."""
         self._streams = CarStreams(seed, self._cars, Purpose.LIDAR)
 
-    def begin(self, ids: Ids, episodes: NDArray[np.int64], boxes: NDArray[np.float32] | None) -> None:
+    def begin(
+        self,
+        ids: Ids,
+        episodes: NDArray[np.int64],
+        course: NDArray[np.intp],
+        boxes: NDArray[np.float32] | None,
+    ) -> None:
         """Draw the noise of new episodes of the cars `ids`; episodes are numbered per car from 0.
 
         Args:
             ids: indices of the cars, (n,).
             episodes: of these cars, (n,).
+            course: index of each of these cars' track, (n,).
             boxes: around these cars, (n, boxes, 6 or more), see `camera.take_pictures`; None: there are none.
         """
-        if boxes is not None:
-            if not self._beside.size:
-                self._beside = np.full((len(self._cars), 4 * boxes.shape[1], 4), np.nan)
-            self._beside[ids] = box_sides(boxes)
+        walls = self._walls[course]
+        self._segments[ids] = walls if boxes is None else np.hstack([walls, box_sides(boxes)])
         for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True):
             self._noise_at[car] = self._streams.at(car, episode).integers(_NOISE_NUMBERS)
 
-    def read(self, ids: Ids, state: CarState, course: NDArray[np.intp], steps: NDArray[np.int64]) -> Readings:
+    def read(self, ids: Ids, state: CarState, steps: NDArray[np.int64]) -> Readings:
         """Return the readings of new scans by the cars `ids`, (n, size).
 
         Args:
             ids: indices of the cars, (n,).
             state: of these cars, arrays (n,).
-            course: index of each of these cars' track, (n,).
             steps: control steps of each of these cars' episodes, (n,).
         """
         poses = np.stack(
@@ -93,7 +100,7 @@ class Lidar:
             ],
             axis=1,
         )
-        distances = scan(self._walls, poses, course, self._beside[ids])
+        distances = scan(poses, self._segments[ids])
         distances[distances > FURTHEST_M] = np.inf
         at = self._noise_at[ids] + _NEXT_SCAN * steps
         noise = self._noise[(at[:, None] + np.arange(RAYS)) % _NOISE_NUMBERS]
@@ -103,7 +110,6 @@ class Lidar:
         self,
         before: Readings,
         state: CarState,
-        course: NDArray[np.intp],
         steps: NDArray[np.int64],
         dropped: NDArray[np.bool_] | None,
     ) -> Readings:
@@ -112,7 +118,6 @@ class Lidar:
         Args:
             before: readings of the step before, (N, size).
             state: arrays (N,).
-            course: index of each car's track, (N,).
             steps: control steps of each car's episode, (N,).
             dropped: cars that see nothing new, (N,); None: there are none.
         """
@@ -121,7 +126,7 @@ class Lidar:
         same = scans[0] == scans[1]
         if dropped is not None:
             same |= dropped
-        now = self.read(np.arange(len(before)), state, course, steps)
+        now = self.read(np.arange(len(before)), state, steps)
         return np.where(same[:, None], before, now)
 
 

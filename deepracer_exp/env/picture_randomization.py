@@ -43,6 +43,9 @@ class PictureRandomization:
     """Draws the camera and the light of each episode of N cars, and disturbs their pictures.
 
     What an episode draws depends only on the seed, the car's number and the episode's number.
+
+    Attributes:
+        most_boxes: boxes around a car, those that are left out included.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class PictureRandomization:
         self._noise_at = np.zeros(n_cars, np.int64)
         # Middle as shares of width and height, and size as a share of the width.
         self._dirt = np.zeros((n_cars, _DIRT_SPOTS, 3))
-        most = int(ranges[:, _COLUMN["objects"], 1].max())
+        self.most_boxes = most = int(ranges[:, _COLUMN["objects"], 1].max())
         self._span[:, _COLUMN["objects"]] += 1  # 0, 1 and 2 objects are equally probable
         self._places = [_places(track) for track in tracks] if most else []
         self._boxes = np.zeros((n_cars, most, 9), np.float32)

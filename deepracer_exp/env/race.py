@@ -124,7 +124,10 @@ class Race:
             else Servos(real_car.controls, setup.actions, n_cars)
         )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
-        self._lidar = None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s)
+        boxes = 0 if self._varied is None else self._varied.most_boxes
+        self._lidar = (
+            None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s, boxes)
+        )
         self.lidar = np.zeros((n_cars, lidar.size if lidar is not None else 0), np.float32)
         self._kept = _KEPT if lidar is None else (*_KEPT, "lidar")
         self.reward = np.zeros(n_cars)
@@ -194,7 +197,8 @@ class Race:
         if self._varied is not None:
             self._varied.begin(ids, episode, self.rules.course[ids])
         if self._lidar is not None:
-            self._lidar.begin(ids, episode, None if self._varied is None else self._varied.boxes(ids))
+            boxes = None if self._varied is None else self._varied.boxes(ids)
+            self._lidar.begin(ids, episode, self.rules.course[ids], boxes)
 
     def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
         """Put cars at rest on the centre line in the middle of their episodes; nothing is drawn again.
@@ -349,9 +353,7 @@ class Race:
                 self.randomization.dropped,
             )
         if self._lidar is not None:
-            self.lidar = self._lidar.next(
-                self.lidar, state, self.rules.course, self.rules.steps, self.randomization.dropped
-            )
+            self.lidar = self._lidar.next(self.lidar, state, self.rules.steps, self.randomization.dropped)
 
     def _observe_started(self, ids: np.ndarray) -> None:
         """Observe only the cars `ids`, just put on the track: with many cars, some start at nearly every step."""
@@ -371,7 +373,7 @@ class Race:
             self.pixels[ids] = self._pictures.first(ids, state, self.rules.course[ids])
         if self._lidar is not None:
             self.lidar = self.lidar.copy()
-            self.lidar[ids] = self._lidar.read(ids, state, self.rules.course[ids], self.rules.steps[ids])
+            self.lidar[ids] = self._lidar.read(ids, state, self.rules.steps[ids])
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
         track_index = self.rules.track_index[ids]

@@ -1,8 +1,5 @@
 """The LIDAR of all cars at once: distances to walls and boxes, whose sides are segments from above."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -20,28 +17,6 @@ MOUNT_X_M, MOUNT_Z_M = 0.02913, 0.1847
 """Ahead of the chassis origin, and above the floor (`bundle/urdf/deepracer/deepracer_single_cam_lidar.urdf`)."""
 
 
-class Walls(NamedTuple):
-    """What reflects, in groups of segments.
-
-    Attributes:
-        segments_m: ends ax, ay, bx, by, (S, 4).
-        first: index of each group's first segment, then the number of all segments, (groups + 1,).
-    """
-
-    segments_m: NDArray[np.float64]
-    first: NDArray[np.int64]
-
-
-def join_walls(groups: Sequence[NDArray[np.float64]]) -> Walls:
-    """Join groups of segments, (n, 4) each; a group may be empty."""
-    return Walls(np.concatenate([np.empty((0, 4)), *groups]), np.cumsum([0, *(len(some) for some in groups)]))
-
-
-def ring_walls(ring: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the segments (n - 1, 4) of a closed outline, (n, 2), of a field or a box."""
-    return np.hstack([ring[:-1], ring[1:]])
-
-
 def box_sides(boxes: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the sides of boxes (N, boxes, 6 or more), see `camera.take_pictures`, as segments (N, 4 * boxes, 4).
 
@@ -52,36 +27,20 @@ def box_sides(boxes: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.concatenate([corners, np.roll(corners, -1, axis=-2)], axis=-1).reshape(len(boxes), -1, 4)
 
 
-def scan(
-    walls: Walls,
-    poses: NDArray[np.float64],
-    group: NDArray[np.intp],
-    beside: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+def scan(poses: NDArray[np.float64], segments_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distance along each ray, (N, RAYS), metres; infinite where nothing is hit.
 
     Args:
-        walls: what reflects.
         poses: x and y in metres and direction in radians of each sensor, (N, 3).
-        group: index of the group of walls that each sensor sees, (N,).
-        beside: segments that each sensor sees as well, (N, segments, 4); None: there are none.
+        segments_m: ends ax, ay, bx, by of what each sensor sees, (N, segments, 4); NaN where there is nothing.
     """
     out = np.empty((len(poses), RAYS))
-    _scan(
-        np.ascontiguousarray(poses),
-        group,
-        walls.segments_m,
-        walls.first,
-        np.empty((len(poses), 0, 4)) if beside is None else beside,
-        np.cos(ANGLES_RAD),
-        np.sin(ANGLES_RAD),
-        out,
-    )
+    _scan(np.ascontiguousarray(poses), segments_m, np.cos(ANGLES_RAD), np.sin(ANGLES_RAD), out)
     return out
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _scan(poses, group, segments, first, beside, cosines, sines, out):  # type: ignore[no-untyped-def]
+def _scan(poses, segments, cosines, sines, out):  # type: ignore[no-untyped-def]
     """Intersect every ray with every segment."""
     rays = len(cosines)
     ray_x, ray_y = np.empty(rays), np.empty(rays)
@@ -93,8 +52,7 @@ def _scan(poses, group, segments, first, beside, cosines, sines, out):  # type: 
             ray_x[ray] = cos * cosines[ray] - sin * sines[ray]
             ray_y[ray] = sin * cosines[ray] + cos * sines[ray]
             nearest[ray] = np.inf
-        _hit(segments[first[group[car]] : first[group[car] + 1]], x, y, ray_x, ray_y, nearest)
-        _hit(beside[car], x, y, ray_x, ray_y, nearest)
+        _hit(segments[car], x, y, ray_x, ray_y, nearest)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

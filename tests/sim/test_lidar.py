@@ -4,10 +4,18 @@ import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_Z_M, RAYS, box_sides, join_walls, ring_walls, scan
+from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_Z_M, RAYS, box_sides, scan
 
-ROOM = ring_walls(np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.5], [0.0, 2.5], [0.0, 0.0]]))
-FIRST = np.zeros(1, np.intp)
+
+def sides(low_x: float, low_y: float, high_x: float, high_y: float) -> np.ndarray:
+    return (
+        shapely.get_coordinates(shapely.box(low_x, low_y, high_x, high_y))
+        .repeat(2, axis=0)[1:-1]
+        .reshape(4, 4)
+    )
+
+
+ROOM = sides(0.0, 0.0, 4.0, 2.5)
 
 
 def poses_in(low: float, high: tuple[float, float], count: int) -> np.ndarray:
@@ -22,16 +30,15 @@ def test_in_a_room_every_ray_ends_at_the_nearest_of_its_four_walls():
     cos, sin = np.cos(angle), np.sin(angle)
     to_x = np.where(cos > 0, 4.0 - poses[:, :1], -poses[:, :1]) / cos
     to_y = np.where(sin > 0, 2.5 - poses[:, 1:2], -poses[:, 1:2]) / sin
-    distances = scan(join_walls([ROOM]), poses, np.zeros(300, np.intp))
+    distances = scan(poses, np.tile(ROOM, (300, 1, 1)))
     assert distances == pytest.approx(np.minimum(to_x, to_y), abs=1e-9)
 
 
 def test_a_sensor_turned_by_one_ray_sees_the_same_ring_moved_by_one():
-    box = ring_walls(np.array([[3.0, 1.0], [3.2, 1.0], [3.2, 1.3], [3.0, 1.3], [3.0, 1.0]]))
-    walls = join_walls([np.vstack([ROOM, box])])
+    walls = np.vstack([ROOM, sides(3.0, 1.0, 3.2, 1.3)])[None]
     pose = np.array([[1.3, 0.7, 0.4]])
     turned = pose + np.array([0, 0, ANGLES_RAD[1] - ANGLES_RAD[0]])
-    assert scan(walls, turned, FIRST)[0, :-1] == pytest.approx(scan(walls, pose, FIRST)[0, 1:], abs=1e-9)
+    assert scan(turned, walls)[0, :-1] == pytest.approx(scan(pose, walls)[0, 1:], abs=1e-9)
 
 
 def test_among_segments_that_cross_the_nearest_hides_the_others():
@@ -46,14 +53,14 @@ def test_among_segments_that_cross_the_nearest_hides_the_others():
         if not crossed.is_empty:
             expected[ray] = eye.distance(crossed)
     assert np.isinf(expected).any()
-    distances = scan(join_walls([segments]), pose[None], FIRST)[0]
+    distances = scan(pose[None], segments[None])[0]
     assert distances == pytest.approx(expected, abs=1e-9)
 
 
-def test_each_sensor_sees_the_walls_of_its_own_group():
-    walls = join_walls([np.empty((0, 4)), ROOM, ROOM + 10])
+def test_each_sensor_sees_its_own_walls_and_nothing_where_there_are_none():
+    walls = np.stack([np.full((4, 4), np.nan), ROOM, ROOM + 10])
     poses = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [11.0, 11.0, 0.0]])
-    nothing, here, there = scan(walls, poses, np.arange(3))
+    nothing, here, there = scan(poses, walls)
     assert np.isinf(nothing).all()
     assert here == pytest.approx(there)
     assert here[RAYS // 2] == pytest.approx(3.0 / np.cos(ANGLES_RAD[RAYS // 2]))
@@ -66,9 +73,9 @@ def test_a_box_is_read_where_it_stands_and_hides_the_wall_behind_it():
     boxes = np.array([[[1.3 * np.cos(to_box), 1.3 * np.sin(to_box), to_box, 0.4, 0.2, MOUNT_Z_M + 0.01]]])
     boxes = np.concatenate([boxes, np.where(np.arange(6) == 5, MOUNT_Z_M, boxes)])
     poses = np.tile([0.0, 0.0, 0.8], (2, 1))
-    walls, group = join_walls([ROOM - [2, 1, 2, 1]]), np.zeros(2, np.intp)
-    empty = scan(walls, poses, group)
-    seen, low = scan(walls, poses, group, box_sides(boxes))
+    walls = np.tile(ROOM - [2, 1, 2, 1], (2, 1, 1))
+    empty = scan(poses, walls)
+    seen, low = scan(poses, np.hstack([walls, box_sides(boxes)]))
     off = ANGLES_RAD - ANGLES_RAD[ray]
     struck = (np.cos(off) > 0) & (np.abs(np.tan(off)) * 1.1 <= 0.1)
     assert struck.sum() == 3
