@@ -129,9 +129,8 @@ class Randomization:
         # 0, 1 and 2 steps are drawn with equal probability.
         self._span[:, _COLUMN["action_delay_steps"]] += 1
         self.values: Floats = self._low.astype(np.float32).astype(np.float64)
-        tyre_friction = batch.car.tyre_friction
         physics: dict[str, Callable[[Ids, Floats], None]] = {
-            "friction_scale": lambda ids, scale: batch.set_tyre_friction(ids, tyre_friction * scale),
+            "friction_scale": batch.set_friction_scale,
             "mass_scale": batch.set_mass_scale,
             "motor_scale": batch.set_motor_scale,
             "servo_scale": batch.set_servo_scale,

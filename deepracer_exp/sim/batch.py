@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
 
-from .car import build_model
+from .car import build_spec
 from .tyres import DRIVE, car_record, push_cars
 
 Floats = NDArray[np.float64]
@@ -47,11 +47,11 @@ class CarBatch:
     def __init__(self, car: CarConfig, n_cars: int, threads: int, floor_friction: ArrayLike = 1.0) -> None:
         self.car = car
         self.n_cars = n_cars
-        self.model = build_model(car)
+        self.model = build_spec(car).compile()
         self._car = car_record(car)
         self._cars = np.full(n_cars, self._car)
         self._tyre_friction = np.full(n_cars, car.tyre_friction)
-        self._floor_friction = np.broadcast_to(np.asarray(floor_friction, np.float64), n_cars).copy()
+        self._floor_friction = np.full(n_cars, floor_friction, np.float64)
         self._cars["friction"] = self._tyre_friction * self._floor_friction
         self._batch = mujoco.batch.Batch(self.model, n_cars, threads or len(os.sched_getaffinity(0)))
         self._rows: Floats = self._batch.state
@@ -74,58 +74,17 @@ class CarBatch:
             y_m: likewise.
             yaw_rad: heading, likewise.
         """
-        rows = np.asarray(ids, np.intp)
+        rows, com = np.asarray(ids, np.intp), self.car.com_x_m
         self._rows[rows] = self._rest_row
-        self._set_pose(rows, np.asarray(x_m, np.float64), np.asarray(y_m, np.float64), yaw_rad)
-
-    def move(self, ids: ArrayLike, pose: Floats, motion: Floats) -> None:
-        """Give cars another pose and motion; speeds of the wheels and steering angles stay as they are.
-
-        Args:
-            ids: distinct indices of cars, (n,).
-            pose: x_m, y_m, yaw_rad of the chassis origin, (n, 3).
-            motion: speed_mps, lateral_mps, yaw_rate_radps as in `CarState`, (n, 3).
-        """
-        rows = np.asarray(ids, np.intp)
-        self._set_pose(rows, *pose.T)
-        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        speed, rate = motion[:, 0], motion[:, 2]
-        lateral = motion[:, 1] + self.car.com_x_m * rate
-        self._qvel[rows, 0] = cos * speed - sin * lateral
-        self._qvel[rows, 1] = sin * speed + cos * lateral
-        self._qvel[rows, 2] = rate
-
-    def _set_pose(self, rows: NDArray[np.intp], x_m: Floats, y_m: Floats, yaw_rad: ArrayLike) -> None:
         # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
-        com = self.car.com_x_m
         self._qpos[rows, 0] = x_m + com * (np.cos(yaw_rad) - 1.0)
         self._qpos[rows, 1] = y_m + com * np.sin(yaw_rad)
         self._qpos[rows, 2] = yaw_rad
 
     @property
-    def steering_rad(self) -> Floats:
-        """Steering angle of the front wheels, (N,): a copy, positive to the left."""
-        angle: Floats = self._drives["steering_rad"][:, 0] + self._car["steering_trim_rad"]
-        return angle
-
-    @property
     def acceleration_mps2(self) -> Floats:
         """Acceleration ahead and to the left in the last physics step, (N, 2): a copy."""
         return np.stack([self._drives["ahead_mps2"][:, 0], self._drives["left_mps2"][:, 0]], axis=1)
-
-    def lift(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
-        """Put cars at rest as `place` does, but keep their steering angles and last steering commands."""
-        rows = np.asarray(ids, np.intp)
-        kept = {name: self._drives[name][rows] for name in ("steering_rad", "sent_steering_rad")}
-        self.place(rows, x_m, y_m, yaw_rad)
-        for name, values in kept.items():
-            self._drives[name][rows] = values
-
-    def steer(self, ids: ArrayLike, angle_rad: ArrayLike) -> None:
-        """Turn cars' front wheels to an angle at once, (n,); the steering continues from there."""
-        rows = np.asarray(ids, np.intp)
-        angle = np.broadcast_to(np.asarray(angle_rad, np.float64), rows.shape)
-        self._drives["steering_rad"][rows, 0] = angle - self._car["steering_trim_rad"]
 
     def drive(
         self, speed_mps: ArrayLike, steering_rad: ArrayLike, moving: NDArray[np.bool_] | None = None
@@ -187,17 +146,15 @@ class CarBatch:
             raise ValueError(f"state has shape {rows.shape}, these cars need {self._rows.shape}")
         self._rows[:] = rows
 
-    def set_tyre_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
-        """Set the tyre friction coefficient of cars, (n,), without the floor's factor."""
-        rows = np.asarray(ids, np.intp)
-        self._tyre_friction[rows] = values
-        self._cars["friction"][rows] = self._tyre_friction[rows] * self._floor_friction[rows]
-
     def set_floor_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
         """Set the floor's factor on the tyre friction of cars, (n,)."""
-        rows = np.asarray(ids, np.intp)
-        self._floor_friction[rows] = values
-        self._cars["friction"][rows] = self._tyre_friction[rows] * self._floor_friction[rows]
+        self._floor_friction[np.asarray(ids, np.intp)] = values
+        self._cars["friction"] = self._tyre_friction * self._floor_friction
+
+    def set_friction_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+        """Multiply cars' tyre friction by scale, (n,), relative to the configured one."""
+        self._tyre_friction[np.asarray(ids, np.intp)] = self.car.tyre_friction * np.asarray(scale)
+        self._cars["friction"] = self._tyre_friction * self._floor_friction
 
     def set_mass_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
         """Multiply cars' masses and inertias by scale, (n,), relative to the configured ones."""

@@ -1,7 +1,5 @@
 """The car as a MuJoCo model, built in code from its dimensions."""
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 
@@ -29,24 +27,6 @@ _DISABLED = (
 _SHELL_RGBA = (0.32, 0.18, 0.62, 1.0)
 _DARK_RGBA = (0.08, 0.08, 0.09, 1.0)
 _RIM_RGBA = (0.75, 0.75, 0.78, 1.0)
-
-
-class WheelPlace(NamedTuple):
-    """Where a wheel's centre is in the chassis frame."""
-
-    name: str
-    x_m: float
-    y_m: float
-
-
-def wheel_places(car: CarConfig) -> tuple[WheelPlace, ...]:
-    """Return the four wheel centres in the order of `WHEELS`."""
-    return (
-        WheelPlace(WHEELS[0], car.front_axle_x_m, car.front_wheel_y_m),
-        WheelPlace(WHEELS[1], car.front_axle_x_m, -car.front_wheel_y_m),
-        WheelPlace(WHEELS[2], car.rear_axle_x_m, car.rear_wheel_y_m),
-        WheelPlace(WHEELS[3], car.rear_axle_x_m, -car.rear_wheel_y_m),
-    )
 
 
 def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
@@ -80,18 +60,13 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     return spec
 
 
-def build_model(car: CarConfig) -> mujoco.MjModel:
-    """Compile `build_spec`."""
-    return build_spec(car).compile()
-
-
 def _add_visuals(spec: mujoco.MjSpec, chassis: mujoco.MjsBody, car: CarConfig) -> None:
     """Add what the renderer shows: floor, shell, cockpit, camera, tyres and spokes, and a light."""
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0
     )
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    axis_z = car.wheel_radius_m
+    axis_z, hinge = car.wheel_radius_m, mujoco.mjtJoint.mjJNT_HINGE
     middle_x = 0.5 * (car.front_axle_x_m + car.rear_axle_x_m)
     inner_half_width = min(car.front_wheel_y_m, car.rear_wheel_y_m) - 0.5 * car.wheel_width_m - 0.004
     half_length = 0.5 * car.body_length_m
@@ -113,19 +88,18 @@ def _add_visuals(spec: mujoco.MjSpec, chassis: mujoco.MjsBody, car: CarConfig) -
     camera_pos = (car.camera_x_m - 0.01, 0, car.camera_z_m)
     _add_visual(chassis, "camera", box, camera_pos, (0.012, 0.03, 0.014), _DARK_RGBA, quat)
     across = (np.sqrt(0.5), np.sqrt(0.5), 0, 0)
-    for place in wheel_places(car):
-        wheel = chassis.add_body(name=place.name, pos=[place.x_m, place.y_m, car.wheel_radius_m])
-        hinge = mujoco.mjtJoint.mjJNT_HINGE
-        if place.name in STEERED:
-            wheel.add_joint(name=f"{place.name}_steer", type=hinge, axis=[0, 0, 1])
-        wheel.add_joint(name=f"{place.name}_spin", type=hinge, axis=[0, 1, 0])
+    for name, (x_m, y_m) in zip(WHEELS, car.wheel_points_m, strict=True):
+        wheel = chassis.add_body(name=name, pos=[x_m, y_m, car.wheel_radius_m])
+        if name in STEERED:
+            wheel.add_joint(name=f"{name}_steer", type=hinge, axis=[0, 0, 1])
+        wheel.add_joint(name=f"{name}_spin", type=hinge, axis=[0, 1, 0])
         # MuJoCo requires a mass of every moving body.
         wheel.mass, wheel.inertia, wheel.explicitinertial = 1e-3, [1e-6, 1e-6, 1e-6], True
         size = (car.wheel_radius_m, 0.5 * car.wheel_width_m, 0)
-        _add_visual(wheel, f"{place.name}_tyre", cylinder, (0, 0, 0), size, _DARK_RGBA, across)
+        _add_visual(wheel, f"{name}_tyre", cylinder, (0, 0, 0), size, _DARK_RGBA, across)
         # A spoke wider than the tyre, so that one sees the wheel turn.
         size = (0.7 * car.wheel_radius_m, 0.5 * car.wheel_width_m + 0.001, 0.005)
-        _add_visual(wheel, f"{place.name}_spoke", box, (0, 0, 0), size, _RIM_RGBA)
+        _add_visual(wheel, f"{name}_spoke", box, (0, 0, 0), size, _RIM_RGBA)
 
 
 def _add_visual(

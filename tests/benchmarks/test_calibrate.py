@@ -24,7 +24,9 @@ def record(car: CarConfig, cars: int = 20, episodes: int = 4, rows: int = 35) ->
     batch, everyone, tables = CarBatch(car, cars, 1), np.arange(cars), []
     for episode in range(episodes):
         # Putting a car down leaves its wheels turned.
-        batch.lift(everyone, *rng.uniform(-3, 3, (3, cars)))
+        kept = batch._drives[["steering_rad", "sent_steering_rad"]].copy()
+        batch.place(everyone, *rng.uniform(-3, 3, (3, cars)))
+        batch._drives[["steering_rad", "sent_steering_rad"]] = kept
         for row in range(rows):
             speed = rng.choice([1.0, 2.0, 3.5], cars)
             steering_deg = rng.choice([-30.0, -10.0, 0.0, 20.0, 30.0], cars)

@@ -234,20 +234,15 @@ def test_a_battery_loses_its_share_of_the_speed_over_twenty_seconds_and_no_more(
     np.testing.assert_allclose(share[300:], 0.7, atol=1e-6)
 
 
-def test_half_the_friction_halves_the_grip_of_that_car_alone():
-    race = race_of("none", "track=reinvent_carpet", friction_scale=(0.5, 1.0), n_cars=6)
-    nominal = race_of("none", "track=reinvent_carpet")._batch._batch.get_model(0).pair_friction
-    for car, scale in enumerate(drawn_of(race, "friction_scale")):
-        friction = race._batch._batch.get_model(car).pair_friction
-        np.testing.assert_allclose(friction[:, :2], scale * nominal[:, :2])
-
-
-def test_each_car_has_the_mass_the_motors_and_the_servos_it_drew():
-    race = race_of(mass_scale=(0.5, 1.5), motor_scale=(0.5, 1.5), servo_scale=(0.5, 1.5), n_cars=5)
+def test_each_car_has_the_grip_the_mass_the_motors_and_the_servos_it_drew():
+    scales = dict.fromkeys(("friction_scale", "mass_scale", "motor_scale", "servo_scale"), (0.5, 1.5))
+    race = race_of("none", "track=reinvent_carpet", n_cars=5, **scales)
     cars, nominal, model = race._batch._cars, race._batch._car, race._batch.model
-    mass, motor, servo = (drawn_of(race, f"{part}_scale") for part in ("mass", "motor", "servo"))
+    friction, mass, motor, servo = (drawn_of(race, name) for name in scales)
     for car in range(5):
         np.testing.assert_allclose(race._batch._batch.get_model(car).body_mass, mass[car] * model.body_mass)
+    floor = race.setup.track.floor.friction
+    np.testing.assert_allclose(cars["friction"], friction * floor * nominal["friction"])
     np.testing.assert_allclose(cars["mass_kg"], mass * nominal["mass_kg"])
     np.testing.assert_allclose(cars["motor_n"], motor * nominal["motor_n"])
     np.testing.assert_allclose(cars["steering_time_s"], nominal["steering_time_s"] / servo)
@@ -267,10 +262,8 @@ def test_the_physics_bears_every_corner_of_what_is_accepted():
     corners = np.array(list(itertools.product([0.1, 2.0], [0.5, 2.0], [0.5, 2.0], [0.5, 2.0])))
     car = compose_experiment([])[0].car
     cars, everyone = CarBatch(car, len(corners), 1), np.arange(len(corners))
-    cars.set_tyre_friction(everyone, car.tyre_friction * corners[:, 0])
-    for scale, apply in zip(
-        corners.T[1:], (cars.set_mass_scale, cars.set_motor_scale, cars.set_servo_scale), strict=True
-    ):
+    setters = (cars.set_friction_scale, cars.set_mass_scale, cars.set_motor_scale, cars.set_servo_scale)
+    for scale, apply in zip(corners.T, setters, strict=True):
         apply(everyone, scale)
     draw = np.random.default_rng(3)
     for _ in range(60):

@@ -165,47 +165,6 @@ def test_the_fitted_cars_turn_wider_than_the_ideal_one(name):
     assert fitted.yaw_rate_radps[0] / fitted.speed_mps[0] < 0.7 * ideal.yaw_rate_radps[0] / ideal.speed_mps[0]
 
 
-def test_a_moved_car_continues_from_its_new_place_with_its_new_motion():
-    cars = CarBatch(EVEN, 2, 1)
-    drive(cars, 1.0, 0.0, 20)
-    # The first is left as it is, the second is the first seen from elsewhere.
-    before = cars.read()
-    turn = 2.0
-    pose = np.array([[5.0, -3.0, before.yaw_rad[0] + turn]])
-    motion = np.array([[before.speed_mps[0], before.lateral_mps[0], before.yaw_rate_radps[0]]])
-    cars.move([1], pose, motion)
-    placed = cars.read()
-    assert (placed.x_m[1], placed.y_m[1]) == (5.0, -3.0)
-    assert placed.yaw_rad[1] == pytest.approx(before.yaw_rad[0] + turn)
-    assert placed.speed_mps[1] == pytest.approx(before.speed_mps[0])
-    after = drive(cars, 1.0, 10.0, 10)
-    dx, dy = after.x_m - placed.x_m, after.y_m - placed.y_m
-    turned = (np.cos(turn) * dx[0] - np.sin(turn) * dy[0], np.sin(turn) * dx[0] + np.cos(turn) * dy[0])
-    # The acceleration that shifts the load, and the speeds of the wheels, are those from before.
-    np.testing.assert_allclose(turned, (dx[1], dy[1]), atol=2e-3)
-
-
-def test_a_moved_car_has_the_motion_it_was_given():
-    cars = CarBatch(CAR, 1, 1)
-    cars.move([0], np.array([[1.0, 2.0, -2.5]]), np.array([[1.5, 0.2, 0.7]]))
-    state = cars.read()
-    assert (state.speed_mps[0], state.lateral_mps[0]) == pytest.approx((1.5, 0.2))
-    assert state.yaw_rate_radps[0] == pytest.approx(0.7)
-
-
-def test_lifting_a_car_stops_it_but_leaves_its_wheels_turned():
-    cars = CarBatch(CAR, 2, 1)
-    drive(cars, 1.5, 30.0, 15)
-    turned = cars.steering_rad
-    cars.lift([0], 1.0, 2.0, 0.5)
-    state = cars.read()
-    assert (state.x_m[0], state.y_m[0], state.speed_mps[0]) == (1.0, 2.0, 0.0)
-    np.testing.assert_array_equal(cars.steering_rad, turned)
-    assert turned[0] > 0.3
-    cars.place([1], 0.0, 0.0, 0.0)
-    assert cars.steering_rad[1] == pytest.approx(np.deg2rad(CAR.steering_trim_deg))
-
-
 def test_commands_beyond_the_limits_are_cut():
     cars = CarBatch(CAR, 2, 1)
     drive(cars, [99.0, CAR.max_speed_mps], [90.0, CAR.max_steering_deg], 10)
@@ -214,7 +173,7 @@ def test_commands_beyond_the_limits_are_cut():
 
 def test_a_slippery_car_slides_and_the_others_do_not_notice():
     alike, one_slips = CarBatch(CAR, 3, 1), CarBatch(CAR, 3, 1)
-    one_slips.set_tyre_friction([1], [0.1])
+    one_slips.set_friction_scale([1], [0.1 / CAR.tyre_friction])
     for cars in (alike, one_slips):
         drive(cars, 2.0, 0.0, 30)
     grip, slip = drive(alike, 2.0, 20.0, 10), drive(one_slips, 2.0, 20.0, 10)
@@ -224,12 +183,14 @@ def test_a_slippery_car_slides_and_the_others_do_not_notice():
 
 def test_a_slippery_floor_and_a_slippery_tyre_are_the_same():
     floor, tyre = CarBatch(CAR, 1, 1, floor_friction=0.4), CarBatch(CAR, 1, 1)
-    tyre.set_tyre_friction([0], [0.4 * CAR.tyre_friction])
+    tyre.set_friction_scale([0], [0.4])
     drive(floor, 1.5, 20.0, 15), drive(tyre, 1.5, 20.0, 15)
     np.testing.assert_array_equal(floor.state, tyre.state)
 
 
-@pytest.mark.parametrize("setter", ["set_mass_scale", "set_motor_scale", "set_servo_scale"])
+@pytest.mark.parametrize(
+    "setter", ["set_friction_scale", "set_mass_scale", "set_motor_scale", "set_servo_scale"]
+)
 def test_a_scale_of_one_changes_nothing(setter):
     plain, scaled = CarBatch(CAR, 2, 1), CarBatch(CAR, 2, 1)
     getattr(scaled, setter)([0, 1], [1.0, 1.0])

@@ -8,7 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.sim.car import build_model, build_spec
+from deepracer_exp.sim.car import build_spec
 
 CAR_FILES = sorted((Path(__file__).parents[2] / "conf/car").glob("*.yaml"))
 
@@ -54,13 +54,13 @@ def test_impossible_cars_are_refused(car, change):
 
 def test_the_model_weighs_what_the_links_of_the_published_car_weigh(car):
     # Chassis, shell, camera and its mount, two hinges, four wheels.
-    assert build_model(car).body_mass.sum() == pytest.approx(
+    assert build_spec(car).compile().body_mass.sum() == pytest.approx(
         5 + 0.3 + 2 * 0.34055 + 2 * 0.1 + 4 * 0.34055, abs=1e-3
     )
 
 
 def test_the_model_turns_about_its_centre_of_mass(car):
-    model, data = build_model(car), None
+    model = build_spec(car).compile()
     data = mujoco.MjData(model)
     data.qvel[2] = 3.0
     before = model.body("chassis").ipos[0]

@@ -28,6 +28,14 @@ def energy_j(cars: CarBatch) -> np.ndarray:
     )
 
 
+def sliding(*motions: tuple[float, float, float], floor_friction: float = 1.0) -> CarBatch:
+    """Cars at the origin with these speeds ahead, to the left (m/s) and yaw rates (rad/s); their wheels stand."""
+    cars = CarBatch(CAR, len(motions), 1, floor_friction)
+    cars._qvel[:] = motions
+    cars._qvel[:, 1] += CAR.com_x_m * cars._qvel[:, 2]
+    return cars
+
+
 @given(
     stiffness=st.floats(1, 5000),
     limit=st.floats(0.01, 100),
@@ -47,8 +55,7 @@ def test_more_slip_never_gives_less_force_and_never_more_than_friction(limit, sl
 
 
 def test_a_car_without_grip_is_not_moved():
-    cars = CarBatch(CAR, 1, 1, floor_friction=0.0)
-    cars.move([0], np.array([[0.0, 0.0, 0.3]]), np.array([[2.0, 0.5, 1.0]]))
+    cars = sliding((2.0, 0.5, 1.0), floor_friction=0.0)
     before = energy_j(cars)
     for _ in range(15):
         cars.drive([4.0], [0.5])
@@ -57,8 +64,7 @@ def test_a_car_without_grip_is_not_moved():
 
 @pytest.mark.parametrize("motion", [(3.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 20.0), (2.0, -2.0, 8.0)])
 def test_a_car_commanded_to_stand_loses_its_energy_and_stays(motion):
-    cars = CarBatch(CAR, 1, 1)
-    cars.move([0], np.zeros((1, 3)), np.array([motion]))
+    cars = sliding(motion)
     energies = [energy_j(cars)[0]]
     for _ in range(60):
         cars.drive([0.0], [0.0])
@@ -73,8 +79,7 @@ def test_a_car_commanded_to_stand_loses_its_energy_and_stays(motion):
 
 def test_braking_and_sliding_are_bounded_by_friction():
     most = 2 / np.pi * CAR.tyre_friction * GRAVITY_MPS2
-    cars = CarBatch(CAR, 2, 1)
-    cars.move([0, 1], np.zeros((2, 3)), np.array([[3.5, 0.0, 0.0], [0.0, 3.5, 0.0]]))
+    cars = sliding((3.5, 0.0, 0.0), (0.0, 3.5, 0.0))
     cars.drive([0.0, 0.0], [0.0, 0.0])
     slid = cars.read()
     lost = 3.5 - np.hypot(slid.speed_mps, slid.lateral_mps)
@@ -132,7 +137,7 @@ def drive_wildly(name: str, steps: int, n_cars: int, threads: int) -> CarBatch:
     extremes = np.array(list(itertools.product((0.3, 1.5), (0.5, 2.0), (0.4, 1.6), (0.2, 2.0))))[
         everyone % 16
     ]
-    cars.set_tyre_friction(everyone, extremes[:, 0] * cars.car.tyre_friction)
+    cars.set_friction_scale(everyone, extremes[:, 0])
     cars.set_mass_scale(everyone, extremes[:, 1])
     cars.set_motor_scale(everyone, extremes[:, 2])
     cars.set_servo_scale(everyone, extremes[:, 3])
