@@ -6,6 +6,7 @@ import numpy as np
 
 from deepracer_exp.config.driving import ObservationConfig, ObservationShape
 from deepracer_exp.config.own_class import build_own
+from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures
 
@@ -88,42 +89,32 @@ class Features:
     def __init__(
         self,
         config: ObservationConfig,
-        lengths_m: np.ndarray,
+        tracks: Tracks,
         steering_max_deg: float,
         speed_max_mps: float,
         parts: Sequence[ObservationPart] = (),
     ):
-        self._config = config
-        self._ahead_ndist = np.asarray(config.lookahead_m) / lengths_m[:, None]
+        self._config, self._tracks = config, tracks
+        self._ahead_ndist = np.asarray(config.lookahead_m) / tracks.length_m[:, None]
         self._steering_max_deg = steering_max_deg
         self._speed_max_mps = speed_max_mps
         self._parts = parts
         self.names = _names(config, parts)
-        self.size = len(self.names)
-
-    def ahead(self, ndist: np.ndarray, track_index: np.ndarray) -> np.ndarray:
-        """Return the normalised distances (N, K) along the centre line at which the road is observed.
-
-        Args:
-            ndist: positions of the cars, (N,).
-            track_index: index of each car's track in the lengths, (N,).
-        """
-        ahead: np.ndarray = ndist[:, None] + self._ahead_ndist[track_index]
-        return ahead
 
     def compute(
-        self, now: Measures, steering_deg: np.ndarray, commanded_mps: np.ndarray, road: np.ndarray
+        self, now: Measures, track_index: TrackIndex, steering_deg: np.ndarray, commanded_mps: np.ndarray
     ) -> np.ndarray:
-        """Return the features, shape (N, size), float32.
+        """Return the features, shape (N, len(names)), float32.
 
         Args:
             now: poses against the track.
+            track_index: index of each car's track, (N,).
             steering_deg: last commanded steering (N,).
             commanded_mps: last commanded speed (N,).
-            road: centre-line points at `ahead(now.ndist)`, shape (N, K, 2).
         """
         config = self._config
-        out = np.empty((len(now.front), self.size), np.float32)
+        road = self._tracks.points_at(now.ndist[:, None] + self._ahead_ndist[track_index], track_index)
+        out = np.empty((len(now.front), len(self.names)), np.float32)
         out[:, 0] = 2 * now.offset_m / now.track_width_m
         out[:, 1] = np.sin(now.heading_error_rad)
         out[:, 2] = np.cos(now.heading_error_rad)

@@ -76,6 +76,7 @@ class Race:
             prints: where `print` of a reward function goes; None: nowhere.
             randomizations: of each car, (N,); None: the setup's for all.
         """
+        randomizations = randomizations or [setup.randomization] * n_cars
         self.setup = setup
         self.n_cars = n_cars
         self.rules = RaceRules(setup, n_cars, first_car)
@@ -88,14 +89,10 @@ class Race:
         # A space that only drives straight ahead has no largest angle to divide by.
         steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
         self._features = Features(
-            setup.observation,
-            self.rules.tracks.length_m,
-            steering_max_deg,
-            high[1],
-            setup.observation_parts,
+            setup.observation, self.rules.tracks, steering_max_deg, high[1], setup.observation_parts
         )
         self.randomization = Randomization(
-            randomizations or [setup.randomization] * n_cars,
+            randomizations,
             self.cars.tolist(),
             self._batch,
             self._features.names,
@@ -105,10 +102,10 @@ class Race:
         self._return = np.zeros(n_cars)
         self._steering_deg = np.zeros(n_cars)
         self._commanded_mps = np.zeros(n_cars)
-        self.observation = np.zeros((n_cars, self._features.size), np.float32)
+        self.observation = np.zeros((n_cars, len(self._features.names)), np.float32)
         camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
         real_car = setup.real_car
-        pictures = [one.pictures for one in randomizations or [setup.randomization] * n_cars]
+        pictures = [one.pictures for one in randomizations]
         lidar = setup.observation.lidar
         seen = camera is not None or lidar is not None
         self._varied = (
@@ -376,12 +373,8 @@ class Race:
             self.lidar[ids] = self._lidar.read(ids, state, self.rules.steps[ids])
 
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
-        track_index = self.rules.track_index[ids]
         return self._features.compute(
-            measures,
-            self._steering_deg[ids],
-            self._commanded_mps[ids],
-            self.rules.tracks.points_at(self._features.ahead(measures.ndist, track_index), track_index),
+            measures, self.rules.track_index[ids], self._steering_deg[ids], self._commanded_mps[ids]
         )
 
     def _lost_car(self, error: RunFailed, action: np.ndarray) -> RunFailed:

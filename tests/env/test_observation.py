@@ -1,11 +1,10 @@
-import dataclasses
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deepracer_exp.env.observation import Features, feature_names
+from deepracer_exp.env.observation import feature_names
 
 
 def features(race) -> dict[str, np.ndarray]:
@@ -88,9 +87,10 @@ def test_an_observation_may_do_without_the_road_ahead(race_of):
 
 
 def test_names_and_size_agree_for_any_lookahead(race_of):
-    config = dataclasses.replace(race_of().setup.observation, lookahead_m=(0.25, 4.0, 10.0))
-    assert feature_names(config)[-2:] == ("ahead_x_10", "ahead_y_10")
-    assert Features(config, np.array([20.0]), 30.0, 4.0).size == len(feature_names(config)) == 13
+    race = race_of("observation.lookahead_m=[0.25,4,10]")
+    assert race.feature_names == feature_names(race.setup.observation)
+    assert race.feature_names[-2:] == ("ahead_x_10", "ahead_y_10")
+    assert race.observation.shape[1] == len(race.feature_names) == 13
 
 
 def test_every_feature_is_documented(race_of):
