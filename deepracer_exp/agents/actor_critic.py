@@ -14,7 +14,7 @@ from torch.distributions import Categorical
 from torchrl.modules import MLP, ActorValueOperator, IndependentNormal, ProbabilisticActor, ValueOperator
 
 from deepracer_exp.config.driving import ObservationShape
-from deepracer_exp.config.learning import CNNConfig, MLPConfig, NetworkConfig
+from deepracer_exp.config.learning import CNNConfig, NetworkConfig
 from deepracer_exp.config.own_class import OwnClass, build_own
 
 CONTINUOUS_ACTION_SIZE = 2
@@ -97,55 +97,57 @@ def build_actor_critic(
     Raises:
         BadInput: a class of the user's own cannot be used.
     """
+    continuous = action_count is None
     outputs = CONTINUOUS_ACTION_SIZE if action_count is None else action_count
-    if isinstance(network, CNNConfig):
-        return _cnn(network, observed, outputs, action_count is None, generator)
     if isinstance(network, OwnClass):
         keys = list(observed.seen)
         # The number itself where an input has only one axis.
         inputs = [shape if len(shape) > 1 else shape[0] for shape in observed.seen.values()]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-            layers, value = (
+            own, value = (
                 build_own(network, "network.target", nn.Module, *inputs, size) for size in (outputs, 1)
             )
-        initial_std = float(getattr(layers, "initial_std", _INITIAL_STD))
-        policy = _policy(keys, layers, action_count is None, initial_std)
-        return ActorCritic(policy, ValueOperator(value, in_keys=keys))
-    return _mlp(network, observed.features, outputs, action_count is None, generator)
+        initial_std = float(getattr(own, "initial_std", _INITIAL_STD))
+        return ActorCritic(_policy(keys, own, continuous, initial_std), ValueOperator(value, in_keys=keys))
+    keys = list(observed.seen) if isinstance(network, CNNConfig) else ["observation"]
 
+    def layers(outputs: int | None, gain: float) -> nn.Module:
+        """Build layers for what is seen; without `outputs` the last hidden layer is the output."""
+        net: nn.Module = (
+            SensorNet(network, observed, outputs)
+            if isinstance(network, CNNConfig)
+            else _dense(observed.features, network.hidden, network.activation, outputs)
+        )
+        return _initialize(net, gain, generator)
 
-def _mlp(
-    network: MLPConfig,
-    observation_size: int,
-    outputs: int,
-    continuous: bool,
-    generator: torch.Generator | None,
-) -> ActorCritic:
-    activation = _ACTIVATIONS[network.activation]
+    if network.shared_trunk:
+        trunk = TensorDictModule(layers(None, _HIDDEN_GAIN), keys, ["hidden"])
 
-    def heads(
-        in_key: str, in_features: int, hidden: tuple[int, ...]
-    ) -> tuple[ProbabilisticActor, ValueOperator]:
-        def mlp(outputs: int, gain: float) -> nn.Module:
-            layers = MLP(in_features, outputs, num_cells=hidden, activation_class=activation)
-            return _initialize(layers, gain, generator)
+        def head(outputs: int, gain: float) -> nn.Module:
+            return _initialize(nn.Sequential(nn.Linear(network.hidden[-1], outputs)), gain, generator)
 
-        policy = _policy([in_key], mlp(outputs, _POLICY_GAIN), continuous, network.initial_std)
-        return policy, ValueOperator(mlp(1, _VALUE_GAIN), in_keys=[in_key])
-
-    if not network.shared_trunk:
-        return ActorCritic(*heads("observation", observation_size, network.hidden))
-    width = network.hidden[-1]
-    layers = MLP(
-        observation_size,
-        width,
-        num_cells=network.hidden[:-1],
-        activation_class=activation,
-        activate_last_layer=True,
+        policy = _policy(["hidden"], head(outputs, _POLICY_GAIN), continuous, network.initial_std)
+        return ActorCritic(policy, ValueOperator(head(1, _VALUE_GAIN), in_keys=["hidden"]), trunk)
+    policy = _policy(keys, layers(outputs, _POLICY_GAIN), continuous, network.initial_std)
+    if not isinstance(network, CNNConfig) or network.critic == "pictures":
+        return ActorCritic(policy, ValueOperator(layers(1, _VALUE_GAIN), in_keys=keys))
+    critic = _dense(observed.features, _CRITIC_HIDDEN, network.activation, 1)
+    return ActorCritic(
+        policy, ValueOperator(_initialize(critic, _VALUE_GAIN, generator), in_keys=["observation"])
     )
-    trunk = TensorDictModule(_initialize(layers, _HIDDEN_GAIN, generator), ["observation"], ["hidden"])
-    return ActorCritic(*heads("hidden", width, ()), trunk)
+
+
+def _dense(inputs: int, hidden: tuple[int, ...], activation: str, outputs: int | None = None) -> MLP:
+    """Return a perceptron; without `outputs` its last hidden layer is the output."""
+    *before, last = hidden if outputs is None else (*hidden, outputs)
+    return MLP(
+        inputs,
+        last,
+        num_cells=before,
+        activation_class=_ACTIVATIONS[activation],
+        activate_last_layer=outputs is None,
+    )
 
 
 class SensorNet(nn.Module):
@@ -159,18 +161,7 @@ class SensorNet(nn.Module):
     def __init__(self, config: CNNConfig, observed: ObservationShape, outputs: int | None) -> None:
         """Build the layers; without `outputs` the last hidden layer is the output."""
         super().__init__()
-        activation = _ACTIVATIONS[config.activation]
-
-        def dense(inputs: int, cells: tuple[int, ...], outputs: int | None = None) -> MLP:
-            *before, last = cells if outputs is None else (*cells, outputs)
-            return MLP(
-                inputs,
-                last,
-                num_cells=before,
-                activation_class=activation,
-                activate_last_layer=outputs is None,
-            )
-
+        activation = config.activation
         size, hidden = 0, config.hidden
         self.has_picture, self.has_lidar = observed.picture is not None, observed.lidar is not None
         self.matrix_units: bool = self.has_picture and torch.cpu._is_amx_tile_supported()
@@ -178,7 +169,7 @@ class SensorNet(nn.Module):
             channels, *pixels = observed.picture
             layers: list[nn.Module] = []
             for filters, kernel, stride in zip(config.filters, config.kernels, config.strides, strict=True):
-                layers += [nn.Conv2d(channels, filters, kernel, stride), activation()]
+                layers += [nn.Conv2d(channels, filters, kernel, stride), _ACTIVATIONS[activation]()]
                 channels = filters
             height, width = config.outputs(*pixels)
             if config.attention is not None:
@@ -190,10 +181,10 @@ class SensorNet(nn.Module):
         if observed.lidar is not None:
             if config.lidar_joins_after:
                 alone, hidden = hidden[: config.lidar_joins_after], hidden[config.lidar_joins_after :]
-                self.embedder, size = dense(size, alone), alone[-1]
-            self.lidar = dense(observed.lidar, config.lidar_hidden)
+                self.embedder, size = _dense(size, alone, activation), alone[-1]
+            self.lidar = _dense(observed.lidar, config.lidar_hidden, activation)
             size += config.lidar_hidden[-1]
-        self.perceptron = dense(size, hidden, outputs)
+        self.perceptron = _dense(size, hidden, activation, outputs)
 
     def forward(self, *sensed: Tensor) -> Tensor:
         """Return the outputs."""
@@ -233,39 +224,6 @@ class Attention(nn.Module):
         """Return the weight of each place, [n, 1, height, width]."""
         scores = self.weight(self.score(places.movedim(1, -1)).tanh())
         return scores.movedim(-1, 1).softmax(dim=2)
-
-
-def _cnn(
-    network: CNNConfig,
-    observed: ObservationShape,
-    outputs: int,
-    continuous: bool,
-    generator: torch.Generator | None,
-) -> ActorCritic:
-    keys = list(observed.seen)
-
-    def layers(outputs: int | None, gain: float) -> nn.Module:
-        return _initialize(SensorNet(network, observed, outputs), gain, generator)
-
-    if network.shared_trunk:
-        trunk = TensorDictModule(layers(None, _HIDDEN_GAIN), keys, ["hidden"])
-        width = network.hidden[-1]
-        policy = _initialize(nn.Sequential(nn.Linear(width, outputs)), _POLICY_GAIN, generator)
-        value = _initialize(nn.Sequential(nn.Linear(width, 1)), _VALUE_GAIN, generator)
-        return ActorCritic(
-            _policy(["hidden"], policy, continuous, network.initial_std),
-            ValueOperator(value, in_keys=["hidden"]),
-            trunk,
-        )
-    policy = _policy(keys, layers(outputs, _POLICY_GAIN), continuous, network.initial_std)
-    if network.critic == "pictures":
-        return ActorCritic(policy, ValueOperator(layers(1, _VALUE_GAIN), in_keys=keys))
-    critic = MLP(
-        observed.features, 1, num_cells=_CRITIC_HIDDEN, activation_class=_ACTIVATIONS[network.activation]
-    )
-    return ActorCritic(
-        policy, ValueOperator(_initialize(critic, _VALUE_GAIN, generator), in_keys=["observation"])
-    )
 
 
 def _policy(

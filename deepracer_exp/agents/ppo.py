@@ -210,12 +210,8 @@ class PPO(Algorithm):
             index: {key: value.cpu() for key, value in state.items()}
             for index, state in optimizer["state"].items()
         }
-        return {
-            "networks": self.networks.state_dict(),
-            "optimizer": {**optimizer, "state": moments},
-            "schedule": self.schedule.state_dict(),
-            "generator": self._generator.get_state(),
-        }
+        own = {"optimizer": {**optimizer, "state": moments}, "generator": self._generator.get_state()}
+        return super().state_dict() | own
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a `state_dict`; further updates are those of the original bit for bit."""
