@@ -11,13 +11,13 @@ from deepracer_exp.tracks.track import Track
 Waypoints = list[tuple[float, float]]
 Row = tuple[Any, ...]
 
-FLOAT_COLUMNS = (
-    *("x", "y", "heading", "distance_from_center", "projection_distance", "progress"),
-    *("steps", "speed", "steering_angle", "track_width", "sim_time"),
-)
-BOOL_COLUMNS = ("all_wheels_on_track", "is_left_of_center", "is_offtrack")
-INDEX_COLUMNS = ("closest_waypoints",)
-COLUMNS = FLOAT_COLUMNS + BOOL_COLUMNS + INDEX_COLUMNS
+_DTYPES: dict[str, type] = {
+    **dict.fromkeys(("x", "y", "heading", "distance_from_center", "projection_distance"), np.float64),
+    **dict.fromkeys(("progress", "steps", "speed", "steering_angle", "track_width", "sim_time"), np.float64),
+    **dict.fromkeys(("all_wheels_on_track", "is_left_of_center", "is_offtrack"), np.bool_),
+    "closest_waypoints": np.int64,
+}
+COLUMNS = tuple(_DTYPES)
 """The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
 
 
@@ -37,13 +37,6 @@ class TrackParams(NamedTuple):
         return cls([(x, y) for x, y in track.waypoints.tolist()], track.length_m, track.reversed)
 
 
-_DTYPES: dict[str, type] = {
-    **dict.fromkeys(FLOAT_COLUMNS, np.float64),
-    **dict.fromkeys(BOOL_COLUMNS, np.bool_),
-    **dict.fromkeys(INDEX_COLUMNS, np.int64),
-}
-
-
 def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> dict[str, np.ndarray]:
     """Return the columns of the given cars (None: all), each as a copy of its documented type."""
     chosen: dict[str, np.ndarray] = {}
@@ -58,7 +51,7 @@ def rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row]:
     return zip(*(selected[key].tolist() for key in COLUMNS), strict=True)
 
 
-def scalar_params(row: Row, waypoints: Waypoints, track_length: float, is_reversed: bool) -> dict[str, Any]:
+def scalar_params(row: Row, road: TrackParams) -> dict[str, Any]:
     """Build the 27 keys for one car.
 
     Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys
@@ -66,16 +59,14 @@ def scalar_params(row: Row, waypoints: Waypoints, track_length: float, is_revers
 
     Args:
         row: One tuple of `rows`; lengths in metres, angles in degrees, speed in m/s, time in seconds.
-        waypoints: Centre line of the direction driven, closing point included.
-        track_length: Metres.
-        is_reversed: Whether the track is driven against its waypoint order.
+        road: The keys that are constant on the course.
     """
     return dict(
         zip(COLUMNS, row, strict=True),
-        track_length=track_length,
-        waypoints=waypoints[:],
+        track_length=road.track_length,
+        waypoints=road.waypoints[:],
         closest_waypoints=row[-1][:],
-        is_reversed=is_reversed,
+        is_reversed=road.is_reversed,
         is_crashed=False,
         closest_objects=[0, 0],
         objects_location=[],
@@ -89,22 +80,21 @@ def scalar_params(row: Row, waypoints: Waypoints, track_length: float, is_revers
 
 
 def batch_params(
-    selected: Mapping[str, np.ndarray], waypoints: np.ndarray, track_length: float, is_reversed: bool
+    selected: Mapping[str, np.ndarray], road: TrackParams, waypoints: np.ndarray
 ) -> dict[str, Any]:
     """Build the same 27 keys for n cars at once, for `reward_batch`.
 
     Args:
         selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2); copied.
-        waypoints: Shape (W, 2); copied.
-        track_length: Metres.
-        is_reversed: Whether the track is driven against its waypoint order.
+        road: The keys that are constant on the course.
+        waypoints: Those of the course as an array, (W, 2); copied.
     """
     n = len(selected["x"])
     return {
         **{key: column.copy() for key, column in selected.items()},
-        "track_length": track_length,
+        "track_length": road.track_length,
         "waypoints": waypoints.copy(),
-        "is_reversed": is_reversed,
+        "is_reversed": road.is_reversed,
         "is_crashed": np.zeros(n, bool),
         "closest_objects": np.zeros((n, 2), np.int64),
         "objects_location": [],

@@ -6,7 +6,7 @@ import reprlib
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from types import CodeType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,10 @@ class RewardFunction:
         prints: Where `print` goes; None discards it.
         scalar: Call `reward_function` even where the module has `reward_batch`.
 
+    Attributes:
+        is_batch: Whether `reward_batch` is called for all cars at once.
+        functions: The modules' own functions, without checks and time limit; one per car, or the one of the batch.
+
     Raises:
         BadInput: The module cannot be run or has no callable `reward_function` or `reward_batch`.
     """
@@ -75,12 +79,12 @@ class RewardFunction:
         self.time_limit_s = time_limit_s
         code = compile(source_with_constants(source), source.path, "exec", dont_inherit=True)
         # Names that the module binds at its top level are listed in its code.
-        self._is_batch = not scalar and "reward_batch" in code.co_names
-        name = "reward_batch" if self._is_batch else "reward_function"
-        cars = [None] if self._is_batch else list(range(n_cars))
+        self.is_batch = not scalar and "reward_batch" in code.co_names
+        name = "reward_batch" if self.is_batch else "reward_function"
+        cars = [None] if self.is_batch else list(range(n_cars))
         try:
             with Guard(time_limit_s):
-                self._functions = [self._load(code, name, prints, car) for car in cars]
+                self.functions = [self._load(code, name, prints, car) for car in cars]
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
@@ -118,19 +122,9 @@ class RewardFunction:
             if len(track_params) > 1:
                 order = np.argsort(track_of, kind="stable")
                 cars, track_of = cars[order], track_of[order]
-            call = self._call_batch if self._is_batch else self._call_each
+            call = self._call_batch if self.is_batch else self._call_each
             rewards[cars] = call(select(columns, cars), track_params, track_of, cars.tolist())
         return rewards
-
-    @property
-    def is_batch(self) -> bool:
-        """Whether `reward_batch` is called for all cars at once."""
-        return self._is_batch
-
-    @property
-    def functions(self) -> Sequence[Callable[[dict[str, Any]], object]]:
-        """The modules' own functions, without checks and time limit."""
-        return self._functions
 
     def pay(self, params: dict[str, Any]) -> float:
         """Return the reward of the first car's module (`scalar`) for given params; call it inside a `Guard`.
@@ -140,12 +134,11 @@ class RewardFunction:
         """
         given = dict(params)
         try:
-            return _as_reward(self._functions[0](params))
+            return _as_reward(self.functions[0](params))
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            failure, cause = self._failure(error, 0, given)
-            raise failure from cause
+            self._fail(error, 0, given)
 
     def _load(
         self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
@@ -169,13 +162,13 @@ class RewardFunction:
         track_of: NDArray[np.intp],
         cars: list[int],
     ) -> list[float]:
-        functions = self._functions
+        functions = self.functions
         rewards: list[float] = []
         table, own_params = list(rows(selected)), [track_params[place] for place in track_of.tolist()]
         try:
             with Guard(self.time_limit_s):
                 for car, road, row in zip(cars, own_params, table, strict=True):
-                    reward = functions[car](scalar_params(row, *road))
+                    reward = functions[car](scalar_params(row, road))
                     # A float within the bounds needs no further check; NaN fails the comparison.
                     if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
                         reward = _as_reward(reward)
@@ -185,8 +178,7 @@ class RewardFunction:
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             # There is a reward for each car so far; the time limit may be exceeded right after the last one.
             at = min(len(rewards), len(cars) - 1)
-            failure, cause = self._failure(error, cars[at], scalar_params(table[at], *own_params[at]))
-            raise failure from cause
+            self._fail(error, cars[at], scalar_params(table[at], own_params[at]))
         return rewards
 
     def _call_batch(
@@ -206,35 +198,31 @@ class RewardFunction:
         def params(first: int, last: int) -> dict[str, Any]:
             part = {key: column[first:last] for key, column in selected.items()}
             place = track_of[first]
-            _, length, is_reversed = track_params[place]
-            return batch_params(part, self._waypoints[place], length, is_reversed)
+            return batch_params(part, track_params[place], self._waypoints[place])
 
         at = (0, len(cars))
         try:
             with Guard(self.time_limit_s):
                 for at in itertools.pairwise(bounds):
-                    rewards[slice(*at)] = _as_rewards(self._functions[0](params(*at)), at[1] - at[0])
+                    rewards[slice(*at)] = _as_rewards(self.functions[0](params(*at)), at[1] - at[0])
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            failure, cause = self._failure(error, None, params(*at))
-            raise failure from cause
+            self._fail(error, None, params(*at))
         bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
         if len(bad):
             row, road = list(rows(selected))[bad[0]], track_params[track_of[bad[0]]]
             no_reward = Unusable(_no_reward(float(rewards[bad[0]])))
-            raise self._failure(no_reward, cars[bad[0]], scalar_params(row, *road))[0]
+            self._fail(no_reward, cars[bad[0]], scalar_params(row, road))
         return rewards
 
-    def _failure(
-        self, error: BaseException, car: int | None, params: dict[str, Any]
-    ) -> tuple[RewardFailed, Exception | None]:
-        """Return the exception to raise for an error of the function, and its cause."""
-        function = "reward_batch" if self._is_batch else "reward_function"
+    def _fail(self, error: BaseException, car: int | None, params: dict[str, Any]) -> NoReturn:
+        """Raise RewardFailed for an error of the function."""
+        function = "reward_batch" if self.is_batch else "reward_function"
         where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
         what, cause = self.what_happened(error)
         message = f"reward {self.source.name}: {function} {what} ({where})"
-        return RewardFailed(message, params, car, what, isinstance(error, DeadlinePassed)), cause
+        raise RewardFailed(message, params, car, what, isinstance(error, DeadlinePassed)) from cause
 
     def what_happened(self, error: BaseException) -> tuple[str, Exception | None]:
         """Describe an error of the module's code in one line with its place; also return its traceback as a cause.

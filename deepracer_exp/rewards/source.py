@@ -48,11 +48,13 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
     tree = _parse(path, text)
     _check_function(path, tree)
     constants = {constant: ast.literal_eval(value) for constant, value in _constants(tree)}
-    overrides = {
-        key: _like(constants[key], value)
-        for key, value in config.constants.items()
-        if _known_constant(path, key, constants)
-    }
+    for key in config.constants:
+        if key not in constants:
+            known = ", ".join(constants) or "none; a constant is a line NAME = number with NAME in capitals"
+            raise BadInput(
+                f"reward.constants.{key}: {path} has no such constant{nearest(key.upper(), constants)}: {known}"
+            )
+    overrides = {key: _like(constants[key], value) for key, value in config.constants.items()}
     return RewardSource(name, path, text, hashlib.sha256(data).hexdigest(), constants, overrides)
 
 
@@ -175,15 +177,6 @@ def _is_number(node: ast.expr) -> bool:
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
         node = node.operand
     return isinstance(node, ast.Constant) and type(node.value) in (int, float)
-
-
-def _known_constant(path: str, key: str, constants: Mapping[str, object]) -> bool:
-    if key not in constants:
-        known = ", ".join(constants) or "none; a constant is a line NAME = number with NAME in capitals"
-        raise BadInput(
-            f"reward.constants.{key}: {path} has no such constant{nearest(key.upper(), constants)}: {known}"
-        )
-    return True
 
 
 def _like(original: int | float, value: float) -> int | float:

@@ -32,7 +32,7 @@ class Situations:
     def params(self) -> Iterator[dict[str, Any]]:
         """Yield fresh params of each situation."""
         for row in rows(select(self.columns, np.arange(len(self)))):
-            yield scalar_params(row, *self.road)
+            yield scalar_params(row, self.road)
 
     def __getitem__(self, which: slice | np.ndarray) -> "Situations":
         """Return a selection."""

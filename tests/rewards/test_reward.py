@@ -63,7 +63,7 @@ def failure(reward: RewardFunction, active: np.ndarray | None = None) -> RewardF
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int64])
 def test_the_params_are_the_27_keys_of_the_service_as_plain_python(dtype: type) -> None:
     row = next(iter(rows(select(columns(2, dtype), None))))
-    params = scalar_params(row, WAYPOINTS, 3.4, False)
+    params = scalar_params(row, ROAD[0])
     assert {key: type(value) for key, value in params.items()} == KEYS
     assert len(KEYS) == 27
     assert all(type(index) is int for index in params["closest_waypoints"])
@@ -76,9 +76,9 @@ def test_the_params_are_the_27_keys_of_the_service_as_plain_python(dtype: type) 
 
 def test_batch_params_hold_the_same_keys_and_values() -> None:
     selected = select(columns(3), None)
-    batch = batch_params(selected, np.array(WAYPOINTS), 3.4, False)
+    batch = batch_params(selected, ROAD[0], np.array(WAYPOINTS))
     for car, row in enumerate(rows(selected)):
-        for key, value in scalar_params(row, WAYPOINTS, 3.4, False).items():
+        for key, value in scalar_params(row, ROAD[0]).items():
             shared = key in TrackParams._fields or key.startswith("objects_")
             np.testing.assert_array_equal(batch[key] if shared else batch[key][car], value)
     assert set(batch) == set(KEYS)
