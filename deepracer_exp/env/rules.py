@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.deepracer.trace import STATUS_CODE
@@ -158,7 +158,7 @@ class RaceRules:
         self._driven = np.zeros((n_cars, len(self._turns)), np.int64)
         self._period_s = setup.car.control_period_s
         self._front_point_m = setup.car.front_point_m
-        self._wheels = np.array(setup.car.wheel_points_m)
+        self._wheels_m = setup.car.wheel_points_m
         self._episodes = setup.episode
         self._episode_rules = EpisodeRules(setup.episode, n_cars)
         self._everyone = np.arange(n_cars)
@@ -273,7 +273,9 @@ class RaceRules:
         self.clock_steps += 1
         now = self.now
         percent, self._previous = lap_progress(now.ndist, self.start_ndist, self._previous)
-        wheels_on = self._wheels_on_road()
+        wheels_on = wheels_on_road(
+            self.tracks, self.track_index, now.x_m, now.y_m, now.yaw_rad, self._wheels_m
+        )
         off_track: Bools = np.asarray(~wheels_on.any(axis=1))
         moved_m = np.hypot(*(now.front - self._last_front).T)
         status = self._episode_rules.apply(self.steps, percent, self._last_progress, moved_m, off_track)
@@ -321,12 +323,23 @@ class RaceRules:
         behind_m, ahead_m = np.hypot(away[..., 0], away[..., 1]).T
         return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
 
-    def _wheels_on_road(self) -> Bools:
-        """Return which wheel centres are on the road, (N, 4); the cars count as level, as in the service's log."""
-        now = self.now
-        cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
-        wheel_x, wheel_y = self._wheels.T
-        points = np.empty((self.n_cars, len(self._wheels), 2))
-        points[:, :, 0] = now.x_m[:, None] + cos * wheel_x - sin * wheel_y
-        points[:, :, 1] = now.y_m[:, None] + sin * wheel_x + cos * wheel_y
-        return self.tracks.on_road(points.reshape(-1, 2), self.track_index).reshape(self.n_cars, -1)
+
+def wheels_on_road(
+    tracks: Tracks, track_index: Ids, x_m: Floats, y_m: Floats, yaw_rad: Floats, wheels_m: ArrayLike
+) -> Bools:
+    """Return which wheel centres are on the road, (N, 4); the cars count as level, as in the service's log.
+
+    Args:
+        tracks: the courses.
+        track_index: index of each car's track in them, (N,).
+        x_m: where the cars are, (N,).
+        y_m: likewise.
+        yaw_rad: headings, (N,).
+        wheels_m: wheels ahead and to the left of there, (4, 2).
+    """
+    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
+    ahead, left = np.asarray(wheels_m).T
+    points = np.stack(
+        [x_m[:, None] + cos * ahead - sin * left, y_m[:, None] + sin * ahead + cos * left], axis=-1
+    )
+    return tracks.on_road(points.reshape(-1, 2), track_index).reshape(len(points), -1)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_course import progress_along
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.tracks.track import Track, Tracks
 
@@ -88,7 +89,7 @@ class RecordedParams:
         """Yield the params of some rows one by one."""
         columns = rows(select(self.columns(chosen), None))
         for row, index in zip(columns, self.track_index[chosen].tolist(), strict=True):
-            yield scalar_params(row, *self.track_params[index])
+            yield scalar_params(row, self.track_params[index])
 
     def _off_track(
         self, part: pd.DataFrame, front: NDArray[np.float64], track_index: Ids
@@ -97,18 +98,11 @@ class RecordedParams:
         off = np.array([_DECIDED.get(word, -1) for word in status.cat.categories] + [-1])[status.cat.codes]
         open_ = np.flatnonzero(off < 0)
         if len(open_):
-            yaw = np.radians(part["yaw"].to_numpy(np.float64)[open_])[:, None]
+            yaw_rad = np.radians(part["yaw"].to_numpy(np.float64)[open_])
             # Recorded poses are of the front point; wheels are measured from the chassis origin.
-            ahead, aside = np.array(self._car.wheel_points_m).T
-            ahead = ahead - self._car.front_point_m
-            points = np.stack(
-                [
-                    front[open_, :1] + np.cos(yaw) * ahead - np.sin(yaw) * aside,
-                    front[open_, 1:] + np.sin(yaw) * ahead + np.cos(yaw) * aside,
-                ],
-                axis=-1,
-            )
-            on_road = self._tracks.on_road(points.reshape(-1, 2), track_index[open_]).reshape(len(open_), -1)
+            wheels_m = np.array(self._car.wheel_points_m) - [self._car.front_point_m, 0.0]
+            x_m, y_m = front[open_].T
+            on_road = wheels_on_road(self._tracks, track_index[open_], x_m, y_m, yaw_rad, wheels_m)
             off[open_] = ~on_road.any(axis=1)
         return off.astype(bool)
 
