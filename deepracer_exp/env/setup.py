@@ -37,7 +37,10 @@ def build_courses(experiment: Experiment) -> tuple[Course, ...]:
     Raises:
         BadInput: a route is missing or malformed, or an open course is not started at its start.
     """
-    courses = tuple(_build(name, config) for name, config in experiment.tracks.items())
+    courses = tuple(
+        Course(name=name, weight=config.weight, tracks=directed_tracks(config))
+        for name, config in experiment.tracks.items()
+    )
     for course in courses:
         if experiment.episode.start_offset and not course.tracks[0].closed:
             raise BadInput(
@@ -47,10 +50,10 @@ def build_courses(experiment: Experiment) -> tuple[Course, ...]:
     return courses
 
 
-def _build(name: str, config: TrackConfig) -> Course:
+def directed_tracks(config: TrackConfig) -> tuple[Track, ...]:
+    """Build a track in each direction in which it is driven, the one of the first episode first."""
     directions = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}[config.direction]
-    tracks = tuple(Track.from_config(config, backwards) for backwards in directions)
-    return Course(name=name, weight=config.weight, tracks=tracks)
+    return tuple(Track.from_config(config, backwards) for backwards in directions)
 
 
 def deal(weights: Sequence[float]) -> Iterator[int]:

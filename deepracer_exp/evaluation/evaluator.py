@@ -20,10 +20,9 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import build_parts
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
-from deepracer_exp.env.setup import Course, RaceSetup
+from deepracer_exp.env.setup import Course, RaceSetup, directed_tracks
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource
-from deepracer_exp.tracks.track import Track
 
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, Group
@@ -133,13 +132,13 @@ class Evaluator:
                 acted = policy(seen)
                 race.step(acted["action"].numpy())
                 row = race.trace
-                back = protocol.step(
+                cars, progress = protocol.step(
                     row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
                 )
                 if on_step is not None:
                     on_step(race, protocol, acted)
-                if len(back.cars):
-                    race.put_back(back.cars, back.progress)
+                if len(cars):
+                    race.put_back(cars, progress)
         return Evaluation(tuple(self._groups(protocol)))
 
     def _groups(self, protocol: RaceProtocol) -> list[Group]:
@@ -170,13 +169,11 @@ def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, Tra
 
 def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
     """Build the tracks; one driven in both directions counts as two."""
-    ways = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}
     courses = []
     for name, config in tracks.items():
-        for backwards in ways[config.direction]:
-            track = Track.from_config(config, backwards)
+        for track in directed_tracks(config):
             label = track.name if config.file is not None and len(tracks) == 1 else name
-            label += " reversed" * (backwards and config.direction == "alternate")
+            label += " reversed" * (track.reversed and config.direction == "alternate")
             courses.append(Course(name=label, weight=1.0, tracks=(track,)))
     return tuple(courses)
 

@@ -43,15 +43,6 @@ class Attempt:
         return self.end == _UP
 
 
-@dataclass(frozen=True, eq=False)
-class Resets:
-    """Cars to put back on the centre line, at rest."""
-
-    cars: Ids
-    progress: Floats
-    """Positions in per cent of the lap, (n,)."""
-
-
 class RaceProtocol:
     """Applies a protocol to N cars, one trial each: which are put back, and which have finished.
 
@@ -74,9 +65,7 @@ class RaceProtocol:
         """
         n_cars = len(closed)
         self._config, self._closed, self._period_s = config, closed, period_s
-        self._penalty_s = {
-            name: getattr(config.penalty_s, name) for name in ("off_track", "reversed", "immobilized")
-        }
+        self._penalty_s = vars(config.penalty_s)
         self._steps = 0
         self.running = np.ones(n_cars, bool)
         self.attempts: list[Attempt] = []
@@ -86,7 +75,7 @@ class RaceProtocol:
         self._resets = np.zeros(n_cars, np.int64)
         self._progress = np.zeros(n_cars)
 
-    def step(self, status: NDArray[np.int64], progress: Floats) -> Resets:
+    def step(self, status: NDArray[np.int64], progress: Floats) -> tuple[Ids, Floats]:
         """Process one control step.
 
         Args:
@@ -94,7 +83,7 @@ class RaceProtocol:
             progress: per cent of the lap, (N,).
 
         Returns:
-            The cars to put back.
+            The cars to put back on the centre line, at rest, and where, in per cent of the lap, (n,) each.
         """
         driven_s = self._steps * self._period_s
         self._steps += 1
@@ -112,7 +101,7 @@ class RaceProtocol:
         for car, percent in back:
             self._progress[car] = percent
         cars, percents = zip(*back, strict=True) if back else ((), ())
-        return Resets(np.array(cars, np.intp), np.array(percents))
+        return np.array(cars, np.intp), np.array(percents)
 
     def _decide(self, car: int, what: str, progress: float, back: list[tuple[int, float]]) -> None:
         config = self._config

@@ -16,9 +16,9 @@ def drive(config, story, closed=True):
     for status, progress in story:
         if not race.running[0]:
             break
-        back = race.step(np.array([STATUS_CODE[status]]), np.array([float(progress)]))
-        backs += list(zip([len(backs)] * len(back.cars), back.progress.tolist(), strict=True))
-    return race, [progress for _, progress in backs]
+        _, put_back_at = race.step(np.array([STATUS_CODE[status]]), np.array([float(progress)]))
+        backs += put_back_at.tolist()
+    return race, backs
 
 
 def steady(*progress):
