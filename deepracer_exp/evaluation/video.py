@@ -39,19 +39,18 @@ class LapRenderer:
     Poses are given; nothing is simulated. A context manager that frees the graphics memory.
     """
 
-    def __init__(self, track: Track, car: CarConfig, view: View, width: int, height: int):
+    def __init__(self, track: Track, car: CarConfig, view: View):
         """Draw the track and set up the renderer."""
         self._car, self._view = car, view
         self._low, self._high = extent(track)
-        self._model = _build(track, car, view, (self._low, self._high), width, height)
+        self._model = _build(track, car, view)
         self._data = mujoco.MjData(self._model)
         self._place = [self._model.joint(name).qposadr[0] for name in ("x", "y", "yaw")]
         self._steer = [self._model.joint(f"{name}_steer").qposadr[0] for name in STEERED]
         self._spin = [self._model.joint(f"{name}_spin").qposadr[0] for name in WHEELS]
-        self._renderer = mujoco.Renderer(self._model, height, width)
+        self._renderer = mujoco.Renderer(self._model, HEIGHT, WIDTH)
         self._camera = mujoco.MjvCamera()
         self._azimuth_rad: float | None = None
-        self._aspect = width / height
 
     def __enter__(self) -> "LapRenderer":
         return self
@@ -93,7 +92,7 @@ class LapRenderer:
         if self._view == "top":
             middle = 0.5 * (self._low + self._high)
             width, height = self._high - self._low
-            seen_m = max(height / (1 - _HEAD), width / self._aspect)
+            seen_m = max(height / (1 - _HEAD), width * HEIGHT / WIDTH)
             camera.lookat[:] = middle[0], middle[1] + 0.5 * _HEAD * seen_m, 0.0
             angle = np.radians(self._model.vis.global_.fovy)
             camera.distance = 0.5 * seen_m / np.tan(angle / 2)
@@ -115,18 +114,11 @@ def extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
 
 
-def _build(
-    track: Track,
-    car: CarConfig,
-    view: View,
-    extent: tuple[NDArray[np.float64], NDArray[np.float64]],
-    width: int,
-    height: int,
-) -> mujoco.MjModel:
-    low, high = extent
+def _build(track: Track, car: CarConfig, view: View) -> mujoco.MjModel:
+    low, high = extent(track)
     spec = build_spec(car, visual=True)
     vis = spec.visual
-    vis.global_.offwidth, vis.global_.offheight = width, height
+    vis.global_.offwidth, vis.global_.offheight = WIDTH, HEIGHT
     vis.headlight.ambient[:] = 0.45
     vis.headlight.diffuse[:] = 0.35
     vis.headlight.specular[:] = 0.0
@@ -199,7 +191,7 @@ def write_video(file: Path, view: View, lap: Lap, car: CarConfig, err: Console) 
         RunFailed: the file cannot be written.
     """
     driven_m = np.cumsum(lap.speed_mps) / car.control_hz
-    with LapRenderer(lap.track, car, view, WIDTH, HEIGHT) as renderer:
+    with LapRenderer(lap.track, car, view) as renderer:
 
         def frames() -> Iterator[NDArray[np.uint8]]:
             for at in range(len(lap)):
