@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.config.car import CarConfig
@@ -151,12 +150,8 @@ def _correlations(laps: pd.DataFrame) -> dict[str, float]:
         "old_time": ("reward", "time_s"),
         "new_time": ("new_reward", "time_s"),
     }
-    return {
-        name: np.nan
-        if laps[one].nunique() == 1 or laps[other].nunique() == 1
-        else float(spearmanr(laps[one], laps[other]).statistic)
-        for name, (one, other) in pairs.items()
-    }
+    table = laps[["reward", "new_reward", "time_s"]].corr("spearman")
+    return {name: float(table.loc[pair]) for name, pair in pairs.items()}
 
 
 def _waypoints(paid: pd.DataFrame) -> pd.DataFrame:
