@@ -15,6 +15,7 @@ from .car import build_spec
 from .tyres import DRIVE, car_record, push_cars
 
 Floats = NDArray[np.float64]
+Ids = NDArray[np.intp]
 
 
 class CarState(NamedTuple):
@@ -65,21 +66,21 @@ class CarBatch:
         self._max_steering_rad = np.deg2rad(car.max_steering_deg)
         self._rest_row = self._rows[0].copy()
 
-    def place(self, ids: ArrayLike, x_m: ArrayLike, y_m: ArrayLike, yaw_rad: ArrayLike) -> None:
+    def place(self, ids: Ids, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> None:
         """Put cars at rest, steering straight, with a fresh physics state.
 
         Args:
             ids: distinct indices of cars, (n,).
-            x_m: position of the chassis origin, (n,) or one for all.
+            x_m: position of the chassis origin, (n,).
             y_m: likewise.
             yaw_rad: heading, likewise.
         """
-        rows, com = np.asarray(ids, np.intp), self.car.com_x_m
-        self._rows[rows] = self._rest_row
+        com = self.car.com_x_m
+        self._rows[ids] = self._rest_row
         # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
-        self._qpos[rows, 0] = x_m + com * (np.cos(yaw_rad) - 1.0)
-        self._qpos[rows, 1] = y_m + com * np.sin(yaw_rad)
-        self._qpos[rows, 2] = yaw_rad
+        self._qpos[ids, 0] = x_m + com * (np.cos(yaw_rad) - 1.0)
+        self._qpos[ids, 1] = y_m + com * np.sin(yaw_rad)
+        self._qpos[ids, 2] = yaw_rad
 
     @property
     def acceleration_mps2(self) -> Floats:
@@ -146,37 +147,32 @@ class CarBatch:
             raise ValueError(f"state has shape {rows.shape}, these cars need {self._rows.shape}")
         self._rows[:] = rows
 
-    def set_floor_friction(self, ids: ArrayLike, values: ArrayLike) -> None:
+    def set_floor_friction(self, ids: Ids, values: Floats) -> None:
         """Set the floor's factor on the tyre friction of cars, (n,)."""
-        self._floor_friction[np.asarray(ids, np.intp)] = values
+        self._floor_friction[ids] = values
         self._cars["friction"] = self._tyre_friction * self._floor_friction
 
-    def set_friction_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+    def set_friction_scale(self, ids: Ids, scale: Floats) -> None:
         """Multiply cars' tyre friction by scale, (n,), relative to the configured one."""
-        self._tyre_friction[np.asarray(ids, np.intp)] = self.car.tyre_friction * np.asarray(scale)
+        self._tyre_friction[ids] = self.car.tyre_friction * scale
         self._cars["friction"] = self._tyre_friction * self._floor_friction
 
-    def set_mass_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+    def set_mass_scale(self, ids: Ids, scale: Floats) -> None:
         """Multiply cars' masses and inertias by scale, (n,), relative to the configured ones."""
-        rows = np.asarray(ids, np.intp)
-        factor = np.broadcast_to(np.asarray(scale, np.float64), rows.shape)
-        self._batch.expand("body_mass")[rows] = factor[:, None] * self.model.body_mass
-        self._batch.expand("body_inertia")[rows] = factor[:, None, None] * self.model.body_inertia
-        self._batch.set_const(np.sort(rows))
+        self._batch.expand("body_mass")[ids] = scale[:, None] * self.model.body_mass
+        self._batch.expand("body_inertia")[ids] = scale[:, None, None] * self.model.body_inertia
+        self._batch.set_const(np.sort(ids))
         for field in ("mass_kg", "yaw_inertia_kgm2", "wheel_kg"):
-            self._cars[field][rows] = factor * self._car[field]
+            self._cars[field][ids] = scale * self._car[field]
 
-    def set_motor_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+    def set_motor_scale(self, ids: Ids, scale: Floats) -> None:
         """Multiply cars' motor gain and torque limit by scale, (n,), relative to the configured ones."""
-        rows = np.asarray(ids, np.intp)
-        factor = np.broadcast_to(np.asarray(scale, np.float64), rows.shape)
-        self._cars["motor_ns_per_m"][rows] = factor[:, None] * self._car["motor_ns_per_m"]
-        self._cars["motor_n"][rows] = factor * self._car["motor_n"]
+        self._cars["motor_ns_per_m"][ids] = scale[:, None] * self._car["motor_ns_per_m"]
+        self._cars["motor_n"][ids] = scale * self._car["motor_n"]
 
-    def set_servo_scale(self, ids: ArrayLike, scale: ArrayLike) -> None:
+    def set_servo_scale(self, ids: Ids, scale: Floats) -> None:
         """Divide the time constant of cars' steering by scale, (n,), relative to the configured one."""
-        rows = np.asarray(ids, np.intp)
-        self._cars["steering_time_s"][rows] = self._car["steering_time_s"] / np.asarray(scale, np.float64)
+        self._cars["steering_time_s"][ids] = self._car["steering_time_s"] / scale
 
 
 def _require_finite(what: str, finite: NDArray[np.bool_]) -> None:
