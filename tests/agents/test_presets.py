@@ -1,15 +1,13 @@
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-import yaml
-from pydantic import TypeAdapter
 from tensordict import TensorDict
 
 from deepracer_exp.agents.actor_critic import Attention, SensorNet, build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import (
     AlgorithmConfig,
@@ -18,27 +16,13 @@ from deepracer_exp.config.learning import (
     MLPConfig,
     NetworkConfig,
 )
-
-CONF = Path(__file__).parents[2] / "conf"
-
-
-def options(group):
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-
-
-def load(group, name, type_):
-    values = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
-    for base in values.pop("defaults", []):
-        values = (
-            yaml.safe_load((CONF / group / f"{base}.yaml").read_text()) if base != "_self_" else {}
-        ) | values
-    return TypeAdapter(type_).validate_python(values)
+from deepracer_exp.config.options import options
 
 
 @pytest.mark.parametrize(("action_count", "sensors"), [(7, "camera"), (None, "both")])
 @pytest.mark.parametrize("name", options("network"))
 def test_every_network_acts_and_judges(name, action_count, sensors):
-    config = load("network", name, NetworkConfig)
+    config = compose_option("network", name, NetworkConfig)
     pixels = torch.randint(0, 256, (3, 2, 96, 96), dtype=torch.uint8)
     sensed = {"observation": torch.randn(3, 11), "pixels": pixels, "lidar": torch.rand(3, 64)}
     if name == "lidar":
@@ -54,26 +38,17 @@ def test_every_network_acts_and_judges(name, action_count, sensors):
 
 @pytest.mark.parametrize("name", options("lr_schedule"))
 def test_every_schedule_keeps_a_positive_rate_over_a_run(name):
-    schedule = PresetSchedule(load("lr_schedule", name, LRScheduleConfig))
+    schedule = PresetSchedule(compose_option("lr_schedule", name, LRScheduleConfig))
     assert all(0 < schedule.factor(i, i / 100) <= 1 for i in range(101))
 
 
 @pytest.mark.parametrize("name", options("algorithm"))
 def test_every_algorithm_builds_and_names_one_length_of_an_iteration(name):
-    config = load("algorithm", name, AlgorithmConfig)
-    network = load("network", "mlp_small", MLPConfig)
+    config = compose_option("algorithm", name, AlgorithmConfig)
+    network = compose_option("network", "mlp_small", MLPConfig)
     networks = build_actor_critic(network, ObservationShape(11), 7, torch.Generator())
-    PPO(networks, config, PresetSchedule(load("lr_schedule", "constant", LRScheduleConfig)), seed=0)
+    PPO(networks, config, PresetSchedule(compose_option("lr_schedule", "constant", LRScheduleConfig)), seed=0)
     assert (config.frames_per_iteration is None) != (config.episodes_per_iteration is None)
-
-
-@pytest.mark.parametrize(
-    ("group", "name"), [(g, n) for g in ("network", "lr_schedule", "algorithm") for n in options(g)]
-)
-def test_every_key_is_explained_on_the_line_above_it(group, name):
-    lines = (CONF / group / f"{name}.yaml").read_text().splitlines()
-    for above, line in zip(["", *lines], lines, strict=False):
-        assert not line or line.startswith(("#", "  - ")) or above.startswith("# ")
 
 
 def test_attention_sums_each_column_by_weights_that_sum_to_one():
@@ -96,7 +71,7 @@ def test_attention_sums_each_column_by_weights_that_sum_to_one():
     [("shallow", 11 * 16 * 64, 512), ("medium", 25 * 35 * 64, 512), ("deep", 3 * 6 * 512, 256)],
 )
 def test_lidar_joins_the_picture_before_the_services_middleware(name, picture, joined):
-    net = SensorNet(load("network", name, CNNConfig), ObservationShape(11, (1, 120, 160), 64), 7)
+    net = SensorNet(compose_option("network", name, CNNConfig), ObservationShape(11, (1, 120, 160), 64), 7)
     first = next(layer for layer in net.perceptron if isinstance(layer, torch.nn.Linear))
     assert (first.in_features, first.out_features) == (picture + 256, joined)
     pixels, lidar = torch.zeros(2, 1, 120, 160, dtype=torch.uint8), torch.rand(2, 64)
@@ -104,7 +79,7 @@ def test_lidar_joins_the_picture_before_the_services_middleware(name, picture, j
 
 
 def test_a_lidar_joins_after_layers_that_see_pictures_alone_where_that_is_asked_for():
-    config = replace(load("network", "deep", CNNConfig), hidden=(64, 32), lidar_joins_after=1)
+    config = replace(compose_option("network", "deep", CNNConfig), hidden=(64, 32), lidar_joins_after=1)
     net = SensorNet(config, ObservationShape(11, (1, 120, 160), 64), 7)
     first = next(layer for layer in net.perceptron if isinstance(layer, torch.nn.Linear))
     assert (first.in_features, first.out_features) == (64 + 256, 32)

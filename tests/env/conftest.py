@@ -1,5 +1,7 @@
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,20 @@ from deepracer_exp.env.setup import RaceSetup, build_setup
 def make_setup(*overrides: str) -> RaceSetup:
     """Compose and build a setup, once for all tests that ask for the same."""
     return build_setup(compose_experiment(overrides)[0])
+
+
+def random_actions(steps: int, cars: int) -> np.ndarray:
+    return np.random.default_rng(5).uniform(-1, 1, (steps, cars, 2))
+
+
+def drive(race: Race, actions: np.ndarray) -> np.ndarray:
+    """Drive with actions (steps, cars, ...), start new episodes as they end, return traces (steps, cars, C)."""
+    rows = []
+    for action in actions:
+        race.step(action)
+        rows.append(race.trace.copy())
+        race.reset(np.flatnonzero(race.terminated | race.truncated))
+    return np.array(rows)
 
 
 @pytest.fixture
@@ -50,3 +66,16 @@ def steer_ahead() -> Callable[[Race, float], np.ndarray]:
         return np.column_stack([steering, np.full(race.n_cars, speed)])
 
     return act
+
+
+@pytest.fixture
+def spy(tmp_path: Path) -> str:
+    """The override of a reward function that pays 1 and keeps its params; `spied` returns them."""
+    file = tmp_path / "spy.py"
+    file.write_text("seen = []\ndef reward_function(params):\n    seen.append(params)\n    return 1.0\n")
+    return f"reward.file={file}"
+
+
+def spied(race: Race) -> list[list[dict[str, Any]]]:
+    """Return the params of all calls, by car."""
+    return [function.__globals__["seen"] for function in race._reward_function.functions]

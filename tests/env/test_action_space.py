@@ -1,17 +1,15 @@
 """Laws of action spaces."""
 
-import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import TypeAdapter
 
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import (
     ActionSpaceConfig,
     ContinuousActionSpace,
@@ -21,15 +19,9 @@ from deepracer_exp.config.driving import (
     SpeedRange,
     SteeringRange,
 )
+from deepracer_exp.config.options import options
 from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions, build_action_space
 from deepracer_exp.errors import BadInput
-
-CONF = Path(__file__).parents[2] / "conf" / "action_space"
-
-
-def option(name: str) -> ActionSpaceConfig:
-    adapter: TypeAdapter[Any] = TypeAdapter(ActionSpaceConfig)
-    return adapter.validate_python(yaml.safe_load((CONF / f"{name}.yaml").read_text(encoding="utf-8")))
 
 
 def grid(
@@ -55,24 +47,16 @@ def continuous(steering: tuple[float, float], speed: tuple[float, float]) -> Con
 
 
 def test_every_option_can_steer_both_ways_alike_and_stays_within_the_cars_limits() -> None:
-    names = sorted(path.stem for path in CONF.glob("*.yaml"))
+    names = options("action_space")
     assert {"discrete", "discrete_fast", "deepracer", "grid", "continuous"} <= set(names)
     for name in names:
-        space = build_action_space(option(name))
+        space = build_action_space(compose_option("action_space", name, ActionSpaceConfig))
         assert space.low[0] == -space.high[0] >= -30, name
         assert 0.1 <= space.low[1] <= space.high[1] <= 4, name
         if isinstance(space, DiscreteActions):
             choices = set(zip(space.steering_deg.tolist(), space.speed_mps.tolist(), strict=True))
             assert len(choices) == space.n, name
             assert choices == {(-steering, speed) for steering, speed in choices}, name
-
-
-def test_every_line_of_an_option_is_explained_by_a_comment_above_it() -> None:
-    for path in CONF.glob("*.yaml"):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        for above, line in itertools.pairwise(lines):
-            if line[0] not in "# ":
-                assert above.startswith("#"), f"{path}: {line}"
 
 
 def test_an_action_number_is_its_place_in_the_list() -> None:
@@ -173,18 +157,20 @@ def with_file(config: ActionSpaceConfig, path: Path) -> ActionSpaceConfig:
 def test_a_file_takes_the_place_of_every_kind_of_group(tmp_path: Path, name: str) -> None:
     path = tmp_path / "model_metadata.json"
     path.write_text(json.dumps({"action_space": [{"steering_angle": "12", "speed": "4.5"}]}))
-    space = build_action_space(with_file(option(name), path))
+    space = build_action_space(with_file(compose_option("action_space", name, ActionSpaceConfig), path))
     assert isinstance(space, DiscreteActions)
     # Beyond the car's 4 m/s: the simulator clips, the action space does not.
     assert (space.steering_deg.tolist(), space.speed_mps.tolist()) == ([12.0], [4.5])
 
     ranges = {"steering_angle": {"low": -12, "high": 20}, "speed": {"low": 1, "high": 2}}
     path.write_text(json.dumps({"action_space": ranges, "action_space_type": "continuous", "version": "5"}))
-    space = build_action_space(with_file(option(name), path))
+    space = build_action_space(with_file(compose_option("action_space", name, ActionSpaceConfig), path))
     assert isinstance(space, ContinuousActions)
     assert (space.low.tolist(), space.high.tolist()) == ([-12, 1], [20, 2])
 
 
 def test_a_missing_file_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"none\.json"):
-        build_action_space(with_file(option("discrete"), tmp_path / "none.json"))
+        build_action_space(
+            with_file(compose_option("action_space", "discrete", ActionSpaceConfig), tmp_path / "none.json")
+        )

@@ -11,15 +11,10 @@ from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup, courses_of_cars
 from deepracer_exp.errors import BadInput
+from tests.env.conftest import spied
 
 THREE = ("track=[reinvent_wood,Straight_track,Spain_track]", "track.Spain_track.direction=reversed")
 WAYS = ("action_space=continuous", "episode.max_steps=40", "randomization=sim2real")
-SPY = """
-seen = []
-def reward_function(params):
-    seen.append(params)
-    return 1.0
-"""
 GIVEN = """
 import numpy as np
 def reward_function(params):
@@ -101,13 +96,12 @@ def test_the_trace_reports_course_and_length(setup_of):
     np.testing.assert_array_equal(rows[1, :, PACKED["track_len"]], np.array(lengths)[[0, 1, 2, 0]])
 
 
-def test_a_reward_function_gets_its_cars_own_course(setup_of, tmp_path):
-    (tmp_path / "spy.py").write_text(SPY)
-    race = Race(setup_of(*THREE, f"reward.file={tmp_path / 'spy.py'}"), 6)
+def test_a_reward_function_gets_its_cars_own_course(setup_of, spy):
+    race = Race(setup_of(*THREE, spy), 6)
     drive(race, np.zeros((3, 6), np.int64))
-    for car, function in enumerate(race._reward_function._functions):
+    for car, seen in enumerate(spied(race)):
         track = race.setup.courses[race.rules.course[car]].tracks[0]
-        for params in function.__globals__["seen"]:
+        for params in seen:
             assert params["track_length"] == track.length_m
             assert params["is_reversed"] == track.reversed
             assert params["waypoints"] == [tuple(point) for point in track.waypoints.tolist()]
@@ -173,16 +167,10 @@ def test_the_direction_alternates_episode_by_episode_for_each_car(setup_of):
     np.testing.assert_array_equal(race.rules.track_index, [0, 0, 0])
 
 
-def test_an_alternating_car_looks_and_is_paid_along_its_direction(setup_of, tmp_path, steer_ahead):
-    (tmp_path / "spy.py").write_text(SPY)
-    setup = setup_of(
-        "track=Oval_track",
-        "track.direction=alternate",
-        "action_space=continuous",
-        f"reward.file={tmp_path / 'spy.py'}",
-    )
+def test_an_alternating_car_looks_and_is_paid_along_its_direction(setup_of, spy, steer_ahead):
+    setup = setup_of("track=Oval_track", "track.direction=alternate", "action_space=continuous", spy)
     race = Race(setup, 1)
-    seen = race._reward_function._functions[0].__globals__["seen"]
+    (seen,) = spied(race)
     for episode in range(4):
         race.reset()
         seen.clear()

@@ -1,28 +1,13 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import shapely
 
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
-from deepracer_exp.env.race import NonFinite, Race
+from deepracer_exp.env.race import NonFinite
+from tests.env.conftest import drive, random_actions, spied
+from tests.rewards.test_reward import KEYS
 
-REFERENCE = Path(__file__).parents[2] / "../shared/reference"
 NOISY = ("randomization=aws", "action_space=continuous", "episode.max_steps=40")
-
-
-def drive(race: Race, actions: np.ndarray) -> np.ndarray:
-    """Drive with actions (steps, cars, ...), start new episodes as they end, return traces (steps, cars, C)."""
-    rows = []
-    for action in actions:
-        race.step(action)
-        rows.append(race.trace.copy())
-        race.reset(np.flatnonzero(race.terminated | race.truncated))
-    return np.array(rows)
-
-
-def random_actions(steps: int, cars: int) -> np.ndarray:
-    return np.random.default_rng(5).uniform(-1, 1, (steps, cars, 2))
 
 
 # --- What a run depends on
@@ -33,26 +18,6 @@ def test_the_number_of_threads_changes_nothing(race_of):
     one, two = (drive(race_of(*NOISY, n_cars=12, threads=threads), actions) for threads in (1, 2))
     assert one[:, :, PACKED["done"]].sum() > 12
     np.testing.assert_array_equal(one, two)
-
-
-def test_a_car_drives_the_same_whatever_drives_beside_it(race_of):
-    actions = random_actions(100, 9)
-    together = drive(race_of(*NOISY, n_cars=9), actions)
-    alone = drive(race_of(*NOISY, n_cars=1, first_car=6), actions[:, 6:7])
-    some = drive(race_of(*NOISY, n_cars=3, first_car=6), actions[:, 6:])
-    np.testing.assert_array_equal(together[:, 6:7], alone)
-    np.testing.assert_array_equal(together[:, 6:], some)
-
-
-def test_the_seed_decides_the_noise_and_seeding_begins_again(race_of):
-    actions = random_actions(60, 2)
-    first, other = race_of(*NOISY, n_cars=2), race_of(*NOISY, "seed=1", n_cars=2)
-    driven = drive(first, actions)
-    assert (driven[:, :, PACKED["X"]] != drive(other, actions)[:, :, PACKED["X"]]).any()
-    for race in (first, other):
-        race.seed(0)
-        race.reset()
-        np.testing.assert_array_equal(drive(race, actions), driven)
 
 
 def test_without_noise_the_seed_changes_nothing(race_of):
@@ -82,14 +47,11 @@ def test_the_first_step_is_the_prepare_step(race_of, column):
     assert (np.linalg.norm(race.rules.now.front - front, axis=1) > 1e-3).all()
 
 
-def test_the_reward_function_first_sees_step_two(race_of, tmp_path):
-    (tmp_path / "spy.py").write_text(
-        "steps = []\ndef reward_function(params):\n    steps.append(params['steps'])\n    return 1.0\n"
-    )
-    race = race_of(f"reward.file={tmp_path / 'spy.py'}")
+def test_the_reward_function_first_sees_step_two(race_of, spy):
+    race = race_of(spy)
     for _ in range(3):
         race.step(np.zeros(1, np.int64))
-    assert race._reward_function._functions[0].__globals__["steps"] == [2.0, 3.0]
+    assert [params["steps"] for params in spied(race)[0]] == [2.0, 3.0]
 
 
 def test_each_episode_starts_further_along_and_each_car_elsewhere(race_of):
@@ -151,24 +113,14 @@ def test_the_clock_runs_at_the_control_rate_of_the_car(race_of, column):
 
 # --- The params of a reward function
 
-KEYS = {
-    *("all_wheels_on_track", "x", "y", "heading", "distance_from_center", "projection_distance", "progress"),
-    *("steps", "speed", "steering_angle", "track_width", "track_length", "waypoints", "closest_waypoints"),
-    *("is_left_of_center", "is_reversed", "is_crashed", "is_offtrack", "closest_objects", "objects_location"),
-    *("objects_left_of_center", "object_in_camera", "objects_speed", "objects_heading"),
-    *("objects_distance_from_center", "objects_distance", "sim_time"),
-}
-SPY = "seen = []\ndef reward_function(params):\n    seen.append(params)\n    return 1.0\n"
-
 
 @pytest.mark.parametrize("direction", ["forward", "reversed"])
 @pytest.mark.parametrize("name", ["reinvent_base", "Spain_track", "Straight_track"])
-def test_params_are_what_shapely_says_of_the_pose(race_of, column, steer_ahead, tmp_path, name, direction):
-    (tmp_path / "spy.py").write_text(SPY)
+def test_params_are_what_shapely_says_of_the_pose(race_of, column, steer_ahead, spy, name, direction):
     race = race_of(
         f"track={name}",
         f"track.direction={direction}",
-        f"reward.file={tmp_path / 'spy.py'}",
+        spy,
         "action_space=continuous",
         n_cars=3,
     )
@@ -183,11 +135,11 @@ def test_params_are_what_shapely_says_of_the_pose(race_of, column, steer_ahead, 
     ring = shapely.LinearRing if track.closed else shapely.LineString
     center, inner, outer = (ring(points) for points in (track.waypoints, track.inner, track.outer))
     clockwise = (not center.is_ccw) if track.closed else direction == "reversed"
-    seen = [f.__globals__["seen"] for f in race._reward_function._functions]
+    seen = spied(race)
     for step in range(5, 59, 9):
         for car in range(3):
             params, (pose, row) = seen[car][step], rows[step]
-            assert set(params) == KEYS
+            assert set(params) == set(KEYS)
             yaw = np.radians(params["heading"])
             forward = np.array([np.cos(yaw), np.sin(yaw)])
             origin = np.array([pose.x_m[car], pose.y_m[car]])

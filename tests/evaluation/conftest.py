@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -59,6 +60,13 @@ def protocol() -> Callable[..., EvaluationConfig]:
         return dataclasses.replace(config, **{"held_out": None, **changes})
 
     return build
+
+
+@pytest.fixture
+def run_dir(trained, tmp_path: Path) -> Path:
+    """A copy of a trained run of one's own, under `runs/tiny/`."""
+    original = trained().folder
+    return Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
 
 
 @pytest.fixture

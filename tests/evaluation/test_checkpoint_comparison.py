@@ -17,8 +17,9 @@ from deepracer_exp.evaluation.checkpoint_comparison import (
     lap_statistics,
     recommend,
 )
-from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import Evaluation, Group
+from deepracer_exp.evaluation.result import Evaluation
+
+from .test_result import attempt, group
 
 
 def figures(
@@ -85,39 +86,24 @@ def test_a_recommendation_other_than_best_says_so_and_without_any_there_is_none(
     assert recommend([result("000010", None)], "race_score") is None
 
 
-def lap(trial: int, time_s: float, complete: bool = True) -> Attempt:
-    return Attempt(
-        trial=trial,
-        begin_s=0,
-        time_s=time_s,
-        penalty_s=0,
-        resets=0,
-        progress=100 if complete else 50,
-        end="lap_complete" if complete else "off_track",
-    )
-
-
-def group(track: str, condition: str, laps: list[Attempt]) -> Group:
-    return Group(track, condition, tuple(range(len(laps))), tuple(laps))
-
-
 def test_figures_are_those_of_the_usual_conditions_with_the_held_out_ones_beside_them():
-    usual = [lap(0, 8.0), lap(1, 9.0), lap(2, 10.0), lap(3, 12.0), lap(4, 3.0, complete=False)]
-    held_out = group("oval", "held_out", [lap(0, 20.0), lap(1, 2.0, False)])
-    found = lap_statistics(Evaluation((group("oval", "usual", usual), held_out)), "race_score")
+    laps = [attempt(trial, time_s) for trial, time_s in enumerate((8.0, 9.0, 10.0, 12.0))]
+    usual = group(*laps, attempt(4, 3.0, progress=50.0))
+    held_out = group(attempt(0, 20.0), attempt(1, 2.0, progress=50.0), condition="held_out")
+    found = lap_statistics(Evaluation((usual, held_out)), "race_score")
     assert (found.complete, found.completion) == pytest.approx((80.0, 90.0))
     assert (found.best_s, found.lap_time_s, found.median_s) == (8.0, 8.75, 9.5)
     assert found.race_score_s == pytest.approx(64 / 5)  # of all laps
     assert (found.held_out_complete, found.held_out_completion) == (50.0, 75.0)
     assert found.held_out_lap_time_s == 20.0
-    alone = lap_statistics(Evaluation((group("oval", "usual", usual),)), "lap_time")
+    alone = lap_statistics(Evaluation((usual,)), "lap_time")
     assert math.isnan(alone.held_out_complete)
     assert math.isnan(alone.held_out_lap_time_s)
 
 
 def test_a_track_without_a_lap_leaves_no_time_of_several_tracks():
-    long, short = group("long", "usual", [lap(0, 20.0)]), group("short", "usual", [lap(0, 10.0)])
-    failed = group("hard", "usual", [lap(0, 10.0, complete=False)])
+    long, short = (group(attempt(0, time_s), track=f"{time_s}") for time_s in (20.0, 10.0))
+    failed = group(attempt(0, progress=50.0), track="hard")
     assert lap_statistics(Evaluation((long, short)), "progress").lap_time_s == 15.0
     assert math.isnan(lap_statistics(Evaluation((long, failed)), "progress").lap_time_s)
 

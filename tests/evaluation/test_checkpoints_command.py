@@ -93,25 +93,6 @@ def test_evaluate_warns_when_it_uses_another_checkpoint(run_dir, call):
     assert json.loads(file.read_text())["checkpoint"]["name"] == "000009"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("nowhere",), ("nowhere: no such run",)),
-        (("evaluation=summit",), ("RUN: missing",)),
-        (("one", "two"), ("one two: 2 runs given",)),
-        (("x", "checkpoint=best"), ("checkpoint=best", "evaluate")),
-        (("x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
-        (("x", "-o", "nowhere/picture.html"), ("--output nowhere/picture.html",)),
-        (("x", "-o", "picture.txt"), ("--output picture.txt",)),
-    ],
-)
-def test_bad_input_is_one_line(call, arguments, words):
-    ended = call("checkpoints", *arguments)
-    assert ended.code == 2
-    assert all(word in ended.complaint for word in words)
-    assert ended.stdout == ""
-
-
 def test_a_run_without_checkpoints_is_refused(run_dir, call):
     shutil.rmtree(run_dir / "checkpoints")
     assert "checkpoints: none" in call("checkpoints", run_dir.name).complaint

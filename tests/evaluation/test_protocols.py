@@ -6,26 +6,14 @@ import yaml
 
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluateConfig
-from deepracer_exp.config.options import conf_dir, groups, options
-
-PROTOCOLS = options("evaluation")
+from deepracer_exp.config.options import conf_dir, groups
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_every_protocol_composes_and_has_the_keys_of_its_dataclass(name):
-    overrides = ["run=x", f"evaluation={name}"]
-    config, composition = compose_evaluation(overrides)
-    assert composition.choices == {"evaluation": name}
-    assert list(composition.mapping["evaluation"]) == list(dataclasses.asdict(config.evaluation))
-    assert set(composition.mapping) == {field.name for field in dataclasses.fields(EvaluateConfig)}
-
-
-@pytest.mark.parametrize("file", ["evaluate", *(f"evaluation/{name}" for name in PROTOCOLS)])
-def test_every_key_is_explained(file):
-    lines = (conf_dir() / f"{file}.yaml").read_text().splitlines()
+def test_every_key_of_the_entry_point_is_explained():
+    lines = (conf_dir() / "evaluate.yaml").read_text().splitlines()
     for above, line in zip(["", *lines], lines, strict=False):
         if re.match(r"(?!defaults)\w+:", line):
-            assert above.startswith("#"), f"{file}: {line} has no comment above it"
+            assert above.startswith("#"), f"{line} has no comment above it"
 
 
 def test_the_entry_point_is_its_group_and_a_few_keys():

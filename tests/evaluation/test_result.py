@@ -14,6 +14,7 @@ def attempt(trial=0, time_s=10.0, progress=100.0, end=None, **more):
 
 
 def group(*attempts, track="a", condition="usual"):
+    """Return attempts of as many trials as they name."""
     return Group(track, condition, tuple(sorted({a.trial for a in attempts})), attempts)
 
 

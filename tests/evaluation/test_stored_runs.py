@@ -13,17 +13,11 @@ from rich.console import Console
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluate import results_table
-from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import Evaluation, Group
+from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
 
-
-@pytest.fixture
-def run_dir(trained, tmp_path) -> Path:
-    """A copy of a trained run of one's own, under `runs/tiny/`."""
-    original = trained().folder
-    return Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
+from .test_result import attempt, group
 
 
 @pytest.fixture
@@ -119,17 +113,24 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), ("RUN: missing",)),
-        (("nowhere",), ("nowhere: no such run",)),
-        (("x", "checkpoint=newest"), ("checkpoint", "best, last")),
-        (("x", "evaluation=sumit"), ("sumit", "summit")),
-        (("x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
-        (("x", "evaluation.trials=0"), ("evaluation.trials=0",)),
-        (("x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
+        (("evaluate",), ("RUN: missing",)),
+        (("evaluate", "nowhere"), ("nowhere: no such run",)),
+        (("evaluate", "x", "checkpoint=newest"), ("checkpoint", "best, last")),
+        (("evaluate", "x", "evaluation=sumit"), ("sumit", "summit")),
+        (("evaluate", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
+        (("evaluate", "x", "evaluation.trials=0"), ("evaluation.trials=0",)),
+        (("evaluate", "x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
+        (("checkpoints", "nowhere"), ("nowhere: no such run",)),
+        (("checkpoints", "evaluation=summit"), ("RUN: missing",)),
+        (("checkpoints", "one", "two"), ("one two: 2 runs given",)),
+        (("checkpoints", "x", "checkpoint=best"), ("checkpoint=best", "evaluate")),
+        (("checkpoints", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
+        (("checkpoints", "x", "-o", "nowhere/picture.html"), ("--output nowhere/picture.html",)),
+        (("checkpoints", "x", "-o", "picture.txt"), ("--output picture.txt",)),
     ],
 )
 def test_bad_input_is_one_line(call, arguments, words):
-    ended = call("evaluate", *arguments)
+    ended = call(*arguments)
     assert ended.code == 2
     assert all(word in ended.complaint for word in words)
     assert ended.stdout == ""
@@ -148,13 +149,8 @@ def test_a_video_needs_a_library_to_draw_with(call, monkeypatch):
     ("width", "median", "intervals"), [(200, True, True), (90, False, True), (60, False, False)]
 )
 def test_a_narrow_table_leaves_out_columns_but_cuts_no_figure(protocol, width, median, intervals):
-    laps = [
-        Attempt(
-            trial=at, begin_s=0, time_s=10.25 + at, penalty_s=0, resets=at, progress=100, end="lap_complete"
-        )
-        for at in range(3)
-    ]
-    evaluation = Evaluation((Group("reinvent_base", "usual", (0, 1, 2), tuple(laps)),))
+    laps = (attempt(at, 10.25 + at, resets=at) for at in range(3))
+    evaluation = Evaluation((group(*laps, track="reinvent_base"),))
     console = Console(width=width, file=io.StringIO())
     console.print(results_table(evaluation, protocol("summit"), ["reinvent_base"], console))
     text = console.file.getvalue()

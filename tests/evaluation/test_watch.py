@@ -5,7 +5,6 @@ import io
 import itertools
 import shutil
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +17,13 @@ from tensordict import TensorDict
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import CameraConfig
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.film import drive_best_lap, write_film
+from deepracer_exp.evaluation.film import Lap, drive_best_lap, write_film
 from deepracer_exp.evaluation.live import LivePage
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
@@ -53,6 +55,15 @@ def step(camera: CameraConfig, policy: torch.nn.Module) -> TensorDict:
         0, 256, (1, *camera.shape), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
     )
     return policy(TensorDict({"pixels": pixels}, [1]))[0]
+
+
+def driven(experiment: Experiment, config: EvaluationConfig) -> tuple[torch.nn.Module, Lap, TensorDict]:
+    """Return a new policy and its best lap."""
+    evaluator = Evaluator(experiment, config, threads=1)
+    observed, actions = observation_shape(experiment.observation), evaluator.race.setup.actions
+    generator = torch.Generator().manual_seed(0)
+    policy = build_actor_critic(experiment.network, observed, actions.n, generator).policy
+    return policy, *drive_best_lap(evaluator, policy)
 
 
 @pytest.mark.parametrize("frame", [0, 1])
@@ -87,13 +98,10 @@ def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
 )
 def test_a_film_has_a_frame_a_step_and_shows_another_picture_in_each(circle, protocol, overrides):
     experiment = compose_experiment([f"track.file={circle}", *overrides])[0]
-    evaluator = Evaluator(experiment, protocol("three_trials", trials=2, time_s=0.4), threads=1)
-    actions = evaluator.race.setup.actions
-    observed = observation_shape(experiment.observation)
-    networks = build_actor_critic(experiment.network, observed, actions.n, torch.Generator().manual_seed(0))
-    lap, acted = drive_best_lap(evaluator, networks.policy)
+    policy, lap, acted = driven(experiment, protocol("three_trials", trials=2, time_s=0.4))
     assert len(lap) == len(acted) == 7  # the prepare step and six more
-    frames = list(Frames(lap, acted, networks.policy, actions, experiment.observation, 0.14))
+    actions = build_action_space(experiment.action_space)
+    frames = list(Frames(lap, acted, policy, actions, experiment.observation, 0.14))
     assert {frame.shape for frame in frames} == {(HEIGHT, WIDTH, 3)}
     assert all((one != other).any() for one, other in itertools.pairwise(frames))
     if experiment.observation.camera is not None:
@@ -108,12 +116,8 @@ def test_a_film_has_a_frame_a_step_and_shows_another_picture_in_each(circle, pro
 def test_the_rays_of_a_film_end_at_the_walls(protocol, yaw_deg):
     own = (f"observation.lidar.{one}" for one in ("noise_m=0", "reach_m=12", f"yaw_deg={yaw_deg}"))
     experiment = compose_experiment(["observation=lidar", *own])[0]
-    evaluator = Evaluator(experiment, protocol("three_trials", trials=1, time_s=1), threads=1)
     lidar, front_m = experiment.observation.lidar, experiment.car.front_point_m
-    networks = build_actor_critic(
-        experiment.network, observation_shape(experiment.observation), 15, torch.Generator().manual_seed(0)
-    )
-    lap, acted = drive_best_lap(evaluator, networks.policy)
+    _, lap, acted = driven(experiment, protocol("three_trials", trials=1, time_s=1))
     sensor, ends = np.split(rays(lap, acted["lidar"].numpy(), lidar, front_m), [1], axis=1)
     wall = shapely.LineString(wall_ring(lap.track))
     assert shapely.distance(wall, shapely.points(ends)) == pytest.approx(0, abs=1e-3)
@@ -131,13 +135,8 @@ def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
     assert np.abs(np.array(shades) - [20 * min(at, 9) for at in range(25)]).max() < 6
 
 
-@pytest.fixture
-def run(trained, tmp_path) -> StoredRun:
-    """A run of features, of which one checkpoint is there."""
-    return StoredRun(shutil.copytree(trained().folder, tmp_path / "run", symlinks=True))
-
-
-def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run, protocol):
+def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protocol):
+    run = StoredRun(run_dir)
     page = LivePage(run, protocol("three_trials", trials=2, time_s=1))
     first = page.shown
     assert "its laps are being driven" in first[1]
@@ -177,10 +176,9 @@ def test_the_live_page_is_served_to_this_machine_alone():
         server.shutdown()
 
 
-def test_the_film_is_put_into_the_folder_of_the_run(trained, call, tmp_path):
-    folder = Path(shutil.copytree(trained().folder, tmp_path / "filmed", symlinks=True))
-    ended = call("watch", str(folder), "evaluation.trials=1", "evaluation.time_s=0.6")
+def test_the_film_is_put_into_the_folder_of_the_run(run_dir, call):
+    ended = call("watch", str(run_dir), "evaluation.trials=1", "evaluation.time_s=0.6")
     assert ended.code == 0, ended.stderr
-    (film,) = folder.glob("films/*.mp4")
-    assert film.stem == (folder / "checkpoints" / "best").resolve().name
+    (film,) = run_dir.glob("films/*.mp4")
+    assert film.stem == (run_dir / "checkpoints" / "best").resolve().name
     assert film.name in ended.stdout
