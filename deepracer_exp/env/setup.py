@@ -106,21 +106,23 @@ class RaceSetup:
         return replace(self, courses=(Course(name=track.name, weight=1.0, tracks=(track,)),))
 
 
-def build_setup(experiment: Experiment) -> RaceSetup:
-    """Read the files that an experiment names and build its race.
+def build_setup(
+    experiment: Experiment, courses: tuple[Course, ...] | None = None, reward: RewardSource | None = None
+) -> RaceSetup:
+    """Read the files that an experiment names and build its race; `courses` and `reward` replace its own.
 
     Raises:
         BadInput: a route, model_metadata or reward file is missing or malformed, or values contradict.
     """
     return RaceSetup(
-        courses=build_courses(experiment),
+        courses=courses or build_courses(experiment),
         car=experiment.car,
         actions=build_action_space(experiment.action_space),
         observation=experiment.observation,
         observation_parts=build_parts(experiment.observation),
         randomization=experiment.randomization,
         episode=experiment.episode,
-        reward=load_reward_source(experiment.reward),
+        reward=reward or load_reward_source(experiment.reward),
         reward_time_limit_s=experiment.reward.time_limit_s,
         seed=experiment.seed,
     )

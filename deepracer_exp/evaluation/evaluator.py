@@ -16,11 +16,9 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.trace import PACKED
-from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.observation import build_parts
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
-from deepracer_exp.env.setup import Course, RaceSetup, directed_tracks
+from deepracer_exp.env.setup import Course, build_setup, directed_tracks
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource
 
@@ -85,17 +83,11 @@ class Evaluator:
             for condition in conditions
             for start in _starts(config, course.tracks[0].closed, condition)
         ]
-        setup = RaceSetup(
-            courses=courses,
-            car=experiment.car,
-            actions=build_action_space(experiment.action_space),
-            observation=experiment.observation,
-            observation_parts=build_parts(experiment.observation),
+        setup = replace(
+            build_setup(experiment, courses, _NO_REWARD),
             randomization=conditions[USUAL],
             # The protocol limits the time.
             episode=replace(experiment.episode, max_steps=0),
-            reward=_NO_REWARD,
-            reward_time_limit_s=experiment.reward.time_limit_s,
             seed=config.seed,
         )
         if config.real_car is not None:
