@@ -33,79 +33,54 @@ _SMOOTHING = 0.25
 """Share of a heading change that the chase camera follows per step."""
 
 
-class LapRenderer:
-    """Renders a car on its track with MuJoCo.
+def render_lap(lap: Lap, car: CarConfig, view: View) -> Iterator[NDArray[np.uint8]]:
+    """Render the steps of a lap with MuJoCo, (HEIGHT, WIDTH, 3) each; poses are given, nothing is simulated."""
+    model, camera = _build(lap.track, car, view), mujoco.MjvCamera()
+    data = mujoco.MjData(model)
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    place, steer, spin = (
+        [model.joint(name).qposadr[0] for name in names]
+        for names in (
+            ("x", "y", "yaw"),
+            (f"{name}_steer" for name in STEERED),
+            (f"{name}_spin" for name in WHEELS),
+        )
+    )
+    # Recorded poses are of the front point; the joints move the centre of mass.
+    to_com_m = car.com_x_m - car.front_point_m
+    com_x_m, com_y_m = lap.x_m + to_com_m * np.cos(lap.yaw_rad), lap.y_m + to_com_m * np.sin(lap.yaw_rad)
+    turned_rad = np.cumsum(lap.speed_mps) / car.control_hz / car.wheel_radius_m
+    azimuth_rad = float(lap.yaw_rad[0])
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        for at, yaw_rad in enumerate(lap.yaw_rad.tolist()):
+            data.qpos[place] = com_x_m[at] - car.com_x_m, com_y_m[at], yaw_rad
+            data.qpos[steer] = lap.steering_rad[at]
+            data.qpos[spin] = turned_rad[at]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_camlight(model, data)
+            if view == "top":
+                _look_down(camera, lap.track, np.radians(model.vis.global_.fovy))
+            else:
+                azimuth_rad += _SMOOTHING * ((yaw_rad - azimuth_rad + np.pi) % (2 * np.pi) - np.pi)
+                ahead = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)])
+                camera.lookat[:] = *(np.array([lap.x_m[at], lap.y_m[at]]) + 0.25 * ahead), 0.05
+                camera.distance, camera.elevation = 1.3, -24.0
+                camera.azimuth = np.degrees(azimuth_rad)
+            renderer.update_scene(data, camera)
+            # Shadows of the distant light cost more than the rest of the image.
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+            yield renderer.render()
 
-    Poses are given; nothing is simulated. A context manager that frees the graphics memory.
-    """
 
-    def __init__(self, track: Track, car: CarConfig, view: View):
-        """Draw the track and set up the renderer."""
-        self._car, self._view = car, view
-        self._low, self._high = extent(track)
-        self._model = _build(track, car, view)
-        self._data = mujoco.MjData(self._model)
-        self._place = [self._model.joint(name).qposadr[0] for name in ("x", "y", "yaw")]
-        self._steer = [self._model.joint(f"{name}_steer").qposadr[0] for name in STEERED]
-        self._spin = [self._model.joint(f"{name}_spin").qposadr[0] for name in WHEELS]
-        self._renderer = mujoco.Renderer(self._model, HEIGHT, WIDTH)
-        self._camera = mujoco.MjvCamera()
-        self._azimuth_rad: float | None = None
-
-    def __enter__(self) -> "LapRenderer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._renderer.close()
-
-    def draw(
-        self, x_m: float, y_m: float, yaw_rad: float, steering_rad: float, driven_m: float
-    ) -> NDArray[np.uint8]:
-        """Return the image of a pose, (height, width, 3).
-
-        Args:
-            x_m: front point of the car, as in a trace.
-            y_m: likewise.
-            yaw_rad: heading.
-            steering_rad: of the front wheels, positive to the left.
-            driven_m: distance driven so far, which turns the wheels.
-        """
-        qpos, car = self._data.qpos, self._car
-        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-        to_com_m = car.com_x_m - car.front_point_m
-        qpos[self._place] = x_m + to_com_m * cos - car.com_x_m, y_m + to_com_m * sin, yaw_rad
-        qpos[self._steer] = steering_rad
-        qpos[self._spin] = driven_m / car.wheel_radius_m
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
-        self._aim(x_m, y_m, yaw_rad)
-        self._renderer.update_scene(self._data, self._camera)
-        # Shadows of the distant light cost more than the rest of the image.
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        picture: NDArray[np.uint8] = self._renderer.render()
-        return picture
-
-    def _aim(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        camera = self._camera
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        if self._view == "top":
-            middle = 0.5 * (self._low + self._high)
-            width, height = self._high - self._low
-            seen_m = max(height / (1 - _HEAD), width * HEIGHT / WIDTH)
-            camera.lookat[:] = middle[0], middle[1] + 0.5 * _HEAD * seen_m, 0.0
-            angle = np.radians(self._model.vis.global_.fovy)
-            camera.distance = 0.5 * seen_m / np.tan(angle / 2)
-            camera.azimuth, camera.elevation = 90.0, -90.0
-            return
-        if self._azimuth_rad is None:
-            self._azimuth_rad = yaw_rad
-        turn = (yaw_rad - self._azimuth_rad + np.pi) % (2 * np.pi) - np.pi
-        self._azimuth_rad += _SMOOTHING * turn
-        ahead = np.array([np.cos(self._azimuth_rad), np.sin(self._azimuth_rad)])
-        camera.lookat[:] = *(np.array([x_m, y_m]) + 0.25 * ahead), 0.05
-        camera.distance, camera.elevation = 1.3, -24.0
-        camera.azimuth = np.degrees(self._azimuth_rad)
+def _look_down(camera: mujoco.MjvCamera, track: Track, angle_rad: float) -> None:
+    """Show the whole track from above, below the overlay; the angle is the picture's height."""
+    low, high = extent(track)
+    middle, (width, height) = 0.5 * (low + high), high - low
+    seen_m = max(height / (1 - _HEAD), width * HEIGHT / WIDTH)
+    camera.lookat[:] = middle[0], middle[1] + 0.5 * _HEAD * seen_m, 0.0
+    camera.distance = 0.5 * seen_m / np.tan(angle_rad / 2)
+    camera.azimuth, camera.elevation = 90.0, -90.0
 
 
 def extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -190,15 +165,8 @@ def write_video(file: Path, view: View, lap: Lap, car: CarConfig, err: Console) 
     Raises:
         RunFailed: the file cannot be written.
     """
-    driven_m = np.cumsum(lap.speed_mps) / car.control_hz
-    with LapRenderer(lap.track, car, view) as renderer:
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for at in range(len(lap)):
-                pose = lap.x_m[at], lap.y_m[at], lap.yaw_rad[at], lap.steering_rad[at]
-                yield _overlay(renderer.draw(*pose, driven_m[at]), lap, at)
-
-        write_film(file, frames(), len(lap), (WIDTH, HEIGHT), car.control_hz, err)
+    frames = (_overlay(picture, lap, at) for at, picture in enumerate(render_lap(lap, car, view)))
+    write_film(file, frames, len(lap), (WIDTH, HEIGHT), car.control_hz, err)
 
 
 def _overlay(picture: NDArray[np.uint8], lap: Lap, at: int) -> NDArray[np.uint8]:
