@@ -76,7 +76,7 @@ class LivePage:
         policy, evaluator = stored.networks.policy, self._evaluator
         recorder = LapRecorder(evaluator)
         evaluation = evaluator(policy, recorder)
-        lines = lines_figure(self._lines(evaluation, recorder))
+        lines = lines_figure(driven_lines(evaluator, evaluation, recorder))
         camera, strip = self._run.experiment.observation.camera, list[Glimpse]()
         if camera is not None:
             again = LapRecorder(evaluator, best_attempt(evaluation))
@@ -85,23 +85,6 @@ class LivePage:
             strip = glimpses(best, again.acted, policy, evaluator.race.setup.actions, camera)
         steps = stored.counters["env_steps"]
         self._draw(f"checkpoint {stored.path.name}, {steps:,} steps", evaluation, strip, _png_of(lines))
-
-    def _lines(self, evaluation: Evaluation, recorder: LapRecorder) -> list[TrackLines]:
-        """Return the laps on the usual conditions, by track."""
-        setup, trials = self._evaluator.race.setup, self._evaluator.trials
-        shown = []
-        for course in range(len(setup.courses)):
-            laps = [
-                recorder.lap(attempt)
-                for attempt in evaluation.on(USUAL).attempts
-                if trials[attempt.trial].course == course
-            ]
-            times_s = [lap.attempt.time_s for lap in laps if lap.attempt.complete]
-            words = f"{len(times_s)} of {len(laps)} laps complete"
-            words += f", the fastest in {min(times_s):.2f} s" if times_s else ""
-            lines = [np.column_stack([lap.x_m, lap.y_m, lap.speed_mps]) for lap in laps if len(lap) > 1]
-            shown.append(TrackLines(setup.courses[course].tracks[0], words, lines))
-        return shown
 
     def _draw(self, headline: str, evaluation: Evaluation | None, strip: list[Glimpse], lines: str) -> None:
         metrics, curves, table = self._run.path / METRICS, "", None
@@ -128,6 +111,20 @@ class LivePage:
             strip=strip,
         )
         self.shown = (version, page)
+
+
+def driven_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecorder) -> list[TrackLines]:
+    """Return the laps on the usual conditions, by track; those that the end of the race cut off do not count."""
+    shown = []
+    groups = [group for group in evaluation.groups if group.condition == USUAL]
+    for course, group in zip(evaluator.race.setup.courses, groups, strict=True):
+        times_s = group.lap_times_s
+        words = f"{len(times_s)} of {len(group.decided)} laps complete"
+        words += f", the fastest in {min(times_s):.2f} s" if len(times_s) else ""
+        laps = [recorder.lap(attempt) for attempt in group.attempts]
+        lines = [np.column_stack([lap.x_m, lap.y_m, lap.speed_mps]) for lap in laps if len(lap) > 1]
+        shown.append(TrackLines(course.tracks[0], words, lines))
+    return shown
 
 
 def _png_of(figure: Figure) -> str:

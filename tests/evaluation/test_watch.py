@@ -23,8 +23,8 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.film import Lap, drive_best_lap, write_film
-from deepracer_exp.evaluation.live import LivePage
+from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, write_film
+from deepracer_exp.evaluation.live import LivePage, driven_lines
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
 from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames, rays
@@ -155,6 +155,17 @@ def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protoco
     assert len({version for version, _ in (first, second, page.shown)}) == 3
     after = {path.relative_to(run.path) for path in run.path.rglob("*")}
     assert {path for path in after - before if path.parts[:2] != ("checkpoints", "999999")} == set()
+
+
+def test_a_lap_that_the_end_of_the_race_cuts_off_is_drawn_but_not_counted(experiment, protocol, driver):
+    evaluator = Evaluator(experiment, protocol("four_minutes", trials=1, time_s=18.0), threads=1)
+    recorder = LapRecorder(evaluator)
+    evaluation = evaluator(driver(), recorder)
+    *complete, last = evaluation.groups[0].attempts
+    assert last.end == "time_up"
+    (shown,) = driven_lines(evaluator, evaluation, recorder)
+    assert shown.words.startswith(f"{len(complete)} of {len(complete)} laps complete, the fastest in ")
+    assert len(shown.lines) == len(complete) + 1
 
 
 def test_the_live_page_is_served_to_this_machine_alone():
