@@ -154,8 +154,8 @@ class SensorNet(nn.Module):
     """Convolutions for pictures, layers for a LIDAR, and a perceptron that joins them.
 
     Called with what there is of pictures, uint8 [..., channels, height, width], and readings, float32 [..., readings];
-    returns float32 [..., outputs]. With pictures, products are in bfloat16 on a GPU, and on processors with matrix
-    units for it (Intel AMX: three times as fast).
+    returns float32 [..., outputs]. With pictures, products are in bfloat16 on a GPU, and on processors with
+    instructions for it (updates are 1.7 to 2.4 times as fast with AVX-512 BF16, three times with AMX).
     """
 
     def __init__(self, config: CNNConfig, observed: ObservationShape, outputs: int | None) -> None:
@@ -164,7 +164,7 @@ class SensorNet(nn.Module):
         activation = config.activation
         size, hidden = 0, config.hidden
         self.has_picture, self.has_lidar = observed.picture is not None, observed.lidar is not None
-        self.matrix_units: bool = self.has_picture and torch.cpu._is_amx_tile_supported()
+        self.half_precision: bool = self.has_picture and torch.cpu._is_avx512_bf16_supported()
         if observed.picture is not None:
             channels, *pixels = observed.picture
             layers: list[nn.Module] = []
@@ -189,7 +189,7 @@ class SensorNet(nn.Module):
     def forward(self, *sensed: Tensor) -> Tensor:
         """Return the outputs."""
         batch = sensed[-1].shape[:-1] if self.has_lidar else sensed[0].shape[:-3]
-        half = self.has_picture and (self.matrix_units or sensed[0].is_cuda)
+        half = self.has_picture and (self.half_precision or sensed[0].is_cuda)
         parts = []
         if self.has_lidar:
             parts.append(self.lidar(sensed[-1].reshape(-1, sensed[-1].shape[-1])))

@@ -173,7 +173,7 @@ class DeployedPolicy(nn.Module):
         self.in_keys = list(networks.policy.in_keys)
         for module in self.modules():
             if isinstance(module, SensorNet):
-                module.matrix_units = False  # a file for any processor
+                module.half_precision = False  # a file for any processor
         self.discrete = isinstance(actions, DiscreteActions)
         if isinstance(actions, DiscreteActions):
             rows = [actions.steering_deg, actions.speed_mps]

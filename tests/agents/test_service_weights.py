@@ -84,8 +84,8 @@ def test_the_services_graph_of_our_tensors_gives_our_outputs(sensors, shared):
     readings = torch.rand(3, 16, generator=generator)
     steps = TensorDict({"pixels": pictures, "lidar": readings}, [3])
     for module in networks.modules():
-        if hasattr(module, "matrix_units"):
-            module.matrix_units = False
+        if hasattr(module, "half_precision"):
+            module.half_precision = False
     sensed = {sensors[0]: pictures.permute(0, 2, 3, 1).numpy().astype(np.float64) / 255}
     if len(sensors) > 1:
         sensed[sensors[1]] = readings.numpy().astype(np.float64)

@@ -280,8 +280,8 @@ def test_two_hundred_damaged_archives_are_refused_within_bounded_memory(call, tm
 
 def actions(networks, frames):
     for module in networks.modules():
-        if hasattr(module, "matrix_units"):
-            module.matrix_units = False
+        if hasattr(module, "half_precision"):
+            module.half_precision = False
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         return torch.cat(
             [networks.policy(TensorDict({"pixels": part}, [len(part)]))["action"] for part in frames]
