@@ -15,7 +15,7 @@ from typing import IO, Any
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
-from .log_blocks import READ_ERRORS
+from .log_blocks import READ_ERRORS, reason_of
 from .recording import LogProblem, readable
 
 _ACCEPTED = "trace CSVs or logs of the service"
@@ -78,8 +78,6 @@ class LogFolder:
     files: list[LogFile] = field(default_factory=list)
     """In the order in which they are fastest to read."""
     problems: list[LogProblem] = field(default_factory=list)
-    parallel: bool = True
-    """Whether files can be read in parallel."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
             if stat.S_ISDIR(mode):
                 yield _walk(path, opened)
             elif _is_packed(path):
-                found = LogFolder(parallel=False)
+                found = LogFolder()
                 archives = opened.enter_context(contextlib.closing(_Archives()))
                 _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
                 yield found
@@ -169,7 +167,7 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
     except (*READ_ERRORS, ValueError) as error:
         if isinstance(error, BadInput):
             raise
-        raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+        raise BadInput(f"{path}: cannot be read: {reason_of(error)}") from error
 
 
 def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
@@ -204,8 +202,7 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
             else:
                 _unpack(found, path, (*folders, path.name), folders, archives)
         except (*READ_ERRORS, ValueError) as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason})"))
+            found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason_of(error)})"))
     return found
 
 
@@ -273,7 +270,6 @@ def _unpack(
             LogFile(path, (*beside, path.name), open_user_file, (path, _ACCEPTED, LOG_BYTES))
         )  # perhaps a model for the car
         return
-    found.parallel = False
     found.problems += members.problems
     rest = [file for file in members.files if not inside or not _lies_beside(path, file)]
     if len(rest) < len(members.files):
@@ -313,7 +309,7 @@ def _ending(name: str) -> str | None:
 
 def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFolder:
     """List the members in the order of the archive: going back would mean reading it again."""
-    found = LogFolder(parallel=False)
+    found = LogFolder()
     members: dict[tuple[str, ...], tarfile.TarInfo] = {}
     try:
         while (member := archive.next()) is not None:
@@ -326,8 +322,8 @@ def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFo
             elif member.islnk() or member.issym():
                 found.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
     except (*READ_ERRORS, ValueError, OverflowError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        found.problems.append(LogProblem(str(path), None, f"cannot be read to its end ({reason})"))
+        reason = f"cannot be read to its end ({reason_of(error)})"
+        found.problems.append(LogProblem(str(path), None, reason))
     for parts, member in members.items():
         if parts:
             plain = parts if _ending(parts[-1]) is None else (*parts[:-1], _PACKED.sub("", parts[-1]))

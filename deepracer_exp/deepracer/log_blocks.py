@@ -18,6 +18,11 @@ _LONGEST_LINE = 2**24
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
+def reason_of(error: Exception) -> str:
+    """Return the message of such an error in one line; its type where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 class Blocks:
     """Reads a stream in blocks of whole lines, so that memory does not grow with the file.
 
@@ -80,8 +85,7 @@ class Blocks:
             try:
                 piece = self.stream.read(min(_PIECE, self.size - size))
             except READ_ERRORS as error:
-                reason = " ".join(str(error).split()) or type(error).__name__
-                self.refused.append((None, f"cannot be read to its end ({reason})"))
+                self.refused.append((None, f"cannot be read to its end ({reason_of(error)})"))
                 self._ended = True
                 break
             if not piece:

@@ -24,7 +24,7 @@ from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES
 
 from .graph_def import GRAPH_BYTES, read_weights
 from .log_archive import natural
-from .log_blocks import READ_ERRORS
+from .log_blocks import READ_ERRORS, reason_of
 from .tf_checkpoint import DATA, DATA_BYTES, INDEX, INDEX_BYTES, read_index, read_tensors
 
 Tensors = Mapping[str, npt.NDArray[np.float32]]
@@ -96,7 +96,7 @@ def read_model(path: str, checkpoint: str) -> StoredModel:
     except BadInput:
         raise
     except (*READ_ERRORS, zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        reason = getattr(error, "strerror", None) or reason_of(error)
         raise BadInput(f"{path}: cannot be read: {reason}; accepted: {_ACCEPTED}") from error
 
 

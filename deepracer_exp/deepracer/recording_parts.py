@@ -1,14 +1,12 @@
 """The files of a recording, each read by itself."""
 
-import heapq
+import bisect
 import json
 import math
 import re
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, fields
-from typing import IO, Any, TypeVar
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import IO, Any
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import SETTINGS_BYTES, read_yaml
@@ -16,13 +14,11 @@ from deepracer_exp.files import SETTINGS_BYTES, read_yaml
 from . import sim_trace
 from .hyperparameters import read_hyperparameters
 from .log_archive import LOG, LogFile, LogFolder, Place, natural, place_of
-from .log_blocks import READ_ERRORS
+from .log_blocks import READ_ERRORS, reason_of
 from .model_metadata import ModelMetadata, read_model_metadata
 from .recording import TRAINING, LogProblem
 from .sim_trace import StepTables, read_trace_csv
 from .training_log import MARKER, TrainingLog, piece_of, read_training_logs
-
-Result = TypeVar("Result")
 
 MOST_LISTED = 20
 """Lines of one file that are listed one by one; the rest is counted."""
@@ -36,7 +32,6 @@ _BESIDE = re.compile(
     r"|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
 )
 _MOST_NAMED = 3
-_THREADS = 4
 _MOST_METRICS_BYTES = 2**26
 _LARGEST = 2**31 - 1
 
@@ -53,21 +48,13 @@ class TraceFile:
 
 
 @dataclass
-class MetricsJson:
-    """The episodes of one metrics file of the service."""
-
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    """Keys `episode` (from 0), `trial`, `phase`, `reward`, `completion`, `time_s`, `episode_status`, `resets`."""
-    refused: list[str] = field(default_factory=list)
-
-
-@dataclass
 class Parts:
     """The content of all files."""
 
     traces: list[TraceFile] = field(default_factory=list)
     logs: list[tuple[LogFile, TrainingLog]] = field(default_factory=list)
-    metrics: list[tuple[LogFile, MetricsJson]] = field(default_factory=list)
+    metrics: list[tuple[LogFile, list[dict[str, Any]]]] = field(default_factory=list)
+    """Rows of `read_metrics_json`."""
     metadata: list[tuple[LogFile, ModelMetadata]] = field(default_factory=list)
     hyperparameters: list[tuple[LogFile, dict[str, Any]]] = field(default_factory=list)
     reward: list[tuple[LogFile, str]] = field(default_factory=list)
@@ -75,20 +62,26 @@ class Parts:
     """Course by kind of job, from the files that start it."""
     files: list[LogFile] = field(default_factory=list)
     problems: list[LogProblem] = field(default_factory=list)
+    steps: list[tuple[Any, LogFile, StepTables]] = field(default_factory=list)
+    """The steps of all files, in the order in which they are dropped if there are too many."""
 
     @property
     def left_out(self) -> bool:
         """Whether steps were left out because there were too many."""
-        found = (*(trace.steps for trace in self.traces), *(log.steps for _, log in self.logs))
-        return any(steps.left_out for steps in found)
+        return any(steps.left_out for _, _, steps in self.steps)
 
-    def add(self, other: "Parts") -> None:
-        """Add the content of other files."""
-        for part in fields(self):
-            if part.name == "worlds":
-                self.worlds |= other.worlds
-            else:
-                getattr(self, part.name).extend(getattr(other, part.name))
+    def add_steps(self, file: LogFile, place: Place, is_csv: bool, age: int, steps: StepTables) -> None:
+        """Add the steps of a file; `age` sorts the files of one worker."""
+        # Those of logs precede those of CSVs, which have more digits.
+        key = (place.kind != TRAINING, is_csv, natural("/".join(place.root)), age, place.worker, file.order)
+        bisect.insort(self.steps, (key, file, steps), key=lambda one: one[0])
+
+    def drop_first_steps(self) -> None:
+        """Drop the first steps of all files while there are too many."""
+        rows = sum(steps.rows for _, _, steps in self.steps)
+        for _, _, steps in self.steps:
+            while steps.rows and rows > sim_trace.MOST_STEPS:
+                rows -= steps.drop_first()
 
     def refuse(self, file: LogFile, refused: list[tuple[int | None, str]]) -> None:
         """List what cannot be read in a file."""
@@ -105,94 +98,32 @@ class Parts:
 def read_parts(folder: LogFolder) -> Parts:
     """Read every file that may hold data, each by itself."""
     alone = len(folder.files) == 1
-    whole = Parts(problems=list(folder.problems))
+    parts = Parts(problems=list(folder.problems))
     others: list[LogFile] = []
-    limit = _StepLimit()
-    # The members of an archive are read from one stream.
-    with ThreadPoolExecutor(_THREADS if folder.parallel else 1) as pool:
-        found = _in_turn(pool, lambda file: _read_one(file, alone), folder.files)
-        for file, (parts, known) in zip(folder.files, found, strict=True):
-            whole.add(parts)
-            limit.add(parts)
-            if known:
-                whole.files.append(file)
-            elif not parts.problems and not _BESIDE.fullmatch(file.name):
-                others.append(file)
-    whole.problems += limit.problems()
+    for file in folder.files:
+        listed = len(parts.problems)
+        try:
+            known = _read(parts, file, alone)
+        except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
+            known = False
+            reason = reason_of(error).removeprefix(f"{file.path}: ")
+            parts.problems.append(LogProblem(str(file.path), None, reason))
+        parts.drop_first_steps()
+        if known:
+            parts.files.append(file)
+        elif len(parts.problems) == listed and not _BESIDE.fullmatch(file.name):
+            others.append(file)
+    parts.problems += [
+        LogProblem(str(file.path), None, sim_trace.left_out_reason(steps.left_out), lines=steps.left_out)
+        for _, file, steps in parts.steps
+        if steps.left_out
+    ]
     if others:
         named = ", ".join("/".join(file.parts[-2:]) for file in others[:_MOST_NAMED])
         more = ", …" if len(others) > _MOST_NAMED else ""
         reason = f"not logs of the service: {named}{more}"
-        whole.problems.append(LogProblem(f"{len(others)} other files", None, reason))
-    return whole
-
-
-class _StepLimit:
-    """The steps of all files, in the order in which they are dropped if there are too many."""
-
-    def __init__(self) -> None:
-        self._steps: list[tuple[Any, LogFile, StepTables]] = []
-        self._next: list[tuple[Any, int]] = []
-        self._rows = 0
-
-    def add(self, parts: Parts) -> None:
-        """Add the content of one file, and drop the first steps of all while there are too many."""
-        for trace in parts.traces:
-            self._put((1, trace.place, trace.number or 0), trace.file, trace.steps)
-        for file, log in parts.logs:
-            # Before those of CSVs, which have more digits.
-            name, age = piece_of(file.name)
-            self._put((0, place_of((*file.parts[:-1], name)), age), file, log.steps)
-        while self._rows > sim_trace.MOST_STEPS:
-            _, first = self._next[0]
-            steps = self._steps[first][2]
-            if steps.rows:
-                self._rows -= steps.rows
-                steps.drop_first()
-                self._rows += steps.rows
-            else:
-                heapq.heappop(self._next)
-
-    def problems(self) -> list[LogProblem]:
-        """Return what was left out of each file."""
-        return [
-            LogProblem(str(file.path), None, sim_trace.left_out_reason(count), lines=count)
-            for _, file, steps in sorted(self._steps, key=lambda one: one[0])
-            if (count := steps.left_out)
-        ]
-
-    def _put(self, where: tuple[int, Place, int], file: LogFile, steps: StepTables) -> None:
-        if not (steps.rows or steps.left_out):
-            return
-        is_csv, place, age = where
-        key = (place.kind != TRAINING, is_csv, natural("/".join(place.root)), age, place.worker, file.order)
-        heapq.heappush(self._next, (key, len(self._steps)))
-        self._steps.append((key, file, steps))
-        self._rows += steps.rows
-
-
-def _in_turn(
-    pool: ThreadPoolExecutor, read: Callable[[LogFile], Result], files: Sequence[LogFile]
-) -> Iterator[Result]:
-    """Read files in parallel and yield their contents in order; only a few wait to be yielded."""
-    waiting: deque[Future[Result]] = deque()
-    for file in files:
-        waiting.append(pool.submit(read, file))
-        if len(waiting) > _THREADS:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
-
-
-def _read_one(file: LogFile, alone: bool) -> tuple[Parts, bool]:
-    """Return the content of a file, and whether it was read."""
-    parts = Parts()
-    try:
-        return parts, _read(parts, file, alone)
-    except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
-        reason = " ".join(str(error).split()).removeprefix(f"{file.path}: ")
-        parts.problems.append(LogProblem(str(file.path), None, reason or type(error).__name__))
-        return parts, False
+        parts.problems.append(LogProblem(f"{len(others)} other files", None, reason))
+    return parts
 
 
 def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
@@ -208,9 +139,9 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         return True
     if name.endswith(".json") and not _BESIDE.fullmatch(name):
         with file.open() as stream:
-            metrics = read_metrics_json(stream)
-        parts.metrics.append((file, metrics))
-        parts.refuse(file, [(None, reason) for reason in metrics.refused])
+            rows, refused = read_metrics_json(stream)
+        parts.metrics.append((file, rows))
+        parts.refuse(file, [(None, reason) for reason in refused])
         return True
     if name.startswith("reward_function") and name.endswith(".py"):
         parts.reward.append((file, file.head(SETTINGS_BYTES).decode("utf-8", "replace")))
@@ -226,14 +157,15 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
 def _read_csv(parts: Parts, file: LogFile) -> bool:
     with file.open() as stream:
         try:
-            trace = read_trace_csv(stream)
+            steps, refused = read_trace_csv(stream)
         except ValueError as error:
             reason = str(error)
         else:
-            number = _NUMBER.search(file.name)
-            place = place_of(file.parts)
-            parts.traces.append(TraceFile(file, place, int(number[1]) if number else None, trace.steps))
-            parts.refuse(file, trace.refused)
+            found = _NUMBER.search(file.name)
+            number, place = int(found[1]) if found else None, place_of(file.parts)
+            parts.traces.append(TraceFile(file, place, number, steps))
+            parts.add_steps(file, place, True, number or 0, steps)
+            parts.refuse(file, refused)
             return True
     # CloudWatch exports logs as CSV too.
     if reason != "empty" and _read_log(parts, file):
@@ -244,11 +176,13 @@ def _read_csv(parts: Parts, file: LogFile) -> bool:
 def _read_log(parts: Parts, file: LogFile) -> bool:
     with file.open() as stream:
         logs = read_training_logs(stream)
+    name, age = piece_of(file.name)
     for log in logs:
         parts.refuse(file, log.refused)
         if not log.recognised and not log.refused:
             raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
         parts.logs.append((file, log))
+        parts.add_steps(file, place_of((*file.parts[:-1], name)), False, age, log.steps)
     log = logs[0]  # all workers print the same settings
     if log.metadata is not None:
         try:
@@ -279,8 +213,12 @@ def _world(file: LogFile, raw: bytes) -> str:
     return world if isinstance(world, str) else ""
 
 
-def read_metrics_json(stream: IO[bytes]) -> MetricsJson:
+def read_metrics_json(stream: IO[bytes]) -> tuple[list[dict[str, Any]], list[str]]:
     """Read the metrics of a training or of an evaluation.
+
+    Returns:
+        A row an episode, with the keys `episode` (from 0), `trial`, `phase`, `reward`, `completion`, `time_s`,
+        `episode_status`, `resets`; and the reasons why other items are none.
 
     Raises:
         ValueError: it holds no list of metrics, or cannot be read; the message gives the reason.
@@ -288,25 +226,24 @@ def read_metrics_json(stream: IO[bytes]) -> MetricsJson:
     try:
         raw = stream.read(_MOST_METRICS_BYTES + 1)
     except READ_ERRORS as error:
-        raise ValueError(f"cannot be read ({' '.join(str(error).split())})") from error
+        raise ValueError(f"cannot be read ({reason_of(error)})") from error
     if len(raw) > _MOST_METRICS_BYTES:
         raise ValueError(f"larger than {_MOST_METRICS_BYTES // 2**20} MiB")
     try:
         data = json.loads(raw.decode("utf-8-sig", "replace"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"not JSON ({' '.join(str(error).split())})") from error
+        raise ValueError(f"not JSON ({reason_of(error)})") from error
     items = data.get("metrics") if isinstance(data, dict) else None
     if not isinstance(items, list):
         raise ValueError('no metrics; accepted: {"metrics": [...]}')
-    metrics = MetricsJson()
+    rows, refused = [], []
     for number, item in enumerate(items):
         try:
-            metrics.rows.append(_episode_row(number, item))
+            rows.append(_episode_row(number, item))
         except (ValueError, TypeError, KeyError, OverflowError, AttributeError) as error:
-            metrics.refused.append(
-                f"metrics[{number}] is not an episode ({type(error).__name__}: {' '.join(str(error).split())})"
-            )
-    return metrics
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            refused.append(f"metrics[{number}] is not an episode ({reason})")
+    return rows, refused
 
 
 def _episode_row(number: int, item: dict[str, Any]) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from .recording import (
     readable,
     typed_table,
 )
-from .recording_parts import MetricsJson, Parts, TraceFile, read_parts
+from .recording_parts import Parts, TraceFile, read_parts
 from .training_log import TrainingLog, Update, join_rolled
 
 _KINDS = (TRAINING, "evaluation", "leaderboard")
@@ -377,25 +377,25 @@ class _Assembly:
         for of, own_worker, own in numbers if self.parts.left_out else ():
             begins[of, own_worker] = min(own, begins.get((of, own_worker), own))
         evaluations = self._evaluations()
-        for file, metrics in self.parts.metrics:
-            if not metrics.rows:
+        for file, episodes in self.parts.metrics:
+            if not episodes:
                 continue
-            if _of_training(file, metrics):
+            if _of_training(file, episodes):
                 worker, number = place_of(file.parts).worker, self._round(file, ())
                 if number is None:
                     continue
                 begin = begins.get((number, worker), math.inf if begins else 0)
-                gone = sum(row["episode"] < begin for row in metrics.rows)
+                gone = sum(row["episode"] < begin for row in episodes)
                 if gone:
                     self._leave_out(file, "episodes", gone)
-                counted = _iterations_by_trial(metrics.rows)
+                counted = _iterations_by_trial(episodes)
                 known = [
                     self.iteration_of[numbers[key]] - at
-                    for row, at in zip(metrics.rows, counted, strict=True)
+                    for row, at in zip(episodes, counted, strict=True)
                     if row["phase"] == TRAINING and (key := (number, worker, row["episode"])) in numbers
                 ]
                 shift = int(np.median(known)) if known else first.get(number, 0)
-                for row, at in zip(metrics.rows, counted, strict=True):
+                for row, at in zip(episodes, counted, strict=True):
                     if row["episode"] < begin:
                         continue
                     key = (number, worker, row["episode"])
@@ -411,10 +411,10 @@ class _Assembly:
                         stream = name
                         break
                 # A copy of another evaluation's folder.
-                if (stream, repr(metrics.rows)) in evaluated:
+                if (stream, repr(episodes)) in evaluated:
                     continue
-                evaluated.add((stream, repr(metrics.rows)))
-                rows += [{**row, "stream": stream, "worker": 0, "iteration": 0} for row in metrics.rows]
+                evaluated.add((stream, repr(episodes)))
+                rows += [{**row, "stream": stream, "worker": 0, "iteration": 0} for row in episodes]
         rows.sort(key=lambda row: (0, row["episode"]) if row["stream"] == TRAINING else (1, 0))
         return typed_table(METRICS_COLUMNS, rows)
 
@@ -453,11 +453,11 @@ def _behind(numbers: Numbers, key: tuple[int, int, int]) -> int:
     return key[2] if same else max(numbers.values()) + max(1, key[2] - own)
 
 
-def _of_training(file: LogFile, metrics: MetricsJson) -> bool:
+def _of_training(file: LogFile, episodes: Sequence[Mapping[str, Any]]) -> bool:
     name = file.name.lower()
     if "training" in name or "evaluation" in name:
         return name.rfind("training") > name.rfind("evaluation")
-    return any(row["phase"] == TRAINING for row in metrics.rows)
+    return any(row["phase"] == TRAINING for row in episodes)
 
 
 def _iterations(updates: Sequence[Update]) -> list[int]:

@@ -5,8 +5,7 @@ import math
 import re
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import IO, NamedTuple
+from typing import IO
 
 import numpy as np
 import pyarrow as pa
@@ -61,14 +60,6 @@ SCHEMA = pa.schema(
 """Columns of a table of rows; `values` is the number of values of the line."""
 
 
-class RefusedLine(NamedTuple):
-    """A line that is not a row of a trace."""
-
-    at: int
-    """Among the lines given."""
-    reason: str
-
-
 def left_out_reason(steps: int) -> str:
     """Return the message about steps that were left out because there are too many."""
     return f"{steps:,} steps are left out: only the last {MOST_STEPS:,} of a recording are kept"
@@ -98,11 +89,12 @@ class StepTables:
         while self.rows > MOST_STEPS and len(self._tables) > 1:
             self.drop_first()
 
-    def drop_first(self) -> None:
-        """Drop the first table: dropping a part of one would not free its memory."""
-        dropped = self._tables.popleft().num_rows
+    def drop_first(self) -> int:
+        """Drop the first table, and return its rows: dropping a part of it would not free its memory."""
+        dropped: int = self._tables.popleft().num_rows
         self.rows -= dropped
         self.left_out += dropped
+        return dropped
 
     @property
     def found(self) -> bool:
@@ -115,22 +107,18 @@ class StepTables:
         return pa.concat_tables(self._tables) if self._tables else SCHEMA.empty_table()
 
 
-@dataclass
-class TraceCsv:
-    """The rows of one CSV file."""
-
-    steps: StepTables = field(default_factory=StepTables)
-    refused: list[tuple[int | None, str]] = field(default_factory=list)
-    """Line (None: from an unknown line on) and reason of what is not a row."""
+Refused = list[tuple[int | None, str]]
+"""Line (None: from an unknown line on) and reason of what is not a row."""
 
 
-def read_trace_csv(stream: IO[bytes]) -> TraceCsv:
+def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
     """Read a CSV trace; several files one after the other, each with its header, are read as one.
 
     Raises:
         ValueError: the first line does not name the columns of a trace; the message names the missing ones.
     """
-    trace, blocks = TraceCsv(), Blocks(stream)
+    steps, blocks = StepTables(), Blocks(stream)
+    refused: Refused = []
     header: Sequence[str] | None = None
     for block in blocks:
         at, number = 0, blocks.lines + 1
@@ -145,13 +133,12 @@ def read_trace_csv(stream: IO[bytes]) -> TraceCsv:
         count = data.count(b"\n") + (not data.endswith(b"\n"))
         table = _read_fast(data, header, count) if data else SCHEMA.empty_table()
         if table is not None:
-            trace.steps.add(table)
+            steps.add(table)
         else:
-            header = _read_csv_lines(trace, data, number, header)
+            header = _read_csv_lines(steps, refused, data, number, header)
     if header is None:
         raise ValueError("empty" if not blocks.refused else blocks.refused[0][1])
-    trace.refused += blocks.refused
-    return trace
+    return steps, refused + blocks.refused
 
 
 def _column_names(line: bytes) -> list[str]:
@@ -162,15 +149,17 @@ def _column_names(line: bytes) -> list[str]:
     return names
 
 
-def _read_csv_lines(trace: TraceCsv, data: bytes, first: int, header: Sequence[str]) -> Sequence[str]:
+def _read_csv_lines(
+    steps: StepTables, refused: Refused, data: bytes, first: int, header: Sequence[str]
+) -> Sequence[str]:
     """Read lines of which some are not rows; return the header in force at the end."""
     lines: list[bytes] = []
     numbers: list[int] = []
 
     def flush() -> None:
-        table, refused = read_rows(lines, {len(header): header})
-        trace.steps.add(table)
-        trace.refused += [(numbers[one.at], one.reason) for one in refused]
+        table, bad = read_rows(lines, {len(header): header})
+        steps.add(table)
+        refused.extend((numbers[at], reason) for at, reason in bad)
         lines.clear()
         numbers.clear()
 
@@ -183,7 +172,7 @@ def _read_csv_lines(trace: TraceCsv, data: bytes, first: int, header: Sequence[s
             try:
                 header = _column_names(line)
             except ValueError as error:
-                trace.refused.append((number, str(error)))
+                refused.append((number, str(error)))
             continue
         lines.append(line)
         numbers.append(number)
@@ -193,7 +182,7 @@ def _read_csv_lines(trace: TraceCsv, data: bytes, first: int, header: Sequence[s
 
 def read_rows(
     lines: Sequence[bytes], layouts: Layouts, before: int | None = None
-) -> tuple[pa.Table, list[RefusedLine]]:
+) -> tuple[pa.Table, list[tuple[int, str]]]:
     """Read the lines of a trace.
 
     A single line with fewer values than its neighbours is incomplete, even if an older generation had so many.
@@ -204,7 +193,8 @@ def read_rows(
         before: how many values the line before the first had; None if there was none.
 
     Returns:
-        Rows in the order of lines with the columns of `SCHEMA`, and the lines that are not rows.
+        Rows in the order of lines with the columns of `SCHEMA`; and of the lines that are not rows, the index among
+        `lines` and the reason.
     """
     if not lines:
         return SCHEMA.empty_table(), []
@@ -213,7 +203,7 @@ def read_rows(
         return whole, []
     incomplete = _incomplete(np.array([line.count(b",") + 1 for line in lines]), before)
     refused = [
-        RefusedLine(at, f"incomplete: {lines[at].count(b',') + 1} values, fewer than the lines around it")
+        (at, f"incomplete: {lines[at].count(b',') + 1} values, fewer than the lines around it")
         for at in np.flatnonzero(incomplete).tolist()
     ]
     kept: list[int] = np.flatnonzero(~incomplete).tolist()
@@ -224,7 +214,7 @@ def read_rows(
         table = _read_chunk(chunk, layouts)
         if table is None:
             table, bad = _read_slowly(chunk, layouts)
-            refused += [RefusedLine(places[one.at], one.reason) for one in bad]
+            refused += [(places[at], reason) for at, reason in bad]
         tables.append(table)
     table = pa.concat_tables(tables) if tables else SCHEMA.empty_table()
     return table, sorted(refused)
@@ -326,14 +316,14 @@ def _actions(column: pa.ChunkedArray) -> pa.ChunkedArray | None:
     return numbers if np.isfinite(discrete).all() else None
 
 
-def _read_slowly(lines: Sequence[bytes], layouts: Layouts) -> tuple[pa.Table, list[RefusedLine]]:
+def _read_slowly(lines: Sequence[bytes], layouts: Layouts) -> tuple[pa.Table, list[tuple[int, str]]]:
     """Read line by line, and say what is wrong with those that are not rows."""
     rows, refused = [], []
     for index, line in enumerate(lines):
         try:
             rows.append(_row(line.decode("utf-8", "replace"), layouts))
         except ValueError as error:
-            refused.append(RefusedLine(index, str(error)))
+            refused.append((index, str(error)))
     return pa.Table.from_pylist(rows, schema=SCHEMA), refused
 
 

@@ -161,7 +161,7 @@ def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int |
     log.steps.add(table)
     if refused:
         starts = [found.start() for found in _TRACE.finditer(block)]
-        log.refused += [(_line(block, starts[one.at], lines_before), one.reason) for one in refused]
+        log.refused += [(_line(block, starts[at], lines_before), reason) for at, reason in refused]
     return int(lines[-1].count(b",")) + 1
 
 
