@@ -12,7 +12,6 @@ import tarfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, NamedTuple
 
@@ -48,21 +47,35 @@ class StoredModel(NamedTuple):
     source: str
     """The file of the weights, for messages."""
     name: str
-    """Of the checkpoint, `11_Step-38428.ckpt`, or of the frozen graph."""
-    is_graph: bool
-    """Whether it is a frozen graph, which has only the policy."""
+    """Of the checkpoint, `11_Step-38428.ckpt`, or of the frozen graph, which has only the policy."""
     files: Mapping[str, bytes]
     """Contents by their names in SMALL_FILES."""
     has_logs: bool
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
 class _Files:
-    path: str
-    sizes: Mapping[str, int]
-    """Bytes of each file, by its path below the model's folder or archive."""
-    open: Callable[[str], IO[bytes]]
+    """The files of a folder or archive; refuses paths that lead out of it, and too many or too large files."""
+
+    def __init__(self, path: str, opener: Callable[[str], IO[bytes]], most_bytes: float = LOG_BYTES) -> None:
+        self.path, self._open, self._most_bytes = path, opener, most_bytes
+        self.sizes: dict[str, int] = {}
+        """Bytes of each file, by its path below the model's folder or archive."""
+        self._given: dict[str, str] = {}
+        """Names as they are in the archive, which `opener` takes."""
+        self._total = 0
+
+    def add(self, name: str, size: int) -> None:
+        parts = PurePosixPath(name.replace("\\", "/"))
+        if parts.is_absolute() or ".." in parts.parts or re.match(r"[A-Za-z]:", name):
+            raise BadInput(f"{self.path}: {name}: leads out of the archive; accepted: {_ACCEPTED}")
+        self._total += size
+        if len(self.sizes) >= _MOST_FILES or self._total > self._most_bytes:
+            raise BadInput(
+                f"{self.path}: holds more than {_MOST_FILES:,} files or {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}"
+            )
+        self.sizes[parts.as_posix()] = size
+        self._given[parts.as_posix()] = name
 
     def read(self, name: str, most_bytes: int) -> bytes:
         """Return a file's content.
@@ -73,7 +86,7 @@ class _Files:
         size, where = self.sizes[name], f"{self.path}/{name}"
         if size > most_bytes:
             raise BadInput(f"{where}: has {size:,} bytes; such a file of a model has at most {most_bytes:,}")
-        with self.open(name) as file:
+        with self._open(self._given[name]) as file:
             raw = file.read(size + 1)
         if len(raw) != size:
             raise BadInput(f"{where}: has {len(raw):,} bytes and not {size:,}; copy it again")
@@ -111,21 +124,17 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
         raise BadInput(f"{files.path}: holds no model{lacking}; accepted: {_ACCEPTED}")
     chosen, note = _choose(files, whole or graphs, checkpoint)
     where, stem = f"{files.path}/{chosen}", PurePosixPath(chosen).name.removesuffix(INDEX)
+    tensors: Tensors
     if whole:
-        index = read_index(files.read(chosen, INDEX_BYTES), where)
+        entries = read_index(files.read(chosen, INDEX_BYTES), where)
         data = f"{chosen[: -len(INDEX)]}{DATA}"
-        tensors: Tensors
-        if files.sizes[data] != index.data_bytes:
-            raise BadInput(
-                f"{files.path}/{data}: has {files.sizes[data]:,} bytes; accepted: the {index.data_bytes:,} of its index"
-            )
-        tensors = read_tensors(index, files.read(data, DATA_BYTES), f"{files.path}/{data}")
+        tensors = read_tensors(entries, files.read(data, DATA_BYTES), f"{files.path}/{data}")
     else:
         tensors = read_weights(where, files.read(chosen, GRAPH_BYTES))
     found = {name: _nearest(files.sizes, name) for name in SMALL_FILES}
     small = {name: files.read(at, SETTINGS_BYTES) for name, at in found.items() if at is not None}
     has_logs = any(map(_LOGS.search, files.sizes))
-    return StoredModel(tensors, where, stem, not whole, small, has_logs, (note,) if note else ())
+    return StoredModel(tensors, where, stem, small, has_logs, (note,) if note else ())
 
 
 def _nearest(names: Mapping[str, int], wanted: str) -> str | None:
@@ -197,73 +206,50 @@ def _opened(path: str) -> Iterator[_Files]:
         raise BadInput(f"{path}: is no archive; accepted: {_ACCEPTED}")
 
 
-class _Listing:
-    """The files found so far; refuses paths that lead out of the archive, and too many or too large files."""
-
-    def __init__(self, path: str, most_bytes: float = LOG_BYTES) -> None:
-        self.path, self._most_bytes = path, most_bytes
-        self.sizes: dict[str, int] = {}
-        self.given: dict[str, str] = {}
-        """Names as they are in the archive."""
-        self._total = 0
-
-    def add(self, name: str, size: int) -> None:
-        parts = PurePosixPath(name.replace("\\", "/"))
-        if parts.is_absolute() or ".." in parts.parts or re.match(r"[A-Za-z]:", name):
-            raise BadInput(f"{self.path}: {name}: leads out of the archive; accepted: {_ACCEPTED}")
-        self._total += size
-        if len(self.sizes) >= _MOST_FILES or self._total > self._most_bytes:
-            raise BadInput(
-                f"{self.path}: holds more than {_MOST_FILES:,} files or {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}"
-            )
-        self.sizes[parts.as_posix()] = size
-        self.given[parts.as_posix()] = name
-
-    def files(self, opener: Callable[[str], IO[bytes]]) -> _Files:
-        """Return the files; `opener` takes the names as they were added."""
-        return _Files(self.path, self.sizes, lambda name: opener(self.given[name]))
-
-
 def _folder(path: str) -> _Files:
     """List the files of a folder; links are not followed."""
-    listing = _Listing(path, math.inf)
+
+    def opened(name: str) -> IO[bytes]:
+        return Path(path, name).open("rb")
+
+    files = _Files(path, opened, math.inf)
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder, name)
             found = file.lstat()
             if stat.S_ISREG(found.st_mode):
-                listing.add(file.relative_to(path).as_posix(), found.st_size)
-    return listing.files(lambda name: Path(path, name).open("rb"))
+                files.add(file.relative_to(path).as_posix(), found.st_size)
+    return files
 
 
 def _zip(path: str, packed: zipfile.ZipFile) -> _Files:
-    listing = _Listing(path)
+    files = _Files(path, packed.open)
     for member in packed.infolist():
         if stat.S_ISLNK(member.external_attr >> 16):
             raise _link(path, member.filename)
         if not member.is_dir():
-            listing.add(member.filename, member.file_size)
-    return listing.files(packed.open)
+            files.add(member.filename, member.file_size)
+    return files
 
 
 def _tar(path: str, archive: tarfile.TarFile) -> _Files:
-    listing = _Listing(path)
     members: dict[str, tarfile.TarInfo] = {}
-    while (member := archive.next()) is not None:
-        if member.islnk() or member.issym():
-            raise _link(path, member.name)
-        if member.isfile():
-            listing.add(member.name, member.size)
-            members[member.name] = member  # the later one counts, as in unpacking
-        elif not member.isdir():
-            raise BadInput(f"{path}: {member.name}: is no file; accepted: {_ACCEPTED}")
 
     def opened(name: str) -> IO[bytes]:
         stream = archive.extractfile(members[name])
         assert stream is not None
         return stream
 
-    return listing.files(opened)
+    files = _Files(path, opened)
+    while (member := archive.next()) is not None:
+        if member.islnk() or member.issym():
+            raise _link(path, member.name)
+        if member.isfile():
+            files.add(member.name, member.size)
+            members[member.name] = member  # the later one counts, as in unpacking
+        elif not member.isdir():
+            raise BadInput(f"{path}: {member.name}: is no file; accepted: {_ACCEPTED}")
+    return files
 
 
 def _link(path: str, name: str) -> BadInput:

@@ -9,7 +9,6 @@
 import math
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import google_crc32c
@@ -31,7 +30,7 @@ DATA_BYTES = 2**30
 _MOST_TENSORS = 1000
 _MAGIC = bytes.fromhex("57fb808b247547db")
 _RESTART_EVERY = 16
-_FOOTER_BYTES, _TRAILER_BYTES = 48, 5
+_FOOTER_BYTES = 48
 _FLOAT = 1  # types.proto
 _HEADER = field(1, 1) + field(3, field(1, 1))
 """BundleHeaderProto: one shard, little-endian, version 1."""
@@ -50,21 +49,8 @@ class Entry(NamedTuple):
     """Of types.proto."""
 
 
-@dataclass(frozen=True)
-class Index:
-    """What an `.index` holds."""
-
-    entries: Mapping[str, Entry]
-    """By name, in the order of the names."""
-
-    @property
-    def data_bytes(self) -> int:
-        """Size of the data file."""
-        return max(entry.offset + entry.size for entry in self.entries.values())
-
-
-def read_index(raw: bytes, where: str) -> Index:
-    """Read an `.index`.
+def read_index(raw: bytes, where: str) -> dict[str, Entry]:
+    """Return the entries of an `.index` by name, in the order of the names.
 
     Args:
         raw: its content, at most `INDEX_BYTES`.
@@ -78,21 +64,20 @@ def read_index(raw: bytes, where: str) -> Index:
         _check_places(entries)
     except (ValueError, struct.error) as error:
         raise BadInput(f"{where}: {error}; accepted: the .index of a TensorFlow checkpoint") from error
-    return Index(entries)
+    return entries
 
 
-def read_tensors(index: Index, data: bytes, where: str) -> dict[str, Array]:
+def read_tensors(entries: Mapping[str, Entry], data: bytes, where: str) -> dict[str, Array]:
     """Return the float32 tensors of a data file, views of its bytes; those of other types are counters.
 
     Raises:
         BadInput: the file is not the one of the index, or corrupt.
     """
-    if len(data) != index.data_bytes:
-        raise BadInput(
-            f"{where}: has {len(data):,} bytes; accepted: the {index.data_bytes:,} of the checkpoint's index"
-        )
+    size = max(entry.offset + entry.size for entry in entries.values())
+    if len(data) != size:
+        raise BadInput(f"{where}: has {len(data):,} bytes; accepted: the {size:,} of the checkpoint's index")
     tensors = {}
-    for name, entry in index.entries.items():
+    for name, entry in entries.items():
         part = memoryview(data)[entry.offset : entry.offset + entry.size]
         if masked_crc32c(part) != entry.crc:
             raise BadInput(f"{where}: {name}: corrupt, its checksum is wrong; copy the file again")

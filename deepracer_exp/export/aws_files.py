@@ -10,7 +10,7 @@ from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import LIDARS, LidarSectors, ModelMetadata, model_metadata_text
-from deepracer_exp.env.action_space import ActionSpace, metadata_of
+from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import writing
 
 CONSOLE_ACTIONS = (2, 30)
@@ -18,13 +18,13 @@ CONSOLE_STEERING_DEG = (-30.0, 30.0)
 CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
 
 
-def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tuple[dict[str, str], list[str]]:
+def aws_files(experiment: Experiment, reward: str) -> tuple[dict[str, str], list[str]]:
     """Return the texts of an experiment's files by name, and a note on each value changed or beyond the console.
 
     Hyperparameters are clipped to the console's ranges. The action space is kept, because a policy only fits its own.
     `reward` is the text of the reward function, with its constants filled in.
     """
-    metadata = replace(metadata_of(actions), **sensor_keys(experiment.observation))
+    metadata = services_metadata(experiment)
     learning, changed = _hyperparameters(experiment)
     texts = {
         "reward_function.py": reward,
@@ -32,6 +32,12 @@ def aws_files(experiment: Experiment, actions: ActionSpace, reward: str) -> tupl
         "hyperparameters.json": hyperparameters_text(learning),
     }
     return texts, [*_action_notes(metadata), *changed]
+
+
+def services_metadata(experiment: Experiment) -> ModelMetadata:
+    """Return the action space and the sensors of an experiment in the service's terms."""
+    actions = metadata_of(build_action_space(experiment.action_space))
+    return replace(actions, **sensor_keys(experiment.observation))
 
 
 def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:

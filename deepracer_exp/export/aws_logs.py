@@ -1,12 +1,10 @@
 """Export the logs of a run as the service would have written them, for existing tools."""
 
-import itertools
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,10 +13,9 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import model_metadata_text
 from deepracer_exp.deepracer.recording import Recording
-from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput, count, writing
 
-from .aws_files import hyperparameters_of, sensor_keys, write_files
+from .aws_files import hyperparameters_of, services_metadata, write_files
 
 TRACE_HEADER = (
     "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
@@ -60,8 +57,7 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", recording.name)
     job = f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{recording.name}"
     learning = replace(hyperparameters_of(experiment), num_episodes_between_training=numbered.per_iteration)
-    actions = metadata_of(build_action_space(experiment.action_space))
-    metadata = model_metadata_text(replace(actions, **sensor_keys(experiment.observation)))
+    metadata = model_metadata_text(services_metadata(experiment))
     hyperparameters = hyperparameters_text(learning)
     head = _head(next(iter(experiment.tracks)), metadata, hyperparameters)
     texts = {
@@ -240,49 +236,35 @@ def _item(reward: float, begin_s: float, end_s: float, **more: Any) -> dict[str,
 def _write_trace(numbered: _Numbered, folder: Path, log: Path, head: str) -> None:
     """Write one CSV per iteration, in full precision, and the same rows into the log, rounded as the service does."""
     folder.mkdir(parents=True, exist_ok=True)
-    iteration_of = numbered.rows["trace_iteration"].to_numpy()
-    bounds = np.searchsorted(iteration_of, np.arange(numbered.iterations + 1))
     episodes, driven = numbered.episodes.itertuples(), 0
     with log.open("w", encoding="utf-8") as out:
         out.write(head)
-        for iteration, (begin, end) in enumerate(itertools.pairwise(bounds)):
-            if begin == end:
-                continue  # no episode ended in it, and tools do not expect a file without rows
-            with (folder / f"{iteration}-iteration.csv").open("w", encoding="utf-8") as trace:
-                driven = _write_rows(numbered.rows.iloc[begin:end], trace, out, episodes, driven)
+        # An iteration in which no episode ended gets no file: tools do not expect one without rows.
+        for iteration, rows in _trace(numbered.rows).groupby(numbered.rows["trace_iteration"]):
+            table = rows.assign(steps=rows["steps"].astype(np.float64))
+            table.to_csv(folder / f"{iteration}-iteration.csv", index=False)
+            for _, of_episode in rows.groupby("episode"):
+                out.writelines(map(_log_line, of_episode.itertuples()))
+                driven += len(of_episode)
+                episode: Any = next(episodes)
+                out.write(_episode_line(episode, driven, episode.reward) + "\n")
 
 
-def _write_rows(rows: pd.DataFrame, trace: TextIO, log: TextIO, episodes: Iterator[Any], driven: int) -> int:
-    trace.write(TRACE_HEADER + "\n")
-    last = np.diff(rows["number"].to_numpy(), append=-1) != 0
-    for (number, step, x, y, yaw, steer, speed, action, reward, done, wheels, progress, near, length, time_s,
-         status, pause), ends in zip(_values(rows), last.tolist(), strict=True):  # fmt: skip
-        trace.write(
-            f"{number},{step}.0,{x!r},{y!r},{yaw!r},{steer!r},{speed!r},{action},{reward!r},{done},{wheels},"
-            f"{progress!r},{near},{length!r},{time_s!r},{status},{pause!r}\n"
-        )
-        log.write(
-            f"SIM_TRACE_LOG:{number},{step},{x:.4f},{y:.4f},{yaw:.4f},{steer:.2f},{speed:.2f},{action},{reward:.4f},"
-            f"{done},{wheels},{progress:.4f},{near},{length:.2f},{time_s!r},{status},{pause:.2f}\n"
-        )
-        driven += 1
-        if ends:
-            episode = next(episodes)
-            log.write(_episode_line(episode, driven, episode.reward) + "\n")
-    return driven
-
-
-def _values(rows: pd.DataFrame) -> Iterator[tuple[Any, ...]]:
-    """Return the rows as Python values, in the order of `TRACE_HEADER`."""
-    columns = {
-        name: rows["number" if name == "episode" else name].tolist() for name in TRACE_HEADER.split(",")
-    }
+def _trace(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with the columns of `TRACE_HEADER`."""
+    table = rows.assign(episode=rows["number"])[TRACE_HEADER.split(",")]
     if rows["action"].isna().any():  # of a continuous action space, as the service has it
-        both = zip(columns["steer"], columns["throttle"], strict=True)
-        columns["action"] = [f"[{steer} {throttle}]" for steer, throttle in both]
-    else:
-        columns["action"] = rows["action"].astype(np.int64).tolist()
-    return zip(*columns.values(), strict=True)
+        both = zip(rows["steer"].tolist(), rows["throttle"].tolist(), strict=True)
+        return table.assign(action=[f"[{steer} {throttle}]" for steer, throttle in both])
+    return table.astype({"action": np.int64})
+
+
+def _log_line(row: Any) -> str:
+    return (
+        f"SIM_TRACE_LOG:{row.episode},{row.steps},{row.X:.4f},{row.Y:.4f},{row.yaw:.4f},{row.steer:.2f},"
+        f"{row.throttle:.2f},{row.action},{row.reward:.4f},{row.done},{row.all_wheels_on_track},{row.progress:.4f},"
+        f"{row.closest_waypoint},{row.track_len:.2f},{row.tstamp!r},{row.episode_status},{row.pause_duration:.2f}\n"
+    )
 
 
 def _notes(numbered: _Numbered, experiment: Experiment) -> list[str]:

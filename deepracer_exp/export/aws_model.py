@@ -4,7 +4,6 @@ import json
 import time
 from dataclasses import replace
 
-import numpy as np
 import torch
 import yaml
 
@@ -20,7 +19,6 @@ from deepracer_exp.deepracer.model_metadata import (
     NEURAL_NETWORKS,
     ModelMetadata,
     model_metadata_text,
-    read_model_metadata,
 )
 from deepracer_exp.deepracer.protobuf import field
 from deepracer_exp.deepracer.tf_checkpoint import DATA, INDEX, META, write_checkpoint
@@ -31,7 +29,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoints import StoredPolicy
 from deepracer_exp.tracks.track import Track
 
-from .aws_files import aws_files
+from .aws_files import aws_files, services_metadata
 
 _PIXELS = 160, 120
 _LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
@@ -50,8 +48,8 @@ def aws_model(
     Raises:
         BadInput: the service has no such network or sensors.
     """
-    texts, notes = aws_files(experiment, build_action_space(experiment.action_space), reward)
-    metadata = read_model_metadata("model_metadata.json", texts["model_metadata.json"].encode())
+    texts, notes = aws_files(experiment, reward)
+    metadata = services_metadata(experiment)
     _refuse_other_sensors(experiment, metadata)
     networks, note = _with_value(experiment, stored.networks)
     tensors = to_service(networks, metadata.sensor)
@@ -148,12 +146,10 @@ def _training_params(experiment: Experiment) -> tuple[str, list[str]]:
     if world is None:
         world = "reinvent_base"
         notes = [f"training_params.yaml: WORLD_NAME={world}, because {name} is no track of the service"]
-    x, y = Track.from_config(config, config.direction == "reversed").waypoints.T
-    signed_area = (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
     values = {
         "WORLD_NAME": world,
         "RACE_TYPE": "TIME_TRIAL",
-        "TRACK_DIRECTION_CLOCKWISE": bool(signed_area < 0),
+        "TRACK_DIRECTION_CLOCKWISE": Track.from_config(config).is_clockwise,
         "BODY_SHELL_TYPE": "deepracer",
         "CAR_COLOR": "White",
     }

@@ -22,7 +22,7 @@ from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.deepracer.car_controls import full_scale, steering_share, throttle
 from deepracer_exp.deepracer.graph_def import HEAD, POLICY_NETWORK, policy_graph, read_weights
 from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, model_metadata_text
-from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, metadata_of
+from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, build_action_space, metadata_of
 from deepracer_exp.env.real_car import car_refusals
 from deepracer_exp.errors import BadInput, RunFailed
 
@@ -69,7 +69,7 @@ def check_car(experiment: Experiment) -> None:
         )
 
 
-def car_archive(networks: "ActorCritic", experiment: Experiment, actions: ActionSpace) -> CarArchive:
+def car_archive(networks: "ActorCritic", experiment: Experiment) -> CarArchive:
     """Return the archive of a policy; the same policy gives the same bytes.
 
     Raises:
@@ -82,6 +82,7 @@ def car_archive(networks: "ActorCritic", experiment: Experiment, actions: Action
 
     observation, network = experiment.observation, experiment.network
     check_car(experiment)
+    actions = build_action_space(experiment.action_space)
     metadata, rescaling = car_actions(actions)
     metadata = replace(metadata, **sensor_keys(observation))
     notes = _notes(metadata.sensor)

@@ -108,7 +108,7 @@ def _car(run: StoredRun, checkpoint: str, path: Path) -> _Written:
             f"--output {path}: accepted: a file whose name ends in {ENDING}, as the car's console wants it"
         )
     stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
-    archive = car_archive(stored.networks, run.experiment, build_action_space(run.experiment.action_space))
+    archive = car_archive(stored.networks, run.experiment)
     _write(path, archive.content)
     return [path], [
         _checkpoint(stored),
@@ -147,7 +147,7 @@ def _reward(run: StoredRun) -> str:
 
 def _aws(run: StoredRun, folder: Path) -> _Written:
     reward = _reward(run)
-    texts, notes = aws_files(run.experiment, build_action_space(run.experiment.action_space), reward)
+    texts, notes = aws_files(run.experiment, reward)
     write_files(texts, folder)
     refused = [
         f"reward_function.py: the AWS console would reject it: {one}" for one in console_findings(reward)

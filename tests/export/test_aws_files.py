@@ -15,7 +15,7 @@ REWARD = "def reward_function(params):\n    return params['speed']\n"
 
 def files(*overrides: str) -> tuple[dict[str, str], list[str]]:
     experiment, _ = compose_experiment(overrides)
-    return aws_files(experiment, build_action_space(experiment.action_space), REWARD)
+    return aws_files(experiment, REWARD)
 
 
 @pytest.mark.parametrize("space", ["console", "discrete", "grid_fine", "continuous"])

@@ -71,7 +71,7 @@ def test_a_value_network_of_features_is_replaced_and_the_note_says_so():
     )
     assert any(note.startswith("value network: ") for note in notes)
     index = next(content for name, content in files.items() if name.endswith(".index"))
-    names = read_index(index, "index").entries
+    names = read_index(index, "index")
     assert {name for name in names if name not in to_service(networks, CAMERA)} == {
         name for name in names if name.startswith(f"{VALUE}/")
     }

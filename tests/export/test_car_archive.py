@@ -60,7 +60,7 @@ def exported(*overrides: str) -> Exported:
     with torch.no_grad():  # a fresh head's outputs hardly differ
         layers[-1].weight.mul_(300.0)
         layers[-1].bias.normal_(generator=generator)
-    return Exported(DeployedPolicy(networks, actions).eval(), car_archive(networks, experiment, actions))
+    return Exported(DeployedPolicy(networks, actions).eval(), car_archive(networks, experiment))
 
 
 small = functools.cache(exported)
