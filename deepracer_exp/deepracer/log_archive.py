@@ -159,9 +159,7 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
                 _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
                 yield found
             else:
-                yield LogFolder(
-                    [LogFile(path, path.resolve().parts[-3:], open_user_file, (path, _ACCEPTED, LOG_BYTES))]
-                )
+                yield LogFolder([_plain(path, path.resolve().parts[-3:])])
     except FileNotFoundError as error:
         raise BadInput(f"{path}: no such file or folder; accepted: {_ACCEPTED}") from error
     except (*READ_ERRORS, ValueError) as error:
@@ -189,8 +187,7 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
             elif entry.is_file() and _PACKED.search(entry.name):
                 packed.append(entry)
             elif entry.is_file():
-                parts = (*above, *entry.relative_to(root).parts)
-                found.files.append(LogFile(entry, parts, open_user_file, (entry, _ACCEPTED, LOG_BYTES)))
+                found.files.append(_plain(entry, (*above, *entry.relative_to(root).parts)))
     found.files.sort(key=lambda file: file.order)
     archives = opened.enter_context(contextlib.closing(_Archives()))
     for path in sorted(packed):
@@ -204,6 +201,10 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
         except (*READ_ERRORS, ValueError) as error:
             found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason_of(error)})"))
     return found
+
+
+def _plain(path: Path, parts: tuple[str, ...]) -> LogFile:
+    return LogFile(path, parts, open_user_file, (path, _ACCEPTED, LOG_BYTES))
 
 
 def _is_packed(path: Path) -> bool:
@@ -266,9 +267,7 @@ def _unpack(
         return
     if inside and not any(map(_may_hold_data, members.files)):
         found.problems += members.problems
-        found.files.append(
-            LogFile(path, (*beside, path.name), open_user_file, (path, _ACCEPTED, LOG_BYTES))
-        )  # perhaps a model for the car
+        found.files.append(_plain(path, (*beside, path.name)))  # perhaps a model for the car
         return
     found.problems += members.problems
     rest = [file for file in members.files if not inside or not _lies_beside(path, file)]

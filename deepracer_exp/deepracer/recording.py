@@ -123,7 +123,6 @@ class Round:
 
     name: str
     first_iteration: int
-    first_episode: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -92,7 +92,7 @@ class _Assembly:
         self.iteration_of: dict[int, int] = {}
         """Iteration of each training episode of the recording."""
         self.logs = join_rolled(parts.logs)
-        self.drives = [*self._drives_of_csv()]
+        self.drives = list(self._drives_of_csv())
         self.roots: dict[int, tuple[str, ...]] = {}
         self.jobs: dict[tuple[str, ...], tuple[str, ...]] = {}
         """Folder of the CSVs by the root of the text logs of the same training."""
@@ -118,20 +118,18 @@ class _Assembly:
         parts = self.parts
         worlds = [one.world for one in self.training if one.world]
         rounds = [
-            Round("/".join(root), *first[number])
-            for number, root in enumerate(self.rounds)
-            if number in first
+            Round("/".join(root), first[number]) for number, root in enumerate(self.rounds) if number in first
         ]
         steps = steps_of([*rows, *self._evaluation_rows()])
-        named = self._checkpoints({number: begin[0] for number, begin in first.items()})
+        named = self._checkpoints(first)
         counted = _counted_checkpoints(steps[steps["stream"] == TRAINING])
         if len(rounds) > 1 or any(counted.get(key, text) != text for key, text in named.items()):
             counted = {}
         return Recording(
             name=name,
             steps=steps,
-            updates=self._updates({number: begin[0] for number, begin in first.items()}),
-            metrics=self._metrics(numbers, {number: begin[0] for number, begin in first.items()}),
+            updates=self._updates(first),
+            metrics=self._metrics(numbers, first),
             metadata=_uppermost(parts.metadata),
             hyperparameters=self.settings or None,
             reward_source=_uppermost(parts.reward),
@@ -246,8 +244,8 @@ class _Assembly:
                 self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=count))
                 self.drives[number] = one.choose(~twice)
 
-    def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, tuple[int, int]]]:
-        """Return the rows, the numbers of the episodes, and the first iteration and episode of each round."""
+    def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, int]]:
+        """Return the rows, the numbers of the episodes, and the first iteration of each round."""
         place = {root: number for number, root in enumerate(self.rounds)}
         drives = sorted(self.training, key=lambda one: (place[one.place.root], one.place.worker))
         if not drives:
@@ -263,14 +261,14 @@ class _Assembly:
             rounds, worker, iteration = rounds[order], worker[order], iteration[order]
         raw, steps = (table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
         episode, numbers = number_episodes(rounds, worker, raw, iteration, steps)
-        first: dict[int, tuple[int, int]] = {}
+        first: dict[int, int] = {}
         so_far = 0
         for number in np.unique(rounds).tolist():
             of = rounds == number
             # An iteration has the number of the checkpoint that drove it, unless an earlier round has used it.
             so_far = max(so_far, self._base(number))
             iteration[of] += so_far
-            first[number] = (so_far, int(episode[of].min()))
+            first[number] = so_far
             so_far = int(iteration[of].max()) + 1
         self.iteration_of = dict(zip(episode.tolist(), iteration.tolist(), strict=True))
         worlds = [
