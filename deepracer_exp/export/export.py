@@ -48,11 +48,8 @@ def export(config: ExportConfig, output: str | None, out: Console) -> Path:
     run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     names = {"onnx": "policy.onnx", "car": name_on_car(run.path.name) + ENDING}
     path = Path(output or run.path / EXPORTS / names.get(config.format, config.format))
-    if config.format in ("aws", "aws-logs"):
-        files, lines = _aws(run, path) if config.format == "aws" else _aws_logs(run, path, config.layout)
-    else:
-        write = {"onnx": _onnx, "car": _car, "aws-model": _aws_model}[config.format]
-        files, lines = write(run, run.choose_checkpoint(config.checkpoint), path)
+    write = {"onnx": _onnx, "car": _car, "aws": _aws, "aws-model": _aws_model, "aws-logs": _aws_logs}
+    files, lines = write[config.format](run, config, path)
     for line in (*map(str, files), *(f"  {line}" for line in lines)):
         out.print(line, soft_wrap=True)
     return path
@@ -62,10 +59,14 @@ _Written = tuple[Iterable[Path], list[str]]
 """Files or folders, and lines on them."""
 
 
-def _onnx(run: StoredRun, checkpoint: str, path: Path) -> _Written:
+def _stored(run: StoredRun, config: ExportConfig) -> StoredPolicy:
+    return read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
+
+
+def _onnx(run: StoredRun, config: ExportConfig, path: Path) -> _Written:
     if path.is_dir():
         raise BadInput(f"--output {path}: is a folder; give a file, e.g. {path / 'policy.onnx'}")
-    stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
+    stored = _stored(run, config)
     actions = build_action_space(run.experiment.action_space)
     torch.set_num_threads(1)
     facts: dict[str, Any] = {
@@ -102,12 +103,12 @@ def _checkpoint(stored: StoredPolicy) -> str:
     return f"checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}"
 
 
-def _car(run: StoredRun, checkpoint: str, path: Path) -> _Written:
+def _car(run: StoredRun, config: ExportConfig, path: Path) -> _Written:
     if not path.name.endswith(ENDING) or path.is_dir():
         raise BadInput(
             f"--output {path}: accepted: a file whose name ends in {ENDING}, as the car's console wants it"
         )
-    stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
+    stored = _stored(run, config)
     archive = car_archive(stored.networks, run.experiment)
     _write(path, archive.content)
     return [path], [
@@ -126,14 +127,14 @@ def _write(path: Path, content: bytes) -> None:
         atomic_write(path, content)
 
 
-def _aws_logs(run: StoredRun, folder: Path, layout: str) -> _Written:
+def _aws_logs(run: StoredRun, config: ExportConfig, folder: Path) -> _Written:
     recording = read_own_recording(run.path)
-    notes = write_aws_logs(recording, run.experiment, folder, layout)
+    notes = write_aws_logs(recording, run.experiment, folder, config.layout)
     return [folder], [*notes, *map(str, recording.problems)]
 
 
-def _aws_model(run: StoredRun, checkpoint: str, folder: Path) -> _Written:
-    stored = read_checkpoint(run.experiment, run.checkpoints, checkpoint)
+def _aws_model(run: StoredRun, config: ExportConfig, folder: Path) -> _Written:
+    stored = _stored(run, config)
     result = read_result(run.path)
     score = result.completion if result and result.iteration == stored.counters["iteration"] else None
     files, notes = aws_model(run.experiment, stored, _reward(run), score)
@@ -145,7 +146,7 @@ def _reward(run: StoredRun) -> str:
     return read_text(run.path / REWARD, "the reward function that the run was trained with")
 
 
-def _aws(run: StoredRun, folder: Path) -> _Written:
+def _aws(run: StoredRun, _: ExportConfig, folder: Path) -> _Written:
     reward = _reward(run)
     texts, notes = aws_files(run.experiment, reward)
     write_files(texts, folder)
