@@ -78,6 +78,14 @@ def test_a_value_network_of_features_is_replaced_and_the_note_says_so():
     assert yaml.safe_load(files["training_params.yaml"])["TRACK_DIRECTION_CLOCKWISE"] is True
 
 
+@pytest.mark.parametrize(("direction", "is_clockwise"), [("forward", False), ("reversed", True)])
+def test_an_open_course_is_clockwise_against_its_waypoints(direction, is_clockwise):
+    _, files, _ = written(
+        *("observation=camera", "network=shallow", "track=Straight_track", f"track.direction={direction}")
+    )
+    assert yaml.safe_load(files["training_params.yaml"])["TRACK_DIRECTION_CLOCKWISE"] is is_clockwise
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
