@@ -249,11 +249,15 @@ def write_archive(files: dict[str, str], path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tarfile.open(path, "w:gz") as archive:
         for name in sorted(files, key=lambda name: name[::-1]):
-            member = tarfile.TarInfo(f"model/{name}")
-            raw = files[name].encode()
-            member.size = len(raw)
-            archive.addfile(member, io.BytesIO(raw))
+            add_member(archive, f"model/{name}", files[name].encode())
     return path
+
+
+def add_member(archive: tarfile.TarFile, name: str, raw: bytes) -> None:
+    """Add a file to an archive."""
+    member = tarfile.TarInfo(name)
+    member.size = len(raw)
+    archive.addfile(member, io.BytesIO(raw))
 
 
 def training(recording: Recording) -> pd.DataFrame:

@@ -132,12 +132,7 @@ def test_the_first_iterations_of_several_workers_are_dropped(tmp_path, most_step
 def test_what_is_known_of_steps_that_are_left_out_is_left_out_and_counted(tmp_path, most_steps):
     rounds = {
         name: {
-            **{
-                f"sim-trace/training/training-simtrace/{n}-iteration.csv": made.csv_text(
-                    made.drives([2 * n, 2 * n + 1], seed=100 * seed + n)
-                )
-                for n in range(3)
-            },
+            **made.training_csvs("sim-trace/training/training-simtrace", seed=100 * seed),
             f"logs/training/training-2024010{seed}101010-a-sagemaker.log": made.trainer_text(3),
             f"metrics/training/training-2024010{seed}101010-a.json": made.training_metrics(
                 made.drives(range(6), seed=seed)

@@ -2,7 +2,6 @@
 
 import bz2
 import gzip
-import io
 import lzma
 import resource
 import tarfile
@@ -29,10 +28,7 @@ def test_an_archive_reaches_nothing_outside_and_leaves_nothing_behind(tmp_path):
             link.type, link.linkname = kind, str(tmp_path / "secret.csv")
             archive.addfile(link)
         for name in ("../../1-iteration.csv", f"{tmp_path}/2-iteration.csv"):
-            raw = made.csv_text(made.drives([1 if "1-" in name else 2])).encode()
-            member = tarfile.TarInfo(name)
-            member.size = len(raw)
-            archive.addfile(member, io.BytesIO(raw))
+            made.add_member(archive, name, made.csv_text(made.drives([1 if "1-" in name else 2])).encode())
     before = sorted(tmp_path.parent.rglob("*"))
     recording = read_recording(path)
     assert sorted(tmp_path.parent.rglob("*")) == before
@@ -78,9 +74,7 @@ def test_what_is_missing_beside_an_archive_is_read_out_of_it(tmp_path):
     assert len(some) == len(other) == 1
     made.write_folder(some | other, tmp_path / "elsewhere" / "model")
     whole = read_recording(tmp_path / "week-one.tar.gz")
-    for name in some | other:
-        (tmp_path / "model" / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "model" / name).write_text((some | other)[name])
+    made.write_folder(some | other, tmp_path / "model")
     recording = read_recording(tmp_path / "week-one.tar.gz")
     assert len(recording.steps) == len(whole.steps)
     rest = read_recording(tmp_path)
@@ -104,10 +98,7 @@ def test_names_of_members_count_as_unpacked_and_archives_are_no_workers(tmp_path
     path = tmp_path / "a.tar"
     with tarfile.open(path, "w") as archive:
         for name, seed in (("x/0-iteration.csv", 1), ("./x/0-iteration.csv", 2)):
-            raw = made.csv_text(made.drives([0], seed=seed)).encode()
-            member = tarfile.TarInfo(name)
-            member.size = len(raw)
-            archive.addfile(member, io.BytesIO(raw))
+            made.add_member(archive, name, made.csv_text(made.drives([0], seed=seed)).encode())
     last = made.drives([0], seed=2)
     assert read_recording(path).steps["X"].tolist() == last["X"].tolist()
     for number in (1, 2):
@@ -128,10 +119,8 @@ def test_logs_of_any_name_are_read_in_an_archive_packed_or_not(tmp_path):
         folder = tmp_path / str(number)
         folder.mkdir()
         with tarfile.open(folder / "LOGS.TAR.GZ", "w:gz") as archive:
-            raw = gzip.compress(text.encode()) if name.endswith("GZ") else text.encode()
-            member = tarfile.TarInfo(name)
-            member.size = len(raw)
-            archive.addfile(member, io.BytesIO(raw))
+            raw = text.encode()
+            made.add_member(archive, name, gzip.compress(raw) if name.endswith("GZ") else raw)
         for place in (folder, folder / "LOGS.TAR.GZ"):
             recording = read_recording(place)
             assert len(recording.steps) == 6, (place, name)

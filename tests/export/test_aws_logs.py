@@ -80,10 +80,14 @@ def loaded(folder, layout: str, caplog) -> DeepRacerLog:
     return log
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_deepracer_utils_loads_the_rows_of_our_trace(run, exported, layout, caplog):
-    theirs = loaded(exported[layout][0], layout, caplog).dataframe()
-    ours = finished(run.folder)
+@pytest.fixture(params=LAYOUTS)
+def log(request, exported, caplog) -> DeepRacerLog:
+    """What deepracer-utils loads from a layout."""
+    return loaded(exported[request.param][0], request.param, caplog)
+
+
+def test_deepracer_utils_loads_the_rows_of_our_trace(run, log):
+    theirs, ours = log.dataframe(), finished(run.folder)
     assert len(theirs) == len(ours) > 1000
     for name in EXACT:
         assert theirs[name].tolist() == ours[name].tolist(), name
@@ -91,11 +95,11 @@ def test_deepracer_utils_loads_the_rows_of_our_trace(run, exported, layout, capl
     assert theirs["iteration"].tolist() == ours["iteration"].tolist()
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_deepracer_utils_counts_our_episodes(run, exported, layout, caplog):
-    theirs = loaded(exported[layout][0], layout, caplog).dataframe()
+def test_deepracer_utils_counts_our_episodes(run, log):
     ours = finished(run.folder)
-    episodes = AnalysisUtils.simulation_agg(theirs, firstgroup="iteration", secondgroup="unique_episode")
+    episodes = AnalysisUtils.simulation_agg(
+        log.dataframe(), firstgroup="iteration", secondgroup="unique_episode"
+    )
     own = ours.groupby(["iteration", "episode"], sort=True)
     assert episodes["iteration"].tolist() == [iteration for iteration, _ in own.groups]
     assert episodes["steps"].tolist() == own.size().tolist()
@@ -105,9 +109,7 @@ def test_deepracer_utils_counts_our_episodes(run, exported, layout, caplog):
     assert episodes["unique_episode"].is_unique
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_deepracer_utils_finds_hyperparameters_and_action_space(run, exported, layout, caplog):
-    log = loaded(exported[layout][0], layout, caplog)
+def test_deepracer_utils_finds_hyperparameters_and_action_space(run, log):
     per_iteration = finished(run.folder).groupby("iteration")["episode"].nunique().max()
     assert log.hyperparameters()["num_episodes_between_training"] == per_iteration
     # As trained, though the console takes no such values.

@@ -65,15 +65,10 @@ def test_what_cannot_be_exported_is_refused_in_one_line(call, arguments, words):
     [
         (["format=onnx", "checkpoint=77"], "000077 is not there"),
         (["format=onnx", "-o", "."], "is a folder; give a file"),
+        (["format=aws-model"], "observation: has no camera"),
     ],
 )
 def test_what_a_run_does_not_have_is_refused(trained, call, arguments, words):
     ended = call("export", str(trained().folder), *arguments)
     assert ended.code == 2
     assert words in ended.complaint
-
-
-def test_a_run_that_the_service_has_no_network_for_is_refused(trained, call):
-    ended = call("export", str(trained().folder), "format=aws-model")
-    assert ended.code == 2
-    assert "observation: has no camera" in ended.complaint
