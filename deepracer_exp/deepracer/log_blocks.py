@@ -31,7 +31,6 @@ class Blocks:
 
     def __init__(self, stream: IO[bytes]) -> None:
         self.stream = stream
-        self.size = SIZE
         self._ended = False
         self._bytes = 0
         self.lines = 0
@@ -77,13 +76,13 @@ class Blocks:
     def _read(self) -> bytes:
         # In pieces: a truncated archive loses only the piece that fails, not what was read before.
         pieces, size = [], 0
-        while size < self.size and not self._ended:
+        while size < SIZE and not self._ended:
             if self._bytes > LOG_BYTES:
                 self.refused.append((None, f"longer than {LOG_BYTES // 2**30} GiB; the rest is not read"))
                 self._ended = True
                 break
             try:
-                piece = self.stream.read(min(_PIECE, self.size - size))
+                piece = self.stream.read(min(_PIECE, SIZE - size))
             except READ_ERRORS as error:
                 self.refused.append((None, f"cannot be read to its end ({reason_of(error)})"))
                 self._ended = True

@@ -13,14 +13,12 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import model_metadata_text
 from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.deepracer.sim_trace import LOG_LAYOUTS
 from deepracer_exp.errors import BadInput, count, writing
 
 from .aws_files import hyperparameters_of, services_metadata, write_files
 
-TRACE_HEADER = (
-    "episode,steps,X,Y,yaw,steer,throttle,action,reward,done,all_wheels_on_track,progress,closest_waypoint,"
-    "track_len,tstamp,episode_status,pause_duration"
-)
+TRACE_HEADER = ",".join(LOG_LAYOUTS[17])
 """Columns of the console's training traces of 2022; tools read a log line of 18 fields differently."""
 LABELS = {
     "lap_complete": "Lap complete",
