@@ -25,24 +25,8 @@ from deepracer_exp.deepracer.model_metadata import (
     read_model_metadata,
 )
 from deepracer_exp.errors import BadInput
+from tests.config.conftest import HYPERPARAMETERS as DRFC
 
-# deepracer-for-cloud's own file.
-DRFC = {
-    "batch_size": 64,
-    "beta_entropy": 0.01,
-    "discount_factor": 0.99,
-    "e_greedy_value": 0.05,
-    "epsilon_steps": 10000,
-    "exploration_type": "categorical",
-    "loss_type": "huber",
-    "lr": 0.0003,
-    "num_episodes_between_training": 20,
-    "num_epochs": 5,
-    "stack_size": 1,
-    "term_cond_avg_score": 350.0,
-    "term_cond_max_episodes": 1000,
-    "sac_alpha": 0.2,
-}
 SENSORS = ["FRONT_FACING_CAMERA", "DISCRETIZED_SECTOR_LIDAR"]
 DISCRETE = [{"steering_angle": -30, "speed": 0.6}, {"steering_angle": 30, "speed": 1.2}]
 CONTINUOUS = {"steering_angle": {"low": -20, "high": 30}, "speed": {"low": 1, "high": 2}}

@@ -24,7 +24,7 @@ RECORDINGS = {
 }
 
 
-@pytest.fixture(params=RECORDINGS)
+@pytest.fixture(scope="module", params=RECORDINGS)
 def recorded(request, reference):
     """Return a world, the places recorded on it and the closest waypoint recorded with each."""
     steps = read_recording(reference / request.param).steps
