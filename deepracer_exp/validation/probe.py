@@ -135,19 +135,18 @@ def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
     Only functions of which some line was executed are considered; error handling is left out: handlers, `raise`,
     `assert`.
     """
-    missed: list[tuple[int, int]] = []
+    spans: list[tuple[int, int]] = []
     for function in ast.walk(ast.parse(text)):
-        if not isinstance(function, ast.FunctionDef):
-            continue
-        own = range(function.body[0].lineno, (function.end_lineno or 0) + 1)
-        if lines.isdisjoint(own):
-            continue
-        for first, last in _missed(function.body, lines):
-            if missed and missed[-1][1] >= first - 1:
-                missed[-1] = missed[-1][0], max(last, missed[-1][1])
-            else:
-                missed.append((first, last))
-    return sorted(missed)
+        if isinstance(function, ast.FunctionDef):
+            own = range(function.body[0].lineno, (function.end_lineno or 0) + 1)
+            spans += [] if lines.isdisjoint(own) else _missed(function.body, lines)
+    missed: list[tuple[int, int]] = []
+    for first, last in sorted(spans):  # functions in classes and in functions are walked last
+        if missed and missed[-1][1] >= first - 1:
+            missed[-1] = missed[-1][0], max(last, missed[-1][1])
+        else:
+            missed.append((first, last))
+    return missed
 
 
 def _missed(body: list[ast.stmt], lines: set[int]) -> Iterator[tuple[int, int]]:
