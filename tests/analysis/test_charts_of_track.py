@@ -170,7 +170,10 @@ def test_the_fastest_lap_is_drawn_and_its_sectors_make_its_time(view: LogView) -
 
 def test_a_car_on_the_centre_line_is_away_from_the_racing_line_by_the_lines_own_offset() -> None:
     view = prepare(made_up_recording([Drive(speed_mps=0.5)]))
-    median = next(one.y for one in layers(racing_line(view).rows[1][0], "line") if one.name == "median")
+    chart = racing_line(view)
+    assert "1 complete lap, median" in [one.name for one in layers(chart, "line")]
+    assert layers(sector_times(view), "bars")[0].name == "median of 1 complete lap"
+    median = next(one.y for one in layers(chart.rows[1][0], "line") if one.name == "median")
     line = minimum_curvature_line(view.course)
     expected = -line.at(np.linspace(0.0, 1.0, 1000), line.offset_m)
     assert (median.min(), median.max()) == pytest.approx((expected.min(), expected.max()), abs=0.02)

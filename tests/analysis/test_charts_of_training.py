@@ -191,6 +191,7 @@ def test_one_lap_is_a_histogram_without_chances() -> None:
     chart = lap_time_histogram(prepare(made_up_recording([Drive()])))
     assert len(layers(chart, "mark")) == 2
     assert layers(chart, "bars")[0].y.sum() == 1
+    assert chart.caption.startswith("No chances can be estimated from 1 complete lap:")
 
 
 def test_stars_are_the_candidates_for_submission(lapping: LogView) -> None:

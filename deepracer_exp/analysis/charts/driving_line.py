@@ -8,6 +8,7 @@ from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_way
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
 from deepracer_exp.analysis.sectors import sectors_of, times_by_sector
 from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
+from deepracer_exp.errors import count
 
 from .figure import Chart, Layer, Panel, band, bars, colored_points, line, note, points
 from .maps import LEAST_STEPS, Grid, beside, map_panel, waypoint_panel
@@ -60,7 +61,7 @@ def sector_times(view: LogView) -> Chart | None:
     x = np.arange(len(sectors))
     panel = Panel(
         layers=[
-            bars(x, times.median() - best_s, PALE, f"median of {len(times)} complete laps"),
+            bars(x, times.median() - best_s, PALE, f"median of {count(len(times), 'complete lap')}"),
             points(x, fastest_s - best_s, VERMILION, "fastest lap", size=12.0, symbol="diamond"),
         ],
         x_names=list(times),
@@ -243,7 +244,7 @@ def _laps_or_recent(view: LogView, *columns: str) -> tuple[pd.DataFrame, str]:
     """Return the rows of complete laps, or without any those of the last third, and which they are."""
     complete = view.episodes["complete"].to_numpy(bool)
     if complete.any():
-        return view.of_episodes(complete, *columns), f"{complete.sum()} complete laps"
+        return view.of_episodes(complete, *columns), count(int(complete.sum()), "complete lap")
     return view.recent(*columns), "last third of the iterations"
 
 

@@ -12,6 +12,7 @@ from deepracer_exp.analysis.candidates import candidates_of
 from deepracer_exp.analysis.log_view import LogView, thirds
 from deepracer_exp.analysis.sectors import Sector, sectors_of, time_lost
 from deepracer_exp.analysis.statistics import Values, histogram, subsample
+from deepracer_exp.errors import count
 
 from .figure import Chart, Layer, Panel, bars, colored_points, in_rows, line, mark, points
 from .style import BLUE, FAINT, GREEN, ORANGE, PALE, SKY, VERMILION
@@ -87,7 +88,8 @@ def _deviation(times_s: Values) -> float:
 def _chances_in_words(times_s: Values, late: bool) -> str:
     deviation = _deviation(times_s)
     if not deviation:
-        return f"There are only {len(times_s)} complete laps, too few to estimate chances."
+        laps = count(len(times_s), "complete lap")
+        return f"No chances can be estimated from {laps}: too few, or all of the same time."
     which = (
         f"the {len(times_s)} complete laps of the last third of the iterations"
         if late
