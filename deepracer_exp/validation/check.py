@@ -38,6 +38,8 @@ class Check:
     """Findings about one reward function."""
 
     setup: RaceSetup
+    against: Track
+    """The same track, driven the other way."""
     console: list[ConsoleFinding]
     tried: dict[str, Answer] = field(default_factory=dict)
     """The answers in the named situations."""
@@ -68,11 +70,16 @@ def read(experiment: Experiment) -> Check:
             f"track=[{names}]: a reward function is validated on one track; accepted: one of these"
         )
     setup = build_setup(experiment)
+    (track,) = experiment.tracks.values()
     # A track driven in both directions is checked in the first of them.
-    return Check(setup=setup.on(setup.track), console=console_findings(setup.reward.text))
+    return Check(
+        setup=setup.on(setup.track),
+        against=Track.from_config(track, reversed=track.direction != "reversed"),
+        console=console_findings(setup.reward.text),
+    )
 
 
-def try_named_situations(check: Check, against: Track) -> None:
+def try_named_situations(check: Check) -> None:
     """Call the function in the named situations, each time in a freshly loaded module, and add the results to `check`.
 
     Raises:
@@ -80,7 +87,7 @@ def try_named_situations(check: Check, against: Track) -> None:
     """
     setup = check.setup
     hangs = False
-    for case in named_situations(setup, against):
+    for case in named_situations(setup, check.against):
         probe = Probe(setup)
         answer = Answer(float("nan"), NOT_CALLED) if hangs else _act(probe, case)
         if probe.failures:
@@ -102,7 +109,7 @@ def _act(probe: Probe, case: NamedSituation) -> Answer:
     return probe.call(next(case.now.params()))
 
 
-def look_closer(check: Check, against: Track) -> None:
+def look_closer(check: Check) -> None:
     """Call the function in many situations and add failures, warnings and the reward grid to `check`."""
     setup = check.setup
     probe = Probe(setup)
@@ -110,7 +117,7 @@ def look_closer(check: Check, against: Track) -> None:
     check.detail = next((detail for limit_s, detail in _DETAILS if plain_s < limit_s), None)
     if not probe.hangs:
         check.state = state_of(setup, Probe(setup), 40 if check.detail else 5)
-        executed, n = _execute_scenes(probe, setup, against) if check.detail else (None, _SAMPLES[-1][1])
+        executed, n = _execute_scenes(probe, check) if check.detail else (None, _SAMPLES[-1][1])
         sampled, rewards = _sample(check, probe, executed, n)
     check.failures += _failures(setup, probe, check.situations)
     if check.failures:
@@ -148,10 +155,11 @@ def look_closer(check: Check, against: Track) -> None:
     check.warnings += pitfalls.pays_for_slowness(setup, laps)
 
 
-def _execute_scenes(probe: Probe, setup: RaceSetup, against: Track) -> tuple[Coverage, int]:
+def _execute_scenes(probe: Probe, check: Check) -> tuple[Coverage, int]:
     """Return the lines executed in the named situations, and how many more situations to sample."""
+    setup = check.setup
     with Coverage(setup.reward.path) as executed:
-        for case in named_situations(setup, against):
+        for case in named_situations(setup, check.against):
             _act(probe, case)
         Probe(setup).call(next(seam(setup).params()))
         traced_s = _cpu_s_per_call(probe, setup)
@@ -173,12 +181,6 @@ def _sample(
     if len(known):
         check.lowest, check.highest = float(known.min()), float(known.max())
     return now, rewards
-
-
-def other_direction(experiment: Experiment) -> Track:
-    """Return the experiment's track driven the other way."""
-    track = next(iter(experiment.tracks.values()))
-    return Track.from_config(track, reversed=track.direction != "reversed")
 
 
 def _cpu_s_per_call(probe: Probe, setup: RaceSetup) -> float:

@@ -16,7 +16,7 @@ from deepracer_exp.sim.batch import CarBatch
 
 from .probe import Probe
 from .reward_grid import RewardGrid
-from .situations import Situations, together
+from .situations import Situations
 
 Floats = NDArray[np.float64]
 
@@ -183,15 +183,15 @@ def pays_for_standing(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
         i = max(1, int(place * (len(lap) - _HELD)))
         driving.append(probe.rewards(lap[i - 1 : i + 1 + _HELD])[2:])
         probe.rewards(lap[i - 1 : i + 1])
-        standing.append(probe.rewards(_held(lap[i : i + 1], setup.car.control_period_s)))
+        standing.append(probe.rewards(_held(lap, i, setup.car.control_period_s)))
     still, moving = float(np.mean(standing)), float(np.mean(driving))
     if still >= moving - _MARGIN * max(abs(still), abs(moving)):
         yield f"pays for standing still: {still:.3g} per step, {moving:.3g} for driving"
 
 
-def _held(at: Situations, step_s: float) -> Situations:
-    """Return the following steps of a car that does not move."""
-    held = together([at] * _HELD)
+def _held(lap: Situations, at: int, step_s: float) -> Situations:
+    """Return the steps of a car that does not move after one step of a lap."""
+    held = lap[np.full(_HELD, at)]
     later = np.arange(1, _HELD + 1)
     still = np.zeros(_HELD)
     return held.given(

@@ -43,8 +43,8 @@ def draw_reward_map(
         BadInput: the picture cannot be written.
     """
     track = setup.track
-    low, high = (getattr(np.concatenate([track.inner, track.outer]), f)(axis=0) for f in ("min", "max"))
-    low, high = low - _BESIDE_M - 0.1, high + _BESIDE_M + 0.1
+    borders = np.concatenate([track.inner, track.outer])
+    low, high = borders.min(axis=0) - _BESIDE_M - 0.1, borders.max(axis=0) + _BESIDE_M + 0.1
     pixels, extent = _track_pixels(setup, rewards, low, high, detail)
     colors, norm, extend = _scale(of, pixels)
 
@@ -107,22 +107,25 @@ def _track_pixels(
 
 def _scale(of: RewardGrid, pixels: np.ndarray) -> tuple[Colormap, Normalize, str]:
     """Choose colours for the rewards on the track; values beyond, such as a penalty for leaving it, are clipped."""
-    everything = np.concatenate([of.reward.ravel(), of.by_command.ravel(), pixels.ravel()])
-    everything = everything[np.isfinite(everything)]
-    on_road = np.concatenate([of.reward[~of.off_track], of.by_command.ravel()])
-    on_road = on_road[np.isfinite(on_road)]
+    everything = _known(of.reward, of.by_command, pixels)
+    if not len(everything):
+        everything = np.zeros(1)
+    on_road = _known(of.reward[~of.off_track], of.by_command)
     if not len(on_road):
-        on_road = everything if len(everything) else np.zeros(1)
+        on_road = everything
     low, high = float(on_road.min()), float(on_road.max())
     if high - low < 1e-9 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
-    if not len(everything):
-        everything = on_road
     below, above = bool(everything.min() < low - 1e-9), bool(everything.max() > high + 1e-9)
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
     if low < 0 < high and -low > 0.05 * high:
         return TAKE_AND_PAY, TwoSlopeNorm(0.0, low, high), extend
     return PAY, Normalize(low, high), extend
+
+
+def _known(*rewards: np.ndarray) -> np.ndarray:
+    values = np.concatenate([some.ravel() for some in rewards])
+    return values[np.isfinite(values)]
 
 
 def _draw_course(axes: Axes, setup: RaceSetup) -> None:

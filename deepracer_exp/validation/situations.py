@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from deepracer_exp.env.action_space import ContinuousActions
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.rewards.params import COLUMNS, TrackParams, rows, scalar_params, select
+from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.track import Track
 
@@ -35,18 +35,12 @@ class Situations:
             yield scalar_params(row, self.road)
 
     def __getitem__(self, which: slice | np.ndarray) -> "Situations":
-        """Return a selection."""
+        """Return a selection; an array of numbers may repeat some."""
         return Situations({key: column[which] for key, column in self.columns.items()}, self.road)
 
     def given(self, **columns: np.ndarray) -> "Situations":
         """Return the same situations with some columns replaced."""
         return Situations({**self.columns, **columns}, self.road)
-
-
-def together(parts: "list[Situations]") -> Situations:
-    """Join situations of one road."""
-    columns = {key: np.concatenate([part.columns[key] for part in parts]) for key in COLUMNS}
-    return Situations(columns, parts[0].road)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

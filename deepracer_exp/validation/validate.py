@@ -17,7 +17,7 @@ from deepracer_exp.deepracer.worlds import UNITS_PER_M
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.runs.files import METRICS, read_metrics
 
-from .check import Check, look_closer, other_direction, read, try_named_situations
+from .check import Check, look_closer, read, try_named_situations
 from .probe import NOT_CALLED
 from .reward_map import draw_reward_map
 
@@ -59,11 +59,10 @@ def validate_reward(
         _line(
             out, "Waypoints: numbered as in the track's own file or knots, not as in a track of the service"
         )
-    against = other_direction(experiment)
-    try_named_situations(check, against)
+    try_named_situations(check)
     _print_situations(out, check)
     if not check.failures:
-        look_closer(check, against)
+        look_closer(check)
     if not check.failures:
         _draw(out, check, _default_picture(experiment, check) if output is None else Path(output))
     _print_lines(out, "Warnings", "yellow", check.warnings)

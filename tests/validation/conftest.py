@@ -12,7 +12,7 @@ from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.tracks.track import Track
 from deepracer_exp.validation import check as checking
 from deepracer_exp.validation import reward_map
-from deepracer_exp.validation.check import Check, look_closer, other_direction, read, try_named_situations
+from deepracer_exp.validation.check import Check, look_closer, read, try_named_situations
 from deepracer_exp.validation.pitfalls import DrivenLap, action_space_laps
 
 
@@ -28,7 +28,7 @@ def race(experiment: Experiment) -> RaceSetup:
 
 @pytest.fixture(scope="session")
 def against(experiment: Experiment) -> Track:
-    return other_direction(experiment)
+    return read(experiment).against
 
 
 @pytest.fixture(scope="session")
@@ -68,10 +68,10 @@ def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None
     """Check a reward function given as text, completely."""
 
     def build(text: str, time_limit_s: float = 60.0) -> Check:
-        check = Check(setup=race_with(text, time_limit_s), console=[])
-        try_named_situations(check, against)
+        check = Check(setup=race_with(text, time_limit_s), against=against, console=[])
+        try_named_situations(check)
         if not check.failures:
-            look_closer(check, against)
+            look_closer(check)
         return check
 
     return build
