@@ -99,9 +99,8 @@ class Laps:
 def laps_on(course: Track, steps: pd.DataFrame, words: str, chosen: bool = False) -> Laps:
     """Return laps on a course; the rows of each (`recording.STEP_COLUMNS`) are contiguous and in the order of time."""
     rows = steps[list(STEP_COLUMNS)].reset_index(drop=True)
-    first = first_rows(rows)
-    rows = add_derived(rows, first, course, DISCOUNT)
-    return Laps(steps=rows, episodes=episode_table(rows, first), words=words, chosen=chosen)
+    rows = add_derived(rows, course, DISCOUNT)
+    return Laps(steps=rows, episodes=episode_table(rows), words=words, chosen=chosen)
 
 
 def prepare_races(recording: Recording, track: str | None = None) -> LogView:

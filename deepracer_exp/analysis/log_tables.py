@@ -47,7 +47,7 @@ _LAP_COLUMNS = {
     "lap_time_s": ("Lap time, s", ".2f"),
     "iteration": ("Iteration", "d"),
     "episode": ("Episode", "d"),
-    "first_waypoint": ("From waypoint", "d"),
+    "start_at": ("From waypoint", "d"),
     "steps": ("Steps", ",d"),
     "dist_m": ("Driven, m", ".2f"),
     "speed_mps": ("Speed commanded, m/s", ".2f"),

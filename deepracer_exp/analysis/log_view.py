@@ -144,10 +144,10 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     name = track if track in logged else logged[0]
     if track is not None and track not in logged and len(logged) > 1:
         raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {', '.join(logged)}")
-    found = find_courses(recording)
+    tracks, problems = find_courses(recording)
     here = (names == name).to_numpy()
     driven_on = steps[here]
-    course, problems = found.tracks.get(name), found.problems
+    course = tracks.get(name)
     if track is not None and track not in logged:
         course, problems = directed(catalogue_track(track), catalogue_track(track, True), driven_on), ()
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
@@ -183,7 +183,5 @@ def _episodes(
     key = streams.astype(np.int64) * (int(episodes.max(initial=0)) + 1) + episodes
     if (np.diff(key) < 0).any():
         rows = rows.iloc[np.argsort(key, kind="stable")]
-    rows = rows.reset_index(drop=True)
-    first = first_rows(rows)
-    rows = add_derived(rows, first, course, discount)
-    return rows, episode_table(rows, first)
+    rows = add_derived(rows.reset_index(drop=True), course, discount)
+    return rows, episode_table(rows)

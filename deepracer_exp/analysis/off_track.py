@@ -194,7 +194,7 @@ def risk_counts(episodes: pd.DataFrame, n: int, reach: int = 0) -> tuple[Values,
     An episode passes every waypoint from that of its first row to that of its last row, also those that a control
     step jumped over; a complete lap passes all of them. So many waypoints to either side as `reach` count as well.
     """
-    first, last = (episodes[name].to_numpy(np.int64) for name in ("first_waypoint", "last_waypoint"))
+    first, last = (episodes[name].to_numpy(np.int64) for name in ("start_at", "last_waypoint"))
     progress = episodes["progress"].to_numpy(np.float64)
     ahead = (last - first) % n
     # A car that ends a little before or behind its start drove hardly anything or nearly the whole lap.

@@ -21,6 +21,8 @@ SMOOTH_M = 0.6
 SHORTEST_M = 0.8
 """Shorter sectors are merged with the neighbour of the more similar curvature."""
 _SAMPLE_M = 0.05
+_PLACES = 200
+"""Places at which two laps are compared."""
 _APART = 4.0
 """Distance of the lap positions of two laps that are interpolated together."""
 
@@ -30,9 +32,7 @@ class Sector:
     """A part of the course between two places."""
 
     name: str
-    """Kind and number, e.g. `left 2`; counted over all sectors from the start line on."""
-    kind: str
-    """`left`, `right` or `straight`."""
+    """`left`, `right` or `straight` and a number, which counts all sectors from the start line on."""
     begin: float
     """Lap position, 0 to 1."""
     end: float
@@ -60,12 +60,10 @@ def sectors_of(course: Track) -> list[Sector]:
     last = len(waypoint_at) - 1 - course.closed
     found = []
     for number, (a, b) in enumerate(pairwise(bounds), start=1):
-        kind = _kind(curvature[a:b])
         inside = np.flatnonzero((waypoint_at >= edges[a]) & (waypoint_at < edges[b]))
         found.append(
             Sector(
-                name=f"{kind} {number}",
-                kind=kind,
+                name=f"{_kind(curvature[a:b])} {number}",
                 begin=float(edges[a]),
                 end=float(edges[b]),
                 first_waypoint=int(inside[0]) if len(inside) else 0,
@@ -110,12 +108,11 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
         A row for each complete lap whose beginning is recorded, a column for each interval; the index is that of
         `LogView.episodes`.
     """
-    first = first_rows(steps)
-    begin = np.flatnonzero(first)
+    begin = np.flatnonzero(first_rows(steps))
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
     columns = {name: steps[name].to_numpy(np.float64) for name in ("progress", "lap_position", "tstamp")}
     complete = np.maximum.reduceat(columns["progress"], begin) >= 100.0 if len(begin) else np.zeros(0, bool)
-    laps = np.flatnonzero(complete & whole_from_start(steps, first))
+    laps = np.flatnonzero(complete & whole_from_start(steps))
     begin, end = begin[laps], end[laps]
     rows = end - begin + 1
     lap = np.repeat(np.arange(len(laps)), rows)
@@ -144,7 +141,7 @@ def times_by_sector(steps: pd.DataFrame, sectors: Sequence[Sector]) -> pd.DataFr
     return times[np.isfinite(times).all(axis=1)]
 
 
-def time_lost(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> pd.DataFrame:
+def time_lost(steps: pd.DataFrame, lap: int, other: int) -> pd.DataFrame:
     """Return how far one lap is behind another along the course; both are indices in `LogView.episodes`.
 
     Returns:
@@ -154,7 +151,7 @@ def time_lost(steps: pd.DataFrame, lap: int, other: int, places: int = 200) -> p
     Raises:
         KeyError: one of them is not a complete lap.
     """
-    bounds = np.linspace(0.0, 1.0, places + 1)
+    bounds = np.linspace(0.0, 1.0, _PLACES + 1)
     times = interval_times(steps, bounds)
     lost_s = times.loc[lap].to_numpy() - times.loc[other].to_numpy()
     return pd.DataFrame({"lap_position": bounds, "delta_s": np.r_[0.0, np.cumsum(lost_s)]})

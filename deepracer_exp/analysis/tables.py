@@ -52,7 +52,6 @@ EPISODE_COLUMNS: Mapping[str, str] = {
     "lap_time_s": "time_s of a complete lap whose beginning is recorded; NaN of other episodes",
     "status": "episode_status of its last row; lap_complete of a lap in a race; where the format has none, "
     "lap_complete, off_track or empty",
-    "first_waypoint": "waypoint of its first row",
     "last_waypoint": "waypoint of its last row",
     "quarter": "1 to 4, of the training's episodes in their order",
     "quintile": "1 to 5, likewise",
@@ -87,22 +86,20 @@ FINISHED = 0.75
 _REPORTED = ("entropy", "kl", "policy_loss", "value_loss", "lr")
 
 
-def add_derived(
-    steps: pd.DataFrame, first: NDArray[np.bool_], course: Track | None, discount: float
-) -> pd.DataFrame:
+def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> pd.DataFrame:
     """Return the steps with `DERIVED_COLUMNS`.
 
     Args:
         steps: rows of each episode contiguous and in the order of time.
-        first: whether a row is its episode's first one.
         course: what was driven on.
         discount: factor on the reward of the next step.
     """
     x, y, yaw, time_s, progress, reward = (
         steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw", "tstamp", "progress", "reward")
     )
+    first = first_rows(steps)
     lap_position, offset_m, center_deg = _places(steps, first, course)
-    stopped = first & ~flying_rows(steps, first)
+    stopped = first & ~flying_rows(steps)
     delta_time_s, dx, dy = (_since(values, stopped) for values in (time_s, x, y))
     delta_dist_m = np.hypot(dx, dy)
     moving = ~stopped & (delta_dist_m >= STILL_M)
@@ -196,33 +193,31 @@ def first_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
     return first
 
 
-def flying_rows(steps: pd.DataFrame, first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def flying_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
     """Return which first rows continue the row before: laps of a race are driven without a stop."""
     number = steps["steps"].to_numpy()
     stream = steps["stream"].astype("category").cat.codes.to_numpy()
-    flying = first & (number > FIRST_STEPS)
+    flying = first_rows(steps) & (number > FIRST_STEPS)
     flying[:1] = False
     flying[1:] &= (number[1:] == number[:-1] + 1) & (stream[1:] == stream[:-1])
     return flying
 
 
-def whole_from_start(steps: pd.DataFrame, first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def whole_from_start(steps: pd.DataFrame) -> NDArray[np.bool_]:
     """Return for each episode whether its beginning is recorded."""
-    begin = np.flatnonzero(first)
-    return (steps["steps"].to_numpy()[begin] <= FIRST_STEPS) | flying_rows(steps, first)[begin]
+    begin = np.flatnonzero(first_rows(steps))
+    return (steps["steps"].to_numpy()[begin] <= FIRST_STEPS) | flying_rows(steps)[begin]
 
 
-def episode_table(steps: pd.DataFrame, first: NDArray[np.bool_]) -> pd.DataFrame:
+def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
     """Summarise each episode in one row, `EPISODE_COLUMNS`, in the order of the steps.
 
     Steps, start, progress, time, distance, speed, reward and completeness are defined as in deepracer-utils 1.5.6
     (logs/log_utils.py, `simulation_agg`).
 
-    Args:
-        steps: rows of each episode contiguous and in the order of time, with the derived columns.
-        first: whether a row is its episode's first one.
+    The rows of each episode are contiguous and in the order of time, with the derived columns.
     """
-    begin = np.flatnonzero(first)
+    begin = np.flatnonzero(first_rows(steps))
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
 
     def combined(name: str, how: np.ufunc = np.add) -> Values:
@@ -254,9 +249,8 @@ def episode_table(steps: pd.DataFrame, first: NDArray[np.bool_]) -> pd.DataFrame
             "reward_if_complete": reward * per_lap,
             "ended": complete | ended,
             "complete": complete,
-            "lap_time_s": np.where(complete & whole_from_start(steps, first) & (time_s > 0), time_s, np.nan),
+            "lap_time_s": np.where(complete & whole_from_start(steps) & (time_s > 0), time_s, np.nan),
             "status": status.mask(lap, "lap_complete").mask(off & ~complete, "off_track"),
-            "first_waypoint": first_row["closest_waypoint"],
             "last_waypoint": last_row["closest_waypoint"],
             "quarter": 1 + 4 * order // len(order),
             "quintile": 1 + 5 * order // len(order),

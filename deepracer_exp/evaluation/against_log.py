@@ -160,7 +160,7 @@ def race_as_logged(
 def _races(logged: pd.DataFrame, track: Track) -> tuple[NDArray[np.float64], NDArray[np.intp], float]:
     """Return where the log's races start (n,), how many laps each of them has, and the longest one's seconds."""
     first = first_rows(logged)
-    standing = np.flatnonzero(first & ~flying_rows(logged, first))
+    standing = np.flatnonzero(first & ~flying_rows(logged))
     laps = np.add.reduceat(first.astype(np.intp), standing)
     front = track.project(logged[["X", "Y"]].to_numpy(np.float64)[standing])
     starts = (front.ndist - logged["progress"].to_numpy(np.float64)[standing] / 100.0) % 1.0

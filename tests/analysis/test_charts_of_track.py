@@ -121,7 +121,7 @@ def test_an_episode_passes_the_waypoints_from_its_start_to_its_end(view: LogView
     n = view.waypoint_count
     far = view.episodes["last_waypoint"].between(78, 82) & ~view.episodes["complete"]
     one = view.episodes[far].iloc[:1]
-    first, last = one[["first_waypoint", "last_waypoint"]].iloc[0]
+    first, last = one[["start_at", "last_waypoint"]].iloc[0]
     passes, _ = risk_counts(one, n)
     np.testing.assert_array_equal(np.flatnonzero(passes), np.arange(first, last + 1))
     near, off = risk_counts(one, n, reach=2)
