@@ -1,7 +1,6 @@
 """The courses of a recording, found by name or recognised by where the car drove."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,22 +35,15 @@ _JUMP = 20.0
 """Per cent of progress between adjacent rows beyond which the car must have been reset."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Courses:
-    """The courses of a recording, in the direction in which most of its rows were driven."""
-
-    tracks: Mapping[str, Track]
-    """By the name in `steps.track`."""
-    problems: tuple[LogProblem, ...]
-    """Courses that were not recognised, with the reason."""
-
-
-def find_courses(recording: Recording) -> Courses:
-    """Find the course of each name in a recording's `steps.track`.
+def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProblem, ...]]:
+    """Find the course of each name in a recording's `steps.track`, in the direction in which most rows were driven.
 
     One of our own runs has its courses in its config.yaml. Other names are looked up among the service's worlds; a
     course without a known name, or with one that does not match where the car drove, is recognised by its waypoint
     numbers, its length and the positions of the car.
+
+    Returns:
+        The courses by name, and those that were not recognised with the reason.
     """
     own: Mapping[str, TrackConfig] = {}
     problems: list[LogProblem] = []
@@ -78,7 +70,7 @@ def find_courses(recording: Recording) -> Courses:
             tracks[name] = directed(both[0], both[1], rows)
         except BadInput as error:
             problems.append(LogProblem(recording.name, None, str(error)))
-    return Courses(tracks=tracks, problems=tuple(problems))
+    return tracks, tuple(problems)
 
 
 def catalogue_track(name: str, reversed: bool = False) -> Track:

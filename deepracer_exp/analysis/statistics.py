@@ -22,13 +22,13 @@ class Histogram:
     width: float
 
 
-def histogram(values: Values, least: int = 8, most: int = 50) -> Histogram:
+def histogram(values: Values, least: int = 8) -> Histogram:
     """Count values; their number and spread decide on the bins (Freedman and Diaconis, 1981)."""
     low, high = float(values.min()), float(values.max())
     if high - low <= 1e-6 * max(abs(high), abs(low)):
         return Histogram(np.array([low]), np.array([float(len(values))]), max(0.05 * abs(low), 1e-6))
     spread = float(np.subtract(*np.percentile(values, [75, 25])))
-    width = float(np.clip(2 * spread / len(values) ** (1 / 3), (high - low) / most, (high - low) / least))
+    width = float(np.clip(2 * spread / len(values) ** (1 / 3), (high - low) / 50, (high - low) / least))
     grain = _grain(values)
     if grain > 0:
         # Bins with different numbers of possible values would look like a comb.
@@ -100,11 +100,12 @@ def quantiles(place: NDArray[np.intp], values: ArrayLike, n: int, shares: tuple[
     return np.stack([groups.quantile(share).reindex(range(n)).to_numpy() for share in shares])
 
 
-def wilson(hits: ArrayLike, tries: ArrayLike, z: float = 1.959964) -> tuple[Values, Values]:
-    """Return the ends of the Wilson score interval of hits / tries (by default 95 per cent); NaN where never tried.
+def wilson(hits: ArrayLike, tries: ArrayLike) -> tuple[Values, Values]:
+    """Return the ends of the Wilson score interval of hits / tries (95 per cent); NaN where never tried.
 
     Source: E. B. Wilson, Probable inference, the law of succession, and statistical inference (1927).
     """
+    z = 1.959964
     tries = np.where(np.asarray(tries) > 0, tries, np.nan)
     share = np.asarray(hits) / tries
     middle = share + z**2 / (2 * tries)

@@ -30,9 +30,8 @@ def renamed(recording: Recording, name: str) -> Recording:
     "name", ["REINVENT_BASE", "arn:aws:deepracer:us-east-1::track/reinvent_base", "", "my_copy"]
 )
 def test_a_course_is_found_by_its_name_or_by_where_the_car_drove(name: str) -> None:
-    found = find_courses(renamed(made_up_recording([Drive()]), name))
-    assert found.tracks[name].name == "reinvent_base"
-    assert not found.problems
+    tracks, problems = find_courses(renamed(made_up_recording([Drive()]), name))
+    assert (tracks[name].name, problems) == ("reinvent_base", ())
 
 
 def test_a_course_driven_against_its_waypoints_is_turned_around() -> None:
@@ -55,7 +54,7 @@ def elsewhere(recording: Recording) -> Recording:
 
 def test_an_unknown_course_is_reported_and_drawn_from_the_recorded_positions() -> None:
     around = elsewhere(made_up_recording([Drive(offset_m=side) for side in (-0.2, 0.0, 0.2)]))
-    (problem,) = find_courses(around).problems
+    (problem,) = find_courses(around)[1]
     assert "'moon' is none of the service's 127 worlds (17.709 m long)" in problem.reason
     assert "`--track ROUTE` takes the file of its route (.npy)" in problem.reason
     view, known = prepare(around), made_up_course()
@@ -121,7 +120,7 @@ def test_a_run_of_ours_has_its_courses_in_its_configuration(tmp_path: Path) -> N
     recording = replace(
         renamed(made_up_recording([Drive()], course="Oval_track"), "mine"), files=(tmp_path / "config.yaml",)
     )
-    assert find_courses(recording).tracks["mine"].name == "mine"
+    assert find_courses(recording)[0]["mine"].name == "mine"
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones() -> None:

@@ -39,7 +39,7 @@ class Grid:
     rows: int
 
     @classmethod
-    def over(cls, course: Track, most: int = 20_000) -> "Grid":
+    def over(cls, course: Track, most: int) -> "Grid":
         """Lay cells over a course, at most `most`, as small as `_SIDES_M` allows."""
         borders = np.concatenate([course.inner, course.outer])
         low, high = borders.min(axis=0) - _RIM_M, borders.max(axis=0) + _RIM_M
@@ -57,16 +57,6 @@ class Grid:
         return np.where(inside, row * self.columns + column, -1).astype(np.intp)
 
     @property
-    def x(self) -> Values:
-        """Centres of the columns, m."""
-        return self.low_x + self.side_m * (np.arange(self.columns, dtype=np.float64) + 0.5)
-
-    @property
-    def y(self) -> Values:
-        """Centres of the rows, m."""
-        return self.low_y + self.side_m * (np.arange(self.rows, dtype=np.float64) + 0.5)
-
-    @property
     def count(self) -> int:
         """Number of cells."""
         return self.columns * self.rows
@@ -79,13 +69,14 @@ class Grid:
 
     def cells(self, values: Values, scale: str, **more: Any) -> go.Heatmap:
         """Return values (count,) as the layer of a map; see `heatmap`."""
-        return heatmap(self.x, self.y, values.reshape(self.rows, self.columns), scale, **more)
+        x = self.low_x + self.side_m * (np.arange(self.columns) + 0.5)
+        y = self.low_y + self.side_m * (np.arange(self.rows) + 0.5)
+        return heatmap(x, y, values.reshape(self.rows, self.columns), scale, **more)
 
 
 def map_panel(course: Track, layers: Sequence[Layer], title: str = "", numbers: bool = True) -> Panel:
     """Return a map: the road, `layers` on it, its borders above them, and numbers of waypoints beside it."""
-    polygons = [part for part in get_parts(course.road) if part.geom_type == "Polygon"]
-    rings = [get_coordinates(ring) for polygon in polygons for ring in get_rings(polygon)]
+    rings = [get_coordinates(ring) for ring in get_rings(get_parts(course.road))]
     borders = [line(ring[:, 0], ring[:, 1], FAINT, width=1.0) for ring in rings]
     ends = np.stack([course.inner[0], course.outer[0]])
     start = line(ends[:, 0], ends[:, 1], FAINT, width=3.0)

@@ -154,8 +154,8 @@ def evaluations(view: LogView) -> Chart | None:
         best_s = float(view.episodes["lap_time_s"].min()) if view.trained else np.nan
         if np.isfinite(best_s):
             laps.append(mark(best_s, "best of the training", GREEN, horizontal=True))
-        low, high = episodes["lap_time_s"].min(), episodes["lap_time_s"].max()
-        low, high = np.nanmin([low, best_s]), np.nanmax([high, best_s])
+        times_s = [*episodes["lap_time_s"], best_s]
+        low, high = np.nanmin(times_s), np.nanmax(times_s)
         rim = max(0.1 * (high - low), 0.1)
         panels.append(("Lap time", "lap time, s", laps, (low - rim, high + rim)))
     slower = " The best lap of the training is the fastest of many."
