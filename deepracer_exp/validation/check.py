@@ -47,7 +47,7 @@ class Check:
     """Reasons why a training cannot use the function."""
     warnings: list[str] = field(default_factory=list)
     situations: int = 0
-    """Number of situations sampled."""
+    """Number of situations sampled or named."""
     lowest: float = float("nan")
     highest: float = float("nan")
     state: State = "none"
@@ -123,6 +123,8 @@ def look_closer(check: Check) -> None:
     if check.failures:
         return
 
+    paid = np.append(rewards, [answer.reward for answer in check.tried.values()])
+    check.lowest, check.highest = float(paid.min()), float(paid.max())
     last_point = Probe(setup).call(next(seam(setup).params()))
     if last_point.failure:
         check.warnings.append(f"at the finish, between the last waypoint and the first: {last_point.failure}")
@@ -139,7 +141,7 @@ def look_closer(check: Check) -> None:
         except (BadInput, RewardFailed) as error:
             check.failures.append(str(error))
             return
-    constant = list(pitfalls.constant_reward(rewards))
+    constant = list(pitfalls.constant_reward(paid))
     check.warnings += constant
     if executed is not None:
         check.warnings += _unreached(setup.reward.text, executed.lines, check.situations)
@@ -169,7 +171,7 @@ def _execute_scenes(probe: Probe, check: Check) -> tuple[Coverage, int]:
 def _sample(
     check: Check, probe: Probe, executed: Coverage | None, n: int
 ) -> tuple[Situations, NDArray[np.float64]]:
-    """Return n sampled situations and their rewards; adds the range of rewards to `check`."""
+    """Return n sampled situations and their rewards; adds the number of situations to `check`."""
     setup = check.setup
     at = sample(setup, n)
     now = situations(setup, at)
@@ -177,9 +179,6 @@ def _sample(
     with executed or nullcontext():
         rewards = probe.rewards(now, before if check.state == "earlier calls" else None)
     check.situations = n + len(check.tried)
-    known = rewards[np.isfinite(rewards)]
-    if len(known):
-        check.lowest, check.highest = float(known.min()), float(known.max())
     return now, rewards
 
 

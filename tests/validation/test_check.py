@@ -117,6 +117,12 @@ def test_a_constant_reward_is_reported_in_one_line(check_of):
     assert "always returns 1, whatever the car does" in found
 
 
+def test_a_reward_for_the_finish_alone_is_not_constant_and_belongs_to_the_range(check_of):
+    check = check_of(function('return 100.0 if params["progress"] == 100 else -1.0'))
+    assert not any("always returns" in line for line in check.warnings)
+    assert (check.lowest, check.highest) == (-1.0, 100.0)
+
+
 def test_a_random_reward_is_reported(check_of):
     found = check_of(function("return random.random()", "import random\n")).warnings
     assert any("draws random numbers" in line for line in found)
