@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from deepracer_exp.errors import count
@@ -284,12 +285,13 @@ def _crashes(view: LogView) -> Finding | None:
     episodes = view.episodes.loc[view.episodes["ended"], "episode"]
     status = view.steps["episode_status"].astype(str).to_numpy()
     rows = view.steps[(status == "crashed") & (np.append([""], status[:-1]) != "crashed")]
-    rows = rows[rows["episode"].isin(episodes)]
+    rows = rows[rows["episode"].isin(episodes)].dropna(subset=["X", "Y"])
     if not len(rows):
         return None
     places = rows[["X", "Y"]].to_numpy(np.float64)
-    near = np.linalg.norm(places[:, None] - places[None], axis=2) <= CRASH_PLACE_M
-    here = rows[near[near.sum(axis=1).argmax()]]
+    tree = KDTree(places)
+    densest = places[tree.query_ball_point(places, CRASH_PLACE_M, return_length=True).argmax()]
+    here = rows.iloc[tree.query_ball_point(densest, CRASH_PLACE_M)]
     crashed = rows["episode"].nunique()
     waypoint = int(here["closest_waypoint"].median())
     x_m, y_m = here[["X", "Y"]].median()
