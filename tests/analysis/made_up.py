@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.analysis.log_course import catalogue_track
+from deepracer_exp.analysis.log_course import catalogue_track, waypoint_positions
 from deepracer_exp.analysis.tables import FRONT_TO_REAR_AXLE_M
 from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata
 from deepracer_exp.deepracer.recording import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS, Recording
@@ -16,6 +16,8 @@ from deepracer_exp.tracks.track import Track
 COURSE = "reinvent_base"
 STEERING_DEG = (-20.0, 0.0, 20.0)
 HZ = 15.0
+FINE = np.linspace(0.0, 1.0, 20001)
+"""Places of a lap between which the speed is constant."""
 OFF_ROWS = 6
 """Rows in which a car that runs off leaves the centre line."""
 
@@ -40,14 +42,15 @@ class Drive:
     """Beside the centre line, positive to the left."""
     wanders: tuple[tuple[float, float], ...] = ()
     """Where on the course (from, to) its steering is drawn by chance."""
-    worker: int = 0
 
-    def lap_time_s(self, course: Track | None = None) -> float:
-        """Return the time of the complete lap."""
-        place = np.linspace(0.0, 1.0, 20001)
-        speed = self._speed((self.start + (place[1:] + place[:-1]) / 2) % 1.0)
-        length_m = (course or made_up_course()).length_m
-        return float(np.sum(np.diff(place) * length_m / speed))
+    def lap_time_s(self) -> float:
+        """Return the time of the complete lap on `COURSE`."""
+        return float(self._passed_s(made_up_course().length_m)[-1])
+
+    def _passed_s(self, length_m: float) -> np.ndarray:
+        """Return the time at each of the places `FINE` of the lap."""
+        speed = self._speed((self.start + (FINE[1:] + FINE[:-1]) / 2) % 1.0)
+        return np.r_[0.0, np.cumsum(np.diff(FINE) * length_m / speed)]
 
     def _speed(self, place: np.ndarray) -> np.ndarray:
         speed = np.full(len(place), self.speed_mps)
@@ -69,7 +72,6 @@ def made_up_recording(
     evaluated: Sequence[float] = (),
     evaluations: Mapping[str, Sequence[Drive]] | None = None,
     name: str = "made_up",
-    seed: int = 0,
 ) -> Recording:
     """Make the recording of a training.
 
@@ -80,9 +82,8 @@ def made_up_recording(
         evaluated: completion in per cent of the five evaluation episodes after each iteration.
         evaluations: drives of other streams.
         name: of the recording.
-        seed: of what is drawn by chance.
     """
-    track, dice = made_up_course(course), np.random.default_rng(seed)
+    track, dice = made_up_course(course), np.random.default_rng(0)
     everything = [("training", drives), *(evaluations or {}).items()]
     speeds = sorted({speed for _, some in everything for one in some for speed in _speeds(one)})
     tables = []
@@ -105,7 +106,7 @@ def made_up_recording(
         steps=_typed(steps, STEP_COLUMNS),
         updates=_typed(updates, UPDATE_COLUMNS),
         metrics=_evaluated(drives, evaluated),
-        metadata=_metadata(speeds),
+        metadata=ModelMetadata(actions=tuple(Action(angle, v) for v in speeds for angle in STEERING_DEG)),
         hyperparameters={"discount_factor": 0.99},
         reward_source=None,
         track=course,
@@ -114,27 +115,18 @@ def made_up_recording(
     )
 
 
-def _metadata(speeds: Sequence[float]) -> ModelMetadata:
-    return ModelMetadata(
-        actions=tuple(Action(angle, speed) for speed in speeds for angle in STEERING_DEG),
-    )
-
-
 def _speeds(drive: Drive) -> list[float]:
     return [drive.speed_mps, *(speed for _, _, speed in drive.sections)]
 
 
 def _rows(track: Track, drive: Drive, speeds: Sequence[float], dice: np.random.Generator) -> pd.DataFrame:
-    fine = np.linspace(0.0, 1.0, 20001)
-    speed = drive._speed((drive.start + (fine[1:] + fine[:-1]) / 2) % 1.0)
-    passed_s = np.r_[0.0, np.cumsum(np.diff(fine) * track.length_m / speed)]
+    passed_s = drive._passed_s(track.length_m)
     until = drive.until
     if drive.off_at is not None:
-        steps_m = np.linalg.norm(np.diff(track.waypoints, axis=0), axis=1)
-        until = (np.r_[0.0, np.cumsum(steps_m)][drive.off_at] / track.length_m - drive.start) % 1.0
-    end_s = float(np.interp(until, fine, passed_s))
+        until = (waypoint_positions(track)[drive.off_at] - drive.start) % 1.0
+    end_s = float(np.interp(until, FINE, passed_s))
     time_s = np.r_[np.arange(0.0, end_s - 0.5 / HZ, 1.0 / HZ), end_s]
-    gone = np.interp(time_s, passed_s, fine)
+    gone = np.interp(time_s, passed_s, FINE)
     gone[-1] = until
     place = (drive.start + gone) % 1.0
     turns = _turns(track, place)
@@ -162,7 +154,7 @@ def _rows(track: Track, drive: Drive, speeds: Sequence[float], dice: np.random.G
         status[-1] = "lap_complete" if complete else "off_track"
     return pd.DataFrame(
         {
-            "worker": drive.worker,
+            "worker": 0,
             "iteration": drive.iteration,
             "steps": np.arange(1, len(gone) + 1),
             "X": xy[:, 0],
