@@ -16,7 +16,7 @@ from .log_course import waypoint_positions
 from .log_tables import NONE, Table
 from .log_view import DISCOUNT, PREPARE, LogView, prepare
 from .sectors import sector_at, sectors_of
-from .statistics import Values
+from .statistics import Values, totals
 from .tables import add_derived, episode_table, first_rows
 
 PLACES = np.arange(100) / 100
@@ -200,11 +200,8 @@ class AgainstLog:
         if self.actions is None:
             return np.zeros(0), np.zeros(0)
         n, m = len(self.logged.driven), len(self.actions.names)
-        counts = [
-            np.bincount(part[part >= 0], minlength=m)
-            for part in (self.actions.number[:n], self.actions.number[n:])
-        ]
-        logged, simulated = (100.0 * one / max(one.sum(), 1) for one in counts)
+        counts = (totals(part, None, m) for part in np.split(self.actions.number, [n]))
+        logged, simulated = (100.0 * one / max(one.sum(), 1.0) for one in counts)
         return logged, simulated
 
     @property

@@ -157,7 +157,6 @@ def html(page: LogPage) -> str:
         picture=plots.get("lap_line"),
         findings=[_finding(one, plots) for one in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
-        names=set(plots),
         replay=page.replay,
         candidates=candidate_rows(view),
         laps=best_laps(view),

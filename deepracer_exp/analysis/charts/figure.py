@@ -119,7 +119,7 @@ def colored_points(
     `scale` is what the values are, with unit; `value_range` are those of the first and the last colour, without it
     the percentiles 1 and 99.
     """
-    low, high = value_range or _color_range(values)
+    low, high = value_range or color_range(values)
     marker = {"size": size, "color": _light(values), "cmin": low, "cmax": high, "colorscale": SCALE}
     marker["colorbar"] = {"title": {"text": escaped(scale)}}
     text = {"hovertemplate": f"%{{marker.color:.6~g}}<extra>{escaped(scale)}</extra>"}
@@ -184,7 +184,7 @@ def heatmap(
     `written` writes each value into its cell, `diverging` puts zero in the middle of the colours; `scale` and
     `value_range` are those of `colored_points`.
     """
-    low, high = value_range or _color_range(values)
+    low, high = value_range or color_range(values)
     if diverging:
         low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
     return go.Heatmap(
@@ -250,7 +250,8 @@ def _hover(hover: Sequence[str] | None) -> dict[str, Any]:
     return {"hovertext": [text.replace("\n", "<br>") for text in hover], "hoverinfo": "text"}
 
 
-def _color_range(values: ArrayLike) -> tuple[float, float]:
+def color_range(values: ArrayLike) -> tuple[float, float]:
+    """Return the percentiles 1 and 99 of the known values, a little apart where they are equal."""
     known = np.asarray(values, np.float64)
     known = known[np.isfinite(known)]
     low, high = np.percentile(known, [1, 99]).tolist() if len(known) else (0.0, 1.0)

@@ -117,15 +117,11 @@ def off_track_risk(view: LogView) -> Chart | None:
     if not len(view.episodes):
         return None
     n = view.waypoint_count
-    late = thirds(view.episodes["iteration"].to_numpy()) == 2
-    every = np.ones(len(late), bool)
-    _, off = risk_counts(view.episodes, n)
+    parts = view.episodes, view.episodes[thirds(view.episodes["iteration"].to_numpy()) == 2]
+    off, late_off = (risk_counts(part, n)[1] for part in parts)
     if not off.any():
         return None
-    _, late_off = risk_counts(view.episodes[late], n)
-    (near_passes, near_off), (late_passes, late_near_off) = (
-        risk_counts(view.episodes[wanted], n, REACH) for wanted in (every, late)
-    )
+    (near_passes, near_off), (late_passes, late_near_off) = (risk_counts(part, n, REACH) for part in parts)
     low, high = (100.0 * end for end in wilson(late_near_off, late_passes))
     share = 100.0 * near_off / np.where(near_passes > 0, near_passes, np.nan)
     late_share = 100.0 * late_near_off / np.where(late_passes > 0, late_passes, np.nan)

@@ -8,7 +8,7 @@ from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
 from deepracer_exp.analysis.statistics import MOST_ROWS, histogram, means, quantiles, subsample
 
 from .actions import action_classes
-from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
+from .figure import Chart, Layer, Panel, band, bars, color_range, in_rows, line, mark, points
 from .maps import Grid, map_panel, waypoint_panel
 from .style import BLACK, BLUE, CATEGORIES, FAINT, GREEN, INK, ORANGE, PALE, VERMILION
 
@@ -33,12 +33,10 @@ def reward_map(view: LogView) -> Chart | None:
     inside = cells[fine][cells[fine] >= 0]
     mean = means(cells[fine], reward, fine.count)
     of_steps = mean[inside[subsample(len(inside), MOST_ROWS)]]
-    of_steps = of_steps[np.isfinite(of_steps)]
-    if not len(of_steps):
+    if not np.isfinite(of_steps).any():
         return None
     # Weighted by how often cells are driven: few steps off the road would take all colours.
-    low, high = np.percentile(of_steps, [1, 99]).tolist()
-    colors = (low, high) if low < high else (low - 0.5, high + 0.5)
+    colors = color_range(of_steps)
 
     def panel(wanted: NDArray[np.bool_], title: str, grid: Grid) -> Panel:
         values = means(np.where(wanted, cells[grid], -1), reward, grid.count)
