@@ -50,7 +50,7 @@ class OffTrackPlace:
     count: int
     """Times it ran off here."""
     passes: int
-    """Episodes that came here."""
+    """Episodes that came here; at least `count`."""
     low: float
     """95 per cent interval of the risk, with `high`."""
     high: float
@@ -97,8 +97,9 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
         left &= _apart(at, center) > 2 * half
         judgements = Counter(judged[here].tolist())
         most, times = judgements.most_common(1)[0]
-        passes = len(np.unique(episode[_apart(position, center) <= half]))
-        low, high = map(float, wilson(offs, max(passes, offs)))
+        # A car that is put back on the road passes the place again.
+        passes = max(len(np.unique(episode[_apart(position, center) <= half])), offs)
+        low, high = map(float, wilson(offs, passes))
         middle = rows[here][np.argsort((at[here] - center + 0.5) % 1.0, kind="stable")[offs // 2]]
         found.append(
             OffTrackPlace(

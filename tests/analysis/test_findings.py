@@ -227,6 +227,15 @@ def test_logs_without_episode_status_show_where_the_car_runs_off() -> None:
     assert of(view, "runs_off").values["times, waypoint 35"] == 6
 
 
+def test_a_car_that_is_put_back_passes_a_place_as_often_as_it_runs_off_there() -> None:
+    recording = made_up_recording([Drive()])
+    off = np.flatnonzero(recording.steps["closest_waypoint"] == 34)[0] + np.array([0, 2, 4])
+    status = recording.steps["episode_status"].astype(str).to_numpy()
+    status[off] = "off_track"
+    view = prepare(replace(recording, steps=recording.steps.assign(episode_status=status)))
+    assert "(3 of 3 passes: a risk of 44% to 100%)" in of(view, "runs_off").sentence
+
+
 def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
     recording = off_at((35, 6, False), (85, 2, False), unfinished=1).recording
     status = recording.steps["episode_status"].astype(str).replace("off_track", "crashed")
