@@ -18,7 +18,7 @@ from . import pitfalls
 from .console import ConsoleFinding, console_findings
 from .pitfalls import action_space_laps
 from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
-from .reward_grid import RewardGrid, Sampler, State, reward_sampler, sample_reward_grid, state_of
+from .reward_grid import RewardGrid, State, sample_reward_grid, state_of
 from .situations import NamedSituation, Situations, named_situations, sample, seam, situations
 
 _WARM = 25
@@ -51,10 +51,8 @@ class Check:
     lowest: float = float("nan")
     highest: float = float("nan")
     state: State = "none"
-    detail: float | None = None
-    """Resolution of the map; None: no map, because a call takes too long."""
-    sampler: Sampler | None = None
     grid: RewardGrid | None = None
+    """None: not sampled, because a call takes too long."""
 
 
 def read(experiment: Experiment) -> Check:
@@ -114,10 +112,10 @@ def look_closer(check: Check) -> None:
     setup = check.setup
     probe = Probe(setup)
     plain_s = _cpu_s_per_call(probe, setup)
-    check.detail = next((detail for limit_s, detail in _DETAILS if plain_s < limit_s), None)
+    detail = next((detail for limit_s, detail in _DETAILS if plain_s < limit_s), None)
     if not probe.hangs:
-        check.state = state_of(setup, Probe(setup), 40 if check.detail else 5)
-        executed, n = _execute_scenes(probe, check) if check.detail else (None, _SAMPLES[-1][1])
+        check.state = state_of(setup, Probe(setup), 40 if detail else 5)
+        executed, n = _execute_scenes(probe, check) if detail else (None, _SAMPLES[-1][1])
         sampled, rewards = _sample(check, probe, executed, n)
     check.failures += _failures(setup, probe, check.situations)
     if check.failures:
@@ -145,10 +143,9 @@ def look_closer(check: Check) -> None:
     check.warnings += constant
     if executed is not None:
         check.warnings += _unreached(setup.reward.text, executed.lines, check.situations)
-    if check.detail is None:
+    if detail is None:
         return
-    check.sampler = reward_sampler(setup, check.state)
-    check.grid = sample_reward_grid(setup, check.sampler, check.detail)
+    check.grid = sample_reward_grid(setup, check.state, detail)
     if constant:  # the other warnings would only repeat it
         return
     laps = action_space_laps(setup)

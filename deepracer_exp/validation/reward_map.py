@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -17,7 +16,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput, writing
 from deepracer_exp.tracks.drawing import outline
 
-from .reward_grid import RewardGrid, Sampler, State
+from .reward_grid import BESIDE_M, RewardGrid, State, map_corners
 from .situations import middle_speed_mps
 
 INK, FAINT, GROUND = "#22262b", "#7b828c", "#ffffff"
@@ -27,26 +26,18 @@ TAKE_AND_PAY = LinearSegmentedColormap.from_list(
     "take_and_pay", ["#7a1f3d", "#c2455b", "#f0a58f", "#f4f1ec", "#9fd3b4", "#2f9273", "#0f4a4a"]
 )
 """Colours from negative over zero to positive."""
-_BESIDE_M = 0.3
-"""Width of the ground shown beside the track."""
 _DOTS_PER_INCH = 130
-_PIXELS = 16_000
-"""Points of the track sampled at detail 1."""
 
 
-def draw_reward_map(
-    setup: RaceSetup, rewards: Sampler, of: RewardGrid, state: State, detail: float, path: Path
-) -> None:
+def draw_reward_map(setup: RaceSetup, of: RewardGrid, state: State, path: Path) -> None:
     """Write the picture: the track coloured by the reward for driving along it, and four cuts.
 
     Raises:
         BadInput: the picture cannot be written.
     """
     track = setup.track
-    borders = np.concatenate([track.inner, track.outer])
-    low, high = borders.min(axis=0) - _BESIDE_M - 0.1, borders.max(axis=0) + _BESIDE_M + 0.1
-    pixels, extent = _track_pixels(setup, rewards, low, high, detail)
-    colors, norm, extend = _scale(of, pixels)
+    low, high = map_corners(track)
+    colors, norm, extend = _scale(of)
 
     width_in, foot_in, head_in = 12.0, 3.9, 1.0
     map_in = float(np.clip(10.6 * (high - low)[1] / (high - low)[0], 2.6, 7.2))
@@ -57,9 +48,15 @@ def draw_reward_map(
     main.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     main.set_axis_off()
     image = main.imshow(
-        pixels, extent=extent, origin="lower", cmap=colors, norm=norm, interpolation="bilinear", zorder=1
+        of.pixels,
+        extent=of.extent,
+        origin="lower",
+        cmap=colors,
+        norm=norm,
+        interpolation="bilinear",
+        zorder=1,
     )
-    image.set_clip_path(PathPatch(outline(track.road.buffer(_BESIDE_M)), transform=main.transData))
+    image.set_clip_path(PathPatch(outline(track.road.buffer(BESIDE_M)), transform=main.transData))
     _draw_course(main, setup)
 
     bar = figure.colorbar(
@@ -87,27 +84,9 @@ def draw_reward_map(
         figure.savefig(path)
 
 
-def _track_pixels(
-    setup: RaceSetup, rewards: Sampler, low: np.ndarray, high: np.ndarray, detail: float
-) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Return the rewards of a grid of points on and beside the track, NaN elsewhere, and its extent in metres."""
-    track = setup.track
-    area_m2 = float(track.road.buffer(_BESIDE_M).area)
-    cell_m = float(np.sqrt(area_m2 / (_PIXELS * detail**2)))
-    x = np.arange(low[0], high[0], cell_m) + cell_m / 2
-    y = np.arange(low[1], high[1], cell_m) + cell_m / 2
-    grid_x, grid_y = np.meshgrid(x, y)
-    near = shapely.contains_xy(track.road.buffer(_BESIDE_M + 1.5 * cell_m), grid_x, grid_y)
-    place = track.project(np.column_stack([grid_x[near], grid_y[near]]))
-    pixels = np.full(grid_x.shape, np.nan)
-    pixels[near], _ = rewards(place.ndist, place.offset_m, 0.0, middle_speed_mps(setup))
-    half_m = cell_m / 2
-    return pixels, (x[0] - half_m, x[-1] + half_m, y[0] - half_m, y[-1] + half_m)
-
-
-def _scale(of: RewardGrid, pixels: np.ndarray) -> tuple[Colormap, Normalize, str]:
+def _scale(of: RewardGrid) -> tuple[Colormap, Normalize, str]:
     """Choose colours for the rewards on the track; values beyond, such as a penalty for leaving it, are clipped."""
-    everything = _known(of.reward, of.by_command, pixels)
+    everything = _known(of.reward, of.by_command, of.pixels)
     if not len(everything):
         everything = np.zeros(1)
     on_road = _known(of.reward[~of.off_track], of.by_command)

@@ -100,11 +100,10 @@ def _draw(out: Console, check: Check, path: Path) -> None:
     if check.state == "earlier calls":
         paid += "; it depends on earlier calls"
     _line(out, paid)
-    if check.grid is None or check.sampler is None or check.detail is None:
+    if check.grid is None:
         _line(out, "No map and no laps: the function is too slow")
         return
-    setup = check.setup
-    draw_reward_map(setup, check.sampler, check.grid, check.state, check.detail, path)
+    draw_reward_map(check.setup, check.grid, check.state, path)
     _line(out, f"Reward map: {shlex.quote(str(path))}")
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from deepracer_exp.validation import pitfalls
 from deepracer_exp.validation.probe import Probe
-from deepracer_exp.validation.reward_grid import reward_sampler, sample_reward_grid, state_of
+from deepracer_exp.validation.reward_grid import sample_reward_grid, state_of
 
 
 def paying(expression: str) -> str:
@@ -38,8 +38,8 @@ def reward_function(params):
 )
 def test_reward_off_the_track_is_reported(race_with, text, words):
     race = race_with(text)
-    sampler = reward_sampler(race, state_of(race, Probe(race)))
-    found = list(pitfalls.pays_off_the_road(sample_reward_grid(race, sampler, 0.25)))
+    grid = sample_reward_grid(race, state_of(race, Probe(race)), 0.25)
+    found = list(pitfalls.pays_off_the_road(grid))
     assert len(found) == (words is not None)
     assert all(word in found[0] for word in words or ())
 
