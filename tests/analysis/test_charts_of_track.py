@@ -133,6 +133,8 @@ def test_the_ends_are_those_of_the_episodes_without_a_lap(view: LogView) -> None
     chart = episode_ends_map(view)
     assert chart.title == "Where 4 of 15 episodes ended before the lap was complete"
     assert [layer.name for layer in layers(chart, "bars")] == ["off the road (4)"]
+    alone = episode_ends_map(prepare(made_up_recording([Drive(off_at=40)])))
+    assert alone.title == "Where 1 of 1 episode ended before the lap was complete"
 
 
 def test_the_shares_of_actions_make_a_hundred_in_each_section(view: LogView) -> None:

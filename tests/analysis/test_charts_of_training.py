@@ -123,6 +123,12 @@ def test_updates_without_laps_and_laps_without_updates_have_no_common_figure(vie
     assert learning_vs_lap_time(prepare(made_up_recording([Drive(until=0.2)], entropy=[2.0]))) is None
 
 
+def test_episodes_of_one_race_and_of_two_are_called_so(view: LogView) -> None:
+    assert "episode of an evaluation or race on this course" in evaluations(view).caption
+    two = made_up_recording([], evaluations={"race": [Drive()], "second": [Drive()]})
+    assert "episode of one of 2 evaluations or races" in evaluations(prepare(two)).caption
+
+
 def test_quarters_count_all_laps(view: LogView) -> None:
     chart = quarters(view)
     ended = view.episodes[view.episodes["ended"]]

@@ -6,6 +6,7 @@ import pandas as pd
 from deepracer_exp.analysis.log_view import LogView, thirds
 from deepracer_exp.analysis.off_track import risk_counts
 from deepracer_exp.analysis.statistics import subsample, totals, wilson
+from deepracer_exp.errors import count
 from deepracer_exp.tracks.track import Track
 
 from .figure import Chart, Layer, band, bars, line, note, points
@@ -37,8 +38,8 @@ def visits_map(view: LogView) -> Chart | None:
         ("all iterations", cell),
         ("last third of the iterations", np.where(late, cell, -1)),
     ):
-        count = totals(place, None, grid.count)
-        seen = np.where(count > 0, count, np.nan)
+        steps = totals(place, None, grid.count)
+        seen = np.where(steps > 0, steps, np.nan)
         # The start positions would take all colours.
         top = float(np.nanpercentile(seen, 98)) if np.isfinite(seen).any() else 1.0
         scale = f"control steps per cell of {100 * grid.side_m:.0f} cm"
@@ -67,9 +68,9 @@ def episode_ends_map(view: LogView) -> Chart | None:
         here = ends[ends["status"] == status]
         if not len(here):
             continue
-        count = totals(here["waypoint"].to_numpy(np.intp), None, n)
-        counted.append(bars(np.arange(n), count, color, f"{words} ({len(here)})", base=base, width=1.0))
-        base = base + count
+        height = totals(here["waypoint"].to_numpy(np.intp), None, n)
+        counted.append(bars(np.arange(n), height, color, f"{words} ({len(here)})", base=base, width=1.0))
+        base = base + height
         shown = here.iloc[subsample(len(here), 1500)]
         hover = [
             f"episode {row.episode}, iteration {row.iteration}\n"
@@ -80,7 +81,7 @@ def episode_ends_map(view: LogView) -> Chart | None:
     rows = [[waypoint_panel(counted, "episodes that ended here", n)]]
     if view.course is not None:
         rows.insert(0, [map_panel(view.course, [*placed, *_worst_notes(ends, view.course)])])
-    of = f"{view.episodes['ended'].sum()} episodes{view.traced}"
+    of = f"{count(int(view.episodes['ended'].sum()), 'episode')}{view.traced}"
     return Chart(
         name="episode_ends_map",
         title=f"Where {len(ends)} of {of} ended before the lap was complete",

@@ -158,14 +158,15 @@ def evaluations(view: LogView) -> Chart | None:
         low, high = np.nanmin(times_s), np.nanmax(times_s)
         rim = max(0.1 * (high - low), 0.1)
         panels.append(("Lap time", "lap time, s", laps, (low - rim, high + rim)))
+    which = f"one of {len(names)} evaluations or races" if len(names) > 1 else "an evaluation or race"
     slower = " The best lap of the training is the fastest of many."
     short = [name if len(name) <= 26 else f"{name[:17]}…{name[-8:]}" for name in names]
     axis: dict[str, Any] = {"x_names": short, "x_range": (-0.5, len(names) - 0.5)}
     return Chart(
         name="evaluations",
         title="Evaluations and races",
-        caption=f"Each point is an episode of one of {len(names)} evaluations or races on this course, in the order "
-        f"in which they were driven.{slower if view.trained else ''}",
+        caption=f"Each point is an episode of {which} on this course, in the order in which they were driven."
+        + slower * view.trained,
         rows=[
             [Panel(title=title, y_label=unit, layers=layers, y_range=y_range, **axis)]
             for title, unit, layers, y_range in panels
