@@ -1,6 +1,7 @@
 """Check a reward function without training: call it in many situations and collect failures and warnings."""
 
 import time
+from collections import Counter
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -117,7 +118,7 @@ def look_closer(check: Check) -> None:
         check.state = state_of(setup, Probe(setup), 40 if detail else 5)
         executed, n = _execute_scenes(probe, check) if detail else (None, _SAMPLES[-1][1])
         sampled, rewards = _sample(check, probe, executed, n)
-    check.failures += _failures(setup, probe, check.situations)
+    check.failures += _failures(setup, probe)
     if check.failures:
         return
 
@@ -200,22 +201,21 @@ def _with_line(setup: RaceSetup, what: str, params: dict[str, Any]) -> str:
     return f"line {coverage.returned_at} {what}" if again.failure == what else what
 
 
-def _failures(setup: RaceSetup, probe: Probe, of: int) -> list[str]:
+def _failures(setup: RaceSetup, probe: Probe) -> list[str]:
     """Return each kind of failure once, with the first situation in which it occurred."""
-    counts: dict[str, int] = {}
-    first: dict[str, str] = {}
-    for what, params in probe.failures:
-        counts[what] = counts.get(what, 0) + 1
-        if what in first:
-            continue
+    first = dict(reversed(probe.failures))
+    lines = []
+    for what, n in Counter(what for what, _ in probe.failures).items():
+        params = first[what]
         side = "left" if params["is_left_of_center"] else "right"
         where = "off the track" if params["is_offtrack"] else "on the road"
-        first[what] = (
+        often = f" ({n:,} of {probe.calls:,} situations)" if n > 1 else ""
+        lines.append(
             f"{_with_line(setup, what, params)}, {where}, {params['distance_from_center']:.2f} m {side} of the "
             f"centre line, progress {params['progress']:.1f}, steps {params['steps']:.0f}, "
-            f"speed {params['speed']:.1f}, steering {params['steering_angle']:.0f}"
+            f"speed {params['speed']:.1f}, steering {params['steering_angle']:.0f}{often}"
         )
-    return [first[what] + (f" ({n} of {of:,} situations)" if n > 1 else "") for what, n in counts.items()]
+    return lines
 
 
 def _unreached(text: str, lines: set[int], of: int) -> list[str]:

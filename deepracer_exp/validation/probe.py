@@ -35,6 +35,7 @@ class Probe:
     """A reward module loaded for one car.
 
     Attributes:
+        calls: number of calls made.
         failures: error messages and the params that caused them, in the order of the calls.
         hangs: a call exceeded the time limit or damaged the interpreter's shared state; every later call counts as
             failed without being made.
@@ -46,6 +47,7 @@ class Probe:
     def __init__(self, setup: RaceSetup):
         """Load the module of a race."""
         self._function = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None, scalar=True)
+        self.calls = 0
         self.failures: list[tuple[str, dict[str, Any]]] = []
         self.hangs = False
 
@@ -77,6 +79,7 @@ class Probe:
                         answers.append(Answer(float("nan"), NOT_CALLED))
                         continue
                     guard.restart()
+                    self.calls += 1
                     try:
                         answers.append(Answer(self._function.pay(params)))
                     except RewardFailed as error:

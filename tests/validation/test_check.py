@@ -1,3 +1,5 @@
+import re
+
 import pytest
 
 from deepracer_exp.errors import BadInput
@@ -60,6 +62,14 @@ def test_a_failure_outside_the_named_situations_is_found_and_described(check_of)
     assert "raised ZeroDivisionError" in failure
     assert "steering 30" in failure
     assert "situations)" in failure
+
+
+def test_no_more_situations_fail_than_are_tried(check_of):
+    (failure,) = check_of(
+        function('return 1 / (params["steering_angle"] == 0 and params["speed"] == 2)')
+    ).failures
+    failed, tried = re.search(r"\((\d+) of (\d+) situations\)$", failure).groups()
+    assert 0.8 * int(tried) < int(failed) < int(tried)
 
 
 def test_a_function_that_hangs_is_called_once(check_of):
