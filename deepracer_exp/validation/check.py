@@ -197,7 +197,7 @@ def _with_line(setup: RaceSetup, what: str, params: dict[str, Any]) -> str:
     if not what.startswith("returned"):
         return what
     with Coverage(setup.reward.path) as coverage:
-        again = Probe(setup).call(params)
+        again = Probe(setup).call(dict(params))  # it may change them
     return f"line {coverage.returned_at} {what}" if again.failure == what else what
 
 

@@ -92,6 +92,10 @@ def test_prints_and_changed_params_do_no_harm(check_of, capsys):
     )
     assert check.failures == []
     assert capsys.readouterr().out == ""
+    cleared = 'if params["steering_angle"] == 30:\n    params.clear()\n    return None\nreturn 1.0'
+    (failure,) = check_of(function(cleared)).failures
+    assert "line 4 returned None" in failure
+    assert "steering 30 (" in failure
 
 
 def test_branches_that_are_never_taken_are_reported_with_their_lines(check_of):
