@@ -219,7 +219,7 @@ def _failures(setup: RaceSetup, probe: Probe) -> list[str]:
 
 
 def _unreached(text: str, lines: set[int], of: int) -> list[str]:
-    written = text.splitlines()
+    written = text.split("\n")
     warnings = []
     for first, last in never_executed(text, lines):
         place = f"line {first}" if first == last else f"lines {first} to {last}"

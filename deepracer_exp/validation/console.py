@@ -1,6 +1,7 @@
 """The checks that the AWS console runs on a reward function before it starts a training."""
 
 import ast
+import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ def style_findings(text: str) -> list[ConsoleFinding]:
 
     Lines with a comment `# noqa` are skipped, as in flake8.
     """
-    lines = text.splitlines(keepends=True)
+    lines = io.StringIO(text).readlines()  # splitlines would also split at form feeds
     guide = pycodestyle.StyleGuide(ignore=list(_IGNORED), reporter=_Report)
     pycodestyle.Checker(lines=lines, options=guide.options).check_all()
     found = {(finding, finding.text[:4]) for finding in guide.options.report.found}
@@ -109,7 +110,7 @@ def _imports_and_builtins(tree: ast.Module) -> Iterator[ConsoleFinding]:
 def _words(text: str) -> Iterator[ConsoleFinding]:
     # The longest first, so that `loadtxt` is reported as itself and not as `load`.
     words = sorted(WORDS, key=len, reverse=True)
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):
         for token in re.findall(r"\w+", line):
             word = next((word for word in words if word in token), None)
             if word is not None:

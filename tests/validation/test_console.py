@@ -55,6 +55,11 @@ def test_forbidden_words_are_found_in_comments_too(word):
     ]
 
 
+def test_a_form_feed_is_no_line():
+    text = GOOD.replace("\n\n\ndef", "\n\x0c\n\ndef")
+    assert findings(f"{text}# load\n") == ["line 7: the word load, forbidden anywhere in the text"]
+
+
 def test_a_word_inside_a_longer_one_is_refused_and_shown():
     text = GOOD.replace("return", "payload = 1\n    return payload *")
     assert "line 6: the word load (in payload), forbidden anywhere in the text" in findings(text)
