@@ -15,8 +15,11 @@ import yaml
 from mlflow import MlflowClient
 
 from deepracer_exp.runs.checkpoint_files import write_hashes
+from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store
+from deepracer_exp.tracking.tracker import MLflowTracker
 
 
 @pytest.fixture(scope="session")
@@ -34,9 +37,33 @@ def store(empty_database: Path, tmp_path: Path) -> Store:
 
 
 @pytest.fixture
+def mlflow(store: Store) -> MlflowClient:
+    """A client of `store`."""
+    return MlflowClient(tracking_uri=store.uri)
+
+
+@pytest.fixture
 def identity(tmp_path: Path) -> Path:
     """Where a tracker writes which MLflow run it records."""
     return tmp_path / "tracking.json"
+
+
+@pytest.fixture
+def tracker(store: Store, identity: Path) -> MLflowTracker:
+    """The tracker of a run that has just begun."""
+    tracker = MLflowTracker(store)
+    tracker.start("run", "race", {}, {}, identity)
+    return tracker
+
+
+def runs_of(client: MlflowClient, experiment: str = "race") -> list:
+    return client.search_runs([client.get_experiment_by_name(experiment).experiment_id])
+
+
+def points(client: MlflowClient, run_id: str | None, column: str = "completion") -> list[tuple[int, float]]:
+    """Return step and value of each point that a run has of a column of metrics.jsonl."""
+    history = client.get_metric_history(run_id, metric_name(column))
+    return sorted((point.step, point.value) for point in history)
 
 
 @pytest.fixture
@@ -113,11 +140,15 @@ FEATURES = ("offset", "speed", "yaw_rate")
 SEEN = {"observation": (len(FEATURES),)}
 
 
-OBSERVATION = {
-    "lookahead_m": [0.5, 1.0],
-    "lookahead_scale_m": 2.0,
-    "speed_scale_mps": 4.0,
-    "yaw_rate_scale_radps": 5.0,
+CONFIG = {
+    "track": {"name": "oval", "knots": [1, 2]},
+    "car": {"name": "deepracer"},
+    "observation": {
+        **{"lookahead_m": [0.5, 1.0], "lookahead_scale_m": 2.0},
+        **{"speed_scale_mps": 4.0, "yaw_rate_scale_radps": 5.0},
+    },
+    "evaluation": {"trials": 8, "tracks": None},
+    "algorithm": {"lr": 0.001},
 }
 
 
@@ -132,20 +163,13 @@ class Season:
     ) -> Path:
         """Make a run with the checkpoints 10, 20 (best) and 30 (last); without a status it has no end."""
         run = self.runs_dir / experiment / name
-        values = {
-            "track": {"name": "oval", "knots": [1, 2]},
-            "car": {"name": "deepracer"},
-            "name": experiment,
-        }
-        values |= {"observation": OBSERVATION}
-        values |= {"evaluation": {"trials": 8, "tracks": None}, "algorithm": {"lr": 0.001}}
         for iteration in (10, 20, 30):
             self.checkpoint(run, iteration)
         (run / "checkpoints" / "best").symlink_to("000020")
         (run / "checkpoints" / "last").symlink_to("000030")
         (run / "trace").mkdir()
         (run / "trace" / "00001-iteration.parquet").write_bytes(bytes(1000))
-        (run / "config.yaml").write_text(yaml.safe_dump(values | config))
+        (run / "config.yaml").write_text(yaml.safe_dump(CONFIG | {"name": experiment} | config))
         (run / "overrides.yaml").write_text("[]\n")
         (run / "provenance.json").write_text("{}")
         if status is not None:
@@ -174,12 +198,8 @@ class Season:
     ) -> Path:
         run = self.run(name, **config)
         lineage = {"parent": parent.name, "parent_dir": str(parent.resolve()), "parent_run_id": None}
-        lineage |= {
-            "checkpoint": checkpoint,
-            "sha256": "0" * 64,
-            "generation": generation,
-            "registered": None,
-        }
+        lineage |= {"checkpoint": checkpoint, "sha256": "0" * 64, "registered": None}
+        lineage["generation"] = generation
         (run / "lineage.json").write_text(json.dumps(lineage))
         return run
 
@@ -191,6 +211,17 @@ class Season:
         run_id = client.create_run(experiment, 0, {"run_dir": str(run.resolve())}).info.run_id
         (run / "tracking.json").write_text(json.dumps({"run_id": run_id}))
         return run_id
+
+    def promote(self, run: Path, name="best", model="season", uri: str | None = None) -> Registered:
+        """Promote a checkpoint of a recorded run as champion."""
+        return promote(run, name, model, "champion", FEATURES, SEEN, uri, self.runs_dir)
+
+    def champion(self, client: MlflowClient, name: str = "best") -> Path:
+        """Make and record a run, and promote a checkpoint of it."""
+        run = self.run("1")
+        self.recorded(run, client)
+        self.promote(run, name)
+        return run
 
 
 @pytest.fixture

@@ -10,9 +10,7 @@ import pytest
 
 from deepracer_exp.runs.checkpoint_files import pin
 from deepracer_exp.runs.clean import DELETED, FAILED_TRACE, SPARE_CHECKPOINTS, remove, survey
-from deepracer_exp.tracking.registry import promote, read_overview
-
-from .conftest import FEATURES, SEEN
+from deepracer_exp.tracking.registry import read_overview
 
 HOUR_S = 3600
 
@@ -21,15 +19,18 @@ def tree(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
+def surveyed(season, asked: bool):
+    """Look what may go; `asked`: MLflow is read."""
+    return survey(season.runs_dir, read_overview(None, season.runs_dir) if asked else None)
+
+
 def listed(season, *, asked: bool = False) -> list[tuple[str, str, list[str]]]:
-    """Return what may go; `asked`: MLflow was read."""
-    found = survey(season.runs_dir, read_overview(None, season.runs_dir) if asked else None)
-    return [(item.run.name, item.what, [path.name for path in item.paths]) for item in found.removable]
+    removable = surveyed(season, asked).removable
+    return [(item.run.name, item.what, [path.name for path in item.paths]) for item in removable]
 
 
 def kept(season, *, asked: bool = False) -> dict[str, str]:
-    found = survey(season.runs_dir, read_overview(None, season.runs_dir) if asked else None)
-    return {run.name: reason for run, reason in found.kept}
+    return {run.name: reason for run, reason in surveyed(season, asked).kept}
 
 
 def age(run: Path, seconds: float) -> None:
@@ -48,11 +49,9 @@ def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp
 
 
 def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
-    run = season.run("1")
-    season.recorded(run, client)
-    promote(run, "10", "model", "champion", FEATURES, SEEN, None, season.runs_dir)
+    run = season.champion(client, "10")
     (run / "checkpoints" / "pinned.json").unlink()
-    client.delete_registered_model_alias("model", "champion")
+    client.delete_registered_model_alias("season", "champion")
     assert listed(season, asked=True) == []
 
 
@@ -85,13 +84,13 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
     cloned, registered = season.run("1"), season.run("2")
     season.clone("3", cloned)
     ids = [season.recorded(run, client) for run in (cloned, registered)]
-    promote(registered, "best", "model", "champion", FEATURES, SEEN, None, season.runs_dir)
+    season.promote(registered)
     for run_id in ids:
         client.delete_run(run_id)
     assert DELETED not in [what for _, what, _ in listed(season, asked=True)]
     reasons = kept(season, asked=True)
     assert reasons["1"] == "deleted in MLflow, but needed: 000020 cloned to 3"
-    assert reasons["2"] == "deleted in MLflow, but needed: 000020 registered as model"
+    assert reasons["2"] == "deleted in MLflow, but needed: 000020 registered as season"
 
 
 def test_a_run_that_a_training_holds_stays_until_it_is_released(season):

@@ -3,13 +3,14 @@
 import json
 
 import pytest
-from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking.delivery import deliver, deliver_evaluation, is_delivered
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.tracking_file import read_tracked_run
+
+from .conftest import points, runs_of
 
 
 @pytest.fixture
@@ -43,37 +44,31 @@ def run_dir(tmp_path, away):
     return folder
 
 
-def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, store, tmp_path, caplog):
+def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, store, mlflow, tmp_path, caplog):
     moved = run_dir.rename(tmp_path / "moved")  # what was logged is found there, too
     assert not is_delivered(moved, store.uri, tmp_path)
     assert deliver(moved, store.uri, tmp_path) == 9
     assert is_delivered(moved, store.uri, tmp_path)
-    client = MlflowClient(tracking_uri=store.uri)
-    (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
+    (run,) = runs_of(mlflow)
     tracked = read_tracked_run(moved / "tracking.json")
-    assert (run.info.run_name, run.info.status) == ("run", "FINISHED")
-    assert (run.info.run_id, run.info.start_time, run.info.end_time) == (
-        tracked.run_id, tracked.start_ms, tracked.end_ms,
-    )  # fmt: skip
+    assert (run.info.run_id, run.info.run_name, run.info.status) == (tracked.run_id, "run", "FINISHED")
+    assert (run.info.start_time, run.info.end_time) == (tracked.start_ms, tracked.end_ms)
     assert run.data.params == {"seed": "1"}
     wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "stopped early: collapsed"}
     assert run.data.tags.items() >= wanted.items()
     assert run.data.metrics.keys() == {"train/completion", "train/iteration", "time/wall_clock_s"}
-    files = {file.path for file in client.list_artifacts(run.info.run_id)}
-    assert files == {"summary.json", "checkpoints"}
+    assert {file.path for file in mlflow.list_artifacts(run.info.run_id)} == {"summary.json", "checkpoints"}
     assert deliver(moved, store.uri, tmp_path) == 0
-    history = client.get_metric_history(run.info.run_id, "train/completion")
-    assert [(point.step, point.value) for point in history] == [(100, 1 / 3), (200, 2 / 3), (300, 1.0)]
+    assert points(mlflow, run.info.run_id) == [(100, 1 / 3), (200, 2 / 3), (300, 1.0)]
     assert not [record for record in caplog.records if record.name.endswith("delivery")]
 
 
-def test_a_run_killed_before_it_logged_its_end_is_ended_by_its_summary(run_dir, store, tmp_path):
+def test_a_run_killed_before_it_logged_its_end_is_ended_by_its_summary(run_dir, store, mlflow, tmp_path):
     tracked = json.loads((run_dir / "tracking.json").read_text())
     del tracked["tags"]["end"]
     (run_dir / "tracking.json").write_text(json.dumps({**tracked, "status": None, "end_ms": None}))
     deliver(run_dir, store.uri, tmp_path)
-    run_id = read_tracked_run(run_dir / "tracking.json").run_id
-    run = MlflowClient(tracking_uri=store.uri).get_run(run_id)
+    (run,) = runs_of(mlflow)
     assert (run.info.status, run.data.tags["end"]) == ("FINISHED", "stopped early: collapsed")
 
 
@@ -92,10 +87,10 @@ def test_a_store_that_is_still_away_is_named_and_costs_nothing(run_dir, away, tm
     assert (run_dir / "tracking.json").read_text() == before
 
 
-def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, tmp_path):
+def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, mlflow, tmp_path):
     deliver(run_dir, store.uri, tmp_path)
     run_id = read_tracked_run(run_dir / "tracking.json").run_id
-    MlflowClient(tracking_uri=store.uri).delete_run(run_id)
+    mlflow.delete_run(run_id)
     with pytest.raises(BadInput, match=f"{run_id} was deleted in MLflow"):
         deliver(run_dir, store.uri, tmp_path)
     (run_dir / "summary.json").unlink()
@@ -103,18 +98,17 @@ def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, tmp_path):
         deliver(run_dir, store.uri, tmp_path)
 
 
-def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, tmp_path, away, caplog):
+def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, mlflow, tmp_path, away, caplog):
     deliver(run_dir, store.uri, tmp_path)
     film = tmp_path / "lap.mp4"
     film.write_bytes(b"film")
     metrics = {"race/evaluate/lap_time_s": 8.765, "race/evaluate/score_s": None}
     deliver_evaluation(run_dir, store.uri, tmp_path, 300, metrics, {film: "films"})
-    client = MlflowClient(tracking_uri=store.uri)
-    run_id = read_tracked_run(run_dir / "tracking.json").run_id
-    assert client.get_run(run_id).info.status == "FINISHED"
-    (point,) = client.get_metric_history(run_id, "race/evaluate/lap_time_s")
+    (run,) = runs_of(mlflow)
+    assert run.info.status == "FINISHED"
+    (point,) = mlflow.get_metric_history(run.info.run_id, "race/evaluate/lap_time_s")
     assert (point.step, point.value) == (300, 8.765)
-    assert [file.path for file in client.list_artifacts(run_id, "films")] == ["films/lap.mp4"]
+    assert [file.path for file in mlflow.list_artifacts(run.info.run_id, "films")] == ["films/lap.mp4"]
     caplog.clear()
     deliver_evaluation(run_dir, away, tmp_path, 300, metrics, {film: "films"})
     assert [record.levelname for record in caplog.records] == ["WARNING"]

@@ -62,14 +62,8 @@ def test_a_store_is_shown_without_password(tmp_path):
 PASSWORD = "s3cr/t@{0}%25 word"
 USER = "racer+1"
 TINY = (
-    *(
-        "experiment=tiny",
-        "collector=in_process",
-        "collector.threads=1",
-        "checkpoints.every=1",
-        "episode.max_steps=60",
-    ),
-    *("budget.env_steps=null", "budget.iterations=2", "debug=true"),
+    *("experiment=tiny", "collector=in_process", "collector.threads=1", "checkpoints.every=1"),
+    *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=2", "debug=true"),
 )
 
 

@@ -7,10 +7,7 @@ import pytest
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.resolve import resolve
-from deepracer_exp.tracking.registry import promote
 from deepracer_exp.tracking.store import folder_of, is_run_id
-
-from .conftest import FEATURES, SEEN
 
 
 def refusal(run, season) -> str:
@@ -99,9 +96,7 @@ def test_a_summary_that_is_none_is_named(season, text):
 
 
 def test_an_alias_leads_to_run_and_checkpoint(season, client):
-    run = season.run("1")
-    season.recorded(run, client)
-    promote(run, "10", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
+    run = season.champion(client, "10")
     for given in ("champion", "season@champion"):
         found = resolve(given, season.runs_dir, None)
         assert (found.path, found.checkpoint, found.registered) == (run, "000010", "season@champion")
@@ -109,24 +104,21 @@ def test_an_alias_leads_to_run_and_checkpoint(season, client):
 
 
 def test_a_runs_name_goes_before_an_alias(season, client):
-    season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
+    run = season.champion(client)
     named = season.run("champion-of-all")
     assert resolve("champion", season.runs_dir, None).path == named
     assert resolve("season@champion", season.runs_dir, None).path == run
 
 
 def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, tmp_path):
-    season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
+    season.champion(client)
     moved = tmp_path / "moved"
     season.runs_dir.rename(moved)
     assert resolve("champion", moved, None).path == moved / "season" / "1"
 
 
 def test_a_checkpoint_that_is_not_the_registered_one_is_refused(season, client):
-    season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
+    run = season.champion(client)
     checkpoint = run / "checkpoints" / "000020"
     file = checkpoint / "agent" / "state.tdz"
     file.write_text("other weights")
@@ -160,20 +152,15 @@ UNKNOWN = {
 
 
 def test_what_no_model_is_called_by_is_refused(season, client):
-    season.recorded(run := season.run("1"), client)
-    promote(run, "best", "season", "champion", FEATURES, SEEN, None, season.runs_dir)
+    season.champion(client)
     for reference, words in UNKNOWN.items():
         assert words in refusal(reference, season), reference
 
 
 def test_a_bare_alias_of_two_models_is_refused(season, client):
-    season.recorded(run := season.run("1"), client)
-    for model in ("a", "b"):
-        promote(run, "best", model, "champion", FEATURES, SEEN, None, season.runs_dir)
-    text = refusal("champion", season)
-    assert "2 models have this alias" in text
-    assert "a@champion, b@champion" in text
-    assert resolve("b@champion", season.runs_dir, None).registered == "b@champion"
+    season.promote(season.champion(client), model="spring")
+    assert "2 models have this alias: season@champion, spring@champion" in refusal("champion", season)
+    assert resolve("spring@champion", season.runs_dir, None).registered == "spring@champion"
 
 
 def test_a_model_that_others_registered_is_refused(season, client):
@@ -190,25 +177,19 @@ def test_without_a_store_a_word_is_no_alias(season):
     assert not (season.runs_dir / "mlflow.db").exists()
 
 
-def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client):
+def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client, tmp_path):
     run = season.run("one")
-    run_id = season.recorded(run, client)
+    run_id, foreign = season.recorded(run, client), client.create_run("0").info.run_id
     assert is_run_id(run_id)
     assert folder_of(run_id, None, season.runs_dir) == run
-    with pytest.raises(BadInput, match=r"Run with id=0+ not found"):
-        folder_of("0" * 32, None, season.runs_dir)
     client.delete_run(run_id)
-    with pytest.raises(BadInput, match="was deleted in MLflow"):
-        folder_of(run_id, None, season.runs_dir)
-
-
-def test_a_foreign_run_is_refused(season, client):
-    run_id = client.create_run("0").info.run_id
-    with pytest.raises(BadInput, match="not a run of deepracer-exp"):
-        folder_of(run_id, None, season.runs_dir)
-
-
-def test_without_a_store_there_is_nothing_to_look_up(tmp_path):
-    with pytest.raises(BadInput, match=r"no mlflow\.db"):
-        folder_of("0" * 32, None, tmp_path)
-    assert not list(tmp_path.iterdir())
+    (tmp_path / "empty").mkdir()
+    for given, runs_dir, words in (
+        (run_id, season.runs_dir, "was deleted in MLflow"),
+        ("0" * 32, season.runs_dir, r"Run with id=0+ not found"),
+        (foreign, season.runs_dir, "not a run of deepracer-exp"),
+        (run_id, tmp_path / "empty", r"no mlflow\.db"),
+    ):
+        with pytest.raises(BadInput, match=words):
+            folder_of(given, None, runs_dir)
+    assert not list((tmp_path / "empty").iterdir())

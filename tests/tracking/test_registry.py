@@ -8,9 +8,9 @@ from mlflow import MlflowClient
 from mlflow.models import Model
 
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
-from deepracer_exp.tracking.registry import is_alias, look_up, promote
+from deepracer_exp.tracking.registry import is_alias, look_up
 
-from .conftest import FEATURES, SEEN
+from .conftest import FEATURES
 
 
 def model_id(version) -> str:
@@ -20,8 +20,8 @@ def model_id(version) -> str:
 def check_promotion(season, client, uri):
     run = season.run("1")
     run_id = season.recorded(run, client)
-    first = promote(run, "best", "model", "champion", FEATURES, SEEN, uri, season.runs_dir)
-    version = client.get_model_version_by_alias("model", "champion")
+    first = season.promote(run, uri=uri)
+    version = client.get_model_version_by_alias("season", "champion")
     assert version.run_id == run_id
     assert version.tags == {
         "run_dir": str(run),
@@ -30,13 +30,13 @@ def check_promotion(season, client, uri):
     }
     kept = {file.path for file in client.list_logged_model_artifacts(model_id(version), "checkpoint/agent")}
     assert kept == {"checkpoint/agent/state.tdz"}
-    assert pinned(run / "checkpoints") == {"000020": ["registered as model"]}
-    assert promote(run, "20", "model", "champion", FEATURES, SEEN, uri, season.runs_dir) == first
-    second = promote(run, "last", "model", "champion", FEATURES, SEEN, uri, season.runs_dir)
+    assert pinned(run / "checkpoints") == {"000020": ["registered as season"]}
+    assert season.promote(run, "20", uri=uri) == first
+    second = season.promote(run, "last", uri=uri)
     assert int(second.version) > int(first.version)
-    assert look_up("model@champion", uri, season.runs_dir) == second
-    assert look_up("champion", uri, season.runs_dir) == second
-    assert len(client.search_model_versions("name = 'model'")) == 2
+    for reference in ("season@champion", "champion"):
+        assert look_up(reference, uri, season.runs_dir) == second
+    assert len(client.search_model_versions("name = 'season'")) == 2
 
 
 def test_a_promoted_checkpoint_is_registered_kept_and_found_by_its_alias(season, client):
@@ -54,15 +54,13 @@ def test_a_server_takes_promotions_as_well(season, server):
 def test_a_promoted_version_has_metrics_signature_report_and_description(season, client):
     run = season.run("1")
     run_id = season.recorded(run, client)
-    rows = [
-        {"iteration": n, "env_steps": 100 * n, "eval_lap_time_s": 9.876543, "kl": 1.0} for n in (10, 20, 30)
-    ]
+    rows = [{"iteration": n, "env_steps": 100 * n, "eval_lap_time_s": 9.876543, "kl": 1.0} for n in (10, 20)]
     rows[1] |= {"eval_completion": 98.7654, "eval_race_score_s": 9.5}
     (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (run / "report.html").write_text("<p>what the training reports")
     client.log_metric(run_id, "race/score_s", 9.5, 1234, 2000)
-    promote(run, "best", "model", "champion", FEATURES, SEEN, None, season.runs_dir)
-    version = client.get_model_version_by_alias("model", "champion")
+    season.promote(run)
+    version = client.get_model_version_by_alias("season", "champion")
     assert version.description.startswith(
         "Checkpoint 20 of `1`: race score 9.50 s, lap 9.88 s, 98.8 % of the lap."
     )
@@ -78,39 +76,34 @@ def test_a_promoted_version_has_metrics_signature_report_and_description(season,
     assert not [path for path in files.rglob("*") if path.suffix in (".pkl", ".pickle", ".pt", ".pth")]
 
 
-def spoil(checkpoint: Path) -> None:
-    (checkpoint / "agent" / "state.tdz").write_text("?")
+TRACKING = "tracking.json"
 
 
 @pytest.mark.parametrize(
-    ("change", "arguments", "words"),
+    ("argument", "file", "text", "words"),
     [
-        (lambda run, client, run_id: spoil(run / "checkpoints/000020"), (), "corrupt"),
-        (lambda run, client, run_id: (run / "tracking.json").unlink(), (), "is not recorded in MLflow"),
-        (
-            lambda run, client, run_id: (run / "tracking.json").write_text('{"run_id": null}'),
-            (),
-            "is not recorded in MLflow",
-        ),
-        (lambda run, client, run_id: (run / "tracking.json").write_text("[]"), (), "tracking.json"),
-        (lambda run, client, run_id: (run / "tracking.json").write_text('{"run_id": 3}'), (), "run_id: 3"),
-        (
-            lambda run, client, run_id: (run / "tracking.json").write_text(json.dumps({"run_id": "0" * 32})),
-            (),
-            "not found",
-        ),
-        (lambda run, client, run_id: client.delete_run(run_id), (), "was deleted in MLflow"),
-        (None, ("checkpoint=77",), "000077 is not there"),
-        (None, ("checkpoint=../x",), "best, last or the number"),
-        (None, ("tracking.uri=ftp://x",), "tracking.uri=ftp://x"),
+        (None, "checkpoints/000020/agent/state.tdz", "?", "corrupt"),
+        (None, TRACKING, None, "is not recorded in MLflow"),
+        (None, TRACKING, '{"run_id": null}', "is not recorded in MLflow"),
+        (None, TRACKING, "[]", "tracking.json"),
+        (None, TRACKING, '{"run_id": 3}', "run_id: 3"),
+        (None, TRACKING, json.dumps({"run_id": "0" * 32}), "not found"),
+        (None, None, None, "was deleted in MLflow"),
+        ("checkpoint=77", None, None, "000077 is not there"),
+        ("checkpoint=../x", None, None, "best, last or the number"),
+        ("tracking.uri=ftp://x", None, None, "tracking.uri=ftp://x"),
     ],
 )
-def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, change, arguments, words):
+def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, argument, file, text, words):
     run = season.run("1")
     run_id = season.recorded(run, client)
-    if change is not None:
-        change(run, client, run_id)
-    ended = call("runs", "promote", "1", *arguments)
+    if file is not None:
+        (run / file).unlink()
+        if text is not None:
+            (run / file).write_text(text)
+    elif argument is None:
+        client.delete_run(run_id)
+    ended = call("runs", "promote", "1", *filter(None, [argument]))
     assert ended.code == 2, ended.stderr
     assert words in ended.complaint
     assert ended.stdout == ""
@@ -122,15 +115,11 @@ def test_what_cannot_be_promoted_is_refused_in_one_line(season, client, call, ch
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--alias", "latest"), "'latest' is not an alias"),
-        (("--alias", "Latest"), "'Latest' is not an alias"),
-        (("--alias", "v12"), "'v12' is not an alias"),
-        (("--alias", ""), "'' is not an alias"),
-        (("--alias", "a b"), "'a b' is not an alias"),
-        (("--alias", "champion\n"), "is not an alias"),
-        (("--model", "a/b"), "'a/b' is not a model name"),
-        (("--model", ""), "'' is not a model name"),
-        (("--model", "a:b"), "'a:b' is not a model name"),
+        *(
+            (("--alias", name), f"{name!r} is not an alias")
+            for name in ("latest", "Latest", "v12", "", "a b", "champion\n")
+        ),
+        *((("--model", name), f"{name!r} is not a model name") for name in ("a/b", "", "a:b")),
     ],
 )
 def test_a_name_that_cannot_be_is_refused_before_anything_is_asked(call, arguments, words):
@@ -162,10 +151,7 @@ def test_the_command_names_the_experiment_s_model_and_says_what_to_do_next(seaso
 
 
 def test_mlflow_would_take_every_alias_that_we_do():
-    from mlflow.utils.validation import (
-        _validate_model_alias_name,
-        _validate_model_alias_name_reserved,
-    )
+    from mlflow.utils.validation import _validate_model_alias_name, _validate_model_alias_name_reserved
 
     for alias in ("champion", "a", "v", "v1a", "V-2", "latest2", "a" * 80):
         assert is_alias(alias)

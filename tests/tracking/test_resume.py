@@ -7,19 +7,22 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.tracking_file import read_tracked_run
 
+from .conftest import points, runs_of
 
-def row(iteration: int, completion: float | None = None) -> dict[str, float]:
-    return {
-        "iteration": iteration,
-        "env_steps": 100 * iteration,
-        "wall_clock_s": iteration / 8,
-        "completion": iteration / 3 if completion is None else completion,
-    }
+
+def rows_until(iteration: int) -> list[dict[str, float]]:
+    return [
+        {"iteration": n, "env_steps": 100 * n, "wall_clock_s": n / 8, "completion": n / 3}
+        for n in range(1, iteration + 1)
+    ]
+
+
+def logged_until(iteration: int) -> list[tuple[int, float]]:
+    return [(row["env_steps"], row["completion"]) for row in rows_until(iteration)]
 
 
 def log(tracker, rows, safe: bool = True):
@@ -30,126 +33,106 @@ def log(tracker, rows, safe: bool = True):
 
 
 @pytest.fixture
-def client(store):
-    return MlflowClient(tracking_uri=store.uri)
-
-
-@pytest.fixture
 def killed(store, identity, wait_until):
     """Return the tracker of a run of ten iterations that was never finished."""
     tracker = MLflowTracker(store)
     params, tags = {"seed": 1}, {"track": "oval", "mlflow.note.content": "as it began"}
     tracker.start("run", "race", params, tags, identity)
-    log(tracker, [row(iteration) for iteration in range(1, 11)])
+    log(tracker, rows_until(10))
     wait_until(lambda: tracker.waiting == 0 and read_tracked_run(identity).run_id is not None)
     return tracker
 
 
-def runs(client):
-    return client.search_runs([client.get_experiment_by_name("race").experiment_id])
-
-
-def points(client, run_id, key="completion"):
-    return [(point.step, point.value) for point in client.get_metric_history(run_id, metric_name(key))]
-
-
-def test_a_resumed_run_continues_the_same_mlflow_run(store, client, identity, killed):
+@pytest.fixture
+def resumed(store, identity, killed):
+    """Return a tracker that continues that run."""
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    rows = [row(iteration) for iteration in range(1, 21)]
-    log(tracker, rows)
-    assert tracker.finish("FINISHED") == 0
-    (run,) = runs(client)
-    assert run.info.run_id == tracker.run_id == killed.run_id
+    return tracker
+
+
+def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, resumed):
+    rows = rows_until(20)
+    log(resumed, rows)
+    assert resumed.finish("FINISHED") == 0
+    (run,) = runs_of(mlflow)
+    assert run.info.run_id == resumed.run_id == killed.run_id
     assert run.info.status == "FINISHED"
     for key in ("completion", "iteration"):
-        assert points(client, run.info.run_id, key) == [(one["env_steps"], one[key]) for one in rows]
-    history = client.get_metric_history(run.info.run_id, "train/completion")
+        assert points(mlflow, run.info.run_id, key) == [(one["env_steps"], one[key]) for one in rows]
+    history = mlflow.get_metric_history(run.info.run_id, "train/completion")
     start_ms = read_tracked_run(identity).start_ms
     assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 21)]
     assert "env_steps" not in run.data.metrics
 
 
-def test_points_wait_for_a_checkpoint_and_block_nothing_else(store, client, identity, wait_until, caplog):
-    tracker = MLflowTracker(store)
-    tracker.start("run", "race", {}, {}, identity)
-    log(tracker, [row(iteration) for iteration in range(1, 11)], safe=False)
+def test_points_wait_for_a_checkpoint_and_block_nothing_else(tracker, mlflow, wait_until, caplog):
+    log(tracker, rows_until(10), safe=False)
     tracker.set_tag("budget", "50 %")
-    wait_until(lambda: bool(tracker.run_id) and "budget" in client.get_run(tracker.run_id).data.tags)
-    assert points(client, tracker.run_id) == []
+    wait_until(lambda: bool(tracker.run_id) and "budget" in mlflow.get_run(tracker.run_id).data.tags)
+    assert points(mlflow, tracker.run_id) == []
     tracker.safe_until(400)
-    wait_until(lambda: len(points(client, tracker.run_id)) == 4)
+    wait_until(lambda: len(points(mlflow, tracker.run_id)) == 4)
     tracker.set_tag("budget", "80 %")
     assert tracker.finish("KILLED") == 0
-    assert points(client, tracker.run_id) == [(100 * n, n / 3) for n in range(1, 5)]
+    assert points(mlflow, tracker.run_id) == logged_until(4)
     assert not caplog.records
 
 
-def test_two_processes_that_log_the_same_rows_record_them_once(store, client, identity, killed):
-    """A request of a killed process may be handled by a slow server after the new process has looked."""
-    both = [MLflowTracker(store) for _ in range(2)]
-    for tracker in both:
-        tracker.reopen(identity)
-    for tracker in both:
-        log(tracker, [row(iteration) for iteration in range(1, 101)])
-    assert [tracker.finish("FINISHED") for tracker in both] == [0, 0]
-    assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 101)]
-
-
-def test_a_run_whose_id_was_never_heard_is_found_again(store, client, identity, killed):
+def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, identity, killed):
     identity.write_text(json.dumps({**json.loads(identity.read_text()), "run_id": None}))
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     assert tracker.finish("FINISHED") == 0
-    assert [run.info.run_id for run in runs(client)] == [killed.run_id]
+    assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
     assert read_tracked_run(identity).run_id == killed.run_id
 
 
-def test_a_run_that_was_never_created_begins_when_it_began(store, client, identity, free_port, tmp_path):
+def test_a_run_that_was_never_created_begins_when_it_began(store, mlflow, identity, free_port):
     away = MLflowTracker(type(store)(f"http://127.0.0.1:{free_port}", None))
     away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
-    log(away, [row(1)])
+    log(away, rows_until(1))
     away.finish("KILLED", deadline_s=0)
     tracked = read_tracked_run(identity)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    log(tracker, [row(1), row(2)])
+    log(tracker, rows_until(2))
     assert tracker.finish("FINISHED") == 0
-    (run,) = runs(client)
+    (run,) = runs_of(mlflow)
     assert (tracked.run_id, run.info.start_time, run.info.run_name) == (None, tracked.start_ms, "run")
     assert (run.data.params, run.data.tags["track"]) == ({"seed": "1"}, "oval")
-    assert points(client, run.info.run_id) == [(100, 1 / 3), (200, 2 / 3)]
+    assert points(mlflow, run.info.run_id) == logged_until(2)
 
 
 def test_a_run_resumed_with_another_store_is_complete_there(
-    store, client, identity, killed, empty_database, tmp_path
+    store, mlflow, identity, killed, empty_database, tmp_path
 ):
     (tmp_path / "other").mkdir()
     shutil.copy(empty_database, tmp_path / "other" / "mlflow.db")
     other = resolve_store(None, tmp_path / "other")
     tracker = MLflowTracker(other)
     tracker.reopen(identity)
-    log(tracker, [row(iteration) for iteration in range(1, 13)])
+    log(tracker, rows_until(12))
     assert tracker.finish("FINISHED") == 0
     there = MlflowClient(tracking_uri=other.uri)
-    assert [run.info.run_id for run in runs(there)] == [tracker.run_id]
-    assert points(there, tracker.run_id) == [(100 * n, n / 3) for n in range(1, 13)]
+    assert [run.info.run_id for run in runs_of(there)] == [tracker.run_id]
+    assert points(there, tracker.run_id) == logged_until(12)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
     assert tracker.finish("FINISHED") == 0
-    assert [run.info.run_id for run in runs(client)] == [killed.run_id]
+    assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
 
 
-def test_a_resumed_run_is_shown_as_running(store, client, identity, killed, wait_until):
+def test_a_resumed_run_is_shown_as_running(store, mlflow, identity, killed, wait_until):
     killed.set_tag("end", "interrupted: by Ctrl-C")
     killed.finish("KILLED")
-    client.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
+    mlflow.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    wait_until(lambda: client.get_run(killed.run_id).info.status == "RUNNING")
+    wait_until(lambda: mlflow.get_run(killed.run_id).info.status == "RUNNING")
     tracker.set_tag("went", "on")
-    wait_until(lambda: "went" in client.get_run(killed.run_id).data.tags)
-    data = client.get_run(killed.run_id).data
+    wait_until(lambda: "went" in mlflow.get_run(killed.run_id).data.tags)
+    data = mlflow.get_run(killed.run_id).data
     assert "end" not in data.tags
     assert data.tags["mlflow.note.content"] == "edited in the UI"
     assert (data.params, data.tags["track"]) == ({"seed": "1"}, "oval")
@@ -157,24 +140,26 @@ def test_a_resumed_run_is_shown_as_running(store, client, identity, killed, wait
 
 
 def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
-    store, client, identity, killed, caplog
+    store, mlflow, identity, killed, caplog
 ):
-    client.delete_run(killed.run_id)
+    mlflow.delete_run(killed.run_id)
     tracker = MLflowTracker(store)
     tracker.reopen(identity)
-    log(tracker, [row(iteration) for iteration in range(1, 21)])
+    log(tracker, rows_until(20))
     assert tracker.finish("FINISHED") > 0
     (record,) = caplog.records
     assert f"run {killed.run_id} was deleted in MLflow; restore it there" in record.message
-    assert points(client, killed.run_id)[-1] == (1000, 10 / 3)
+    assert points(mlflow, killed.run_id) == logged_until(10)
 
 
-def test_a_repeated_iteration_that_differs_is_not_doubled(store, client, identity, killed):
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
-    log(tracker, [row(iteration) for iteration in range(1, 10)] + [row(10, completion=99.0)])
-    assert tracker.finish("FINISHED") == 0
-    assert points(client, killed.run_id) == [(100 * n, n / 3) for n in range(1, 11)]
+def test_a_repeated_iteration_that_differs_is_not_doubled(mlflow, killed, resumed):
+    *same, last = rows_until(10)
+    log(resumed, [*same, last | {"completion": 99.0}])
+    assert resumed.finish("FINISHED") == 0
+    assert points(mlflow, killed.run_id) == logged_until(10)
+
+
+TRACKED = {"run_id": None, "run_name": "a", "experiment": "b", "start_ms": 2, "store": "c"}
 
 
 @pytest.mark.parametrize(
@@ -184,14 +169,8 @@ def test_a_repeated_iteration_that_differs_is_not_doubled(store, client, identit
         ("{", "Invalid JSON"),
         ("[]", "accepted: what a tracker writes there"),
         ("{}", "run_id: Field required"),
-        (
-            '{"run_id": 1, "run_name": "a", "experiment": "b", "start_ms": 2, "store": "c"}',
-            "run_id: Input should be",
-        ),
-        (
-            '{"run_id": null, "run_name": "a", "experiment": "b", "start_ms": "x", "store": "c"}',
-            "start_ms: Input should be",
-        ),
+        (json.dumps(TRACKED | {"run_id": 1}), "run_id: Input should be"),
+        (json.dumps(TRACKED | {"start_ms": "x"}), "start_ms: Input should be"),
     ],
 )
 def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
@@ -202,7 +181,7 @@ def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
     assert str(identity) in str(refused.value)
 
 
-def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(store, client, tmp_path):
+def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(store, mlflow, tmp_path):
     def train(name: str, lap_s: float) -> str:
         folder = tmp_path / name
         folder.mkdir()
@@ -218,21 +197,20 @@ def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(st
         assert tracker.finish("FINISHED", 60) == 0
         return str(tracker.run_id)
 
-    def notes(run_id: str) -> tuple[str, str]:
-        run = client.get_run(run_id)
-        return run.data.tags["mlflow.note.content"], client.get_experiment(run.info.experiment_id).tags[
-            "mlflow.note.content"
-        ]
+    def note_of_experiment() -> str:
+        return mlflow.get_experiment_by_name("race").tags["mlflow.note.content"]
 
-    slow, fast = train("slow", 12.3456789), train("fast", 8.7654321)
-    of_run, of_experiment = notes(fast)
+    train("slow", 12.3456789)
+    fast = train("fast", 8.7654321)
+    of_run = mlflow.get_run(fast).data.tags["mlflow.note.content"]
     assert of_run.startswith("**finished**: converged: all")
     assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0 % of the lap" in of_run
     assert f"(get-artifact?path=best_lap.png&run_uuid={fast})" in of_run
     assert of_run.endswith("as it began")
-    assert "[fast]" in of_experiment
-    assert "8.77 s" in of_experiment
-    assert client.get_run(fast).data.metrics["race/best/lap_time_s"] == 8.7654321
-    experiment_id = client.get_run(slow).info.experiment_id
-    client.set_experiment_tag(experiment_id, "mlflow.note.content", "mine")
-    assert notes(train("fastest", 7.0))[1] == "mine"
+    assert "[fast]" in note_of_experiment()
+    assert "8.77 s" in note_of_experiment()
+    assert mlflow.get_run(fast).data.metrics["race/best/lap_time_s"] == 8.7654321
+    experiment_id = mlflow.get_run(fast).info.experiment_id
+    mlflow.set_experiment_tag(experiment_id, "mlflow.note.content", "mine")
+    train("fastest", 7.0)
+    assert note_of_experiment() == "mine"

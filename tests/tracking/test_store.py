@@ -8,19 +8,17 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracker import open_tracker
 
+SERVERS = "accepted: http(s)://host:port"
+
 
 @pytest.mark.parametrize(
     ("uri", "said"),
     [
         ("sqllite:///x.db", "did you mean sqlite?"),
-        ("ftp://host", "accepted: http(s)://host:port"),
-        ("./mlruns", "accepted: http(s)://host:port"),
-        ("file:///tmp/mlruns", "accepted: http(s)://host:port"),
+        *((uri, SERVERS) for uri in ("ftp://host", "./mlruns", "file:///tmp/mlruns")),
         ("http://", "no host"),
         ("http://host:port", "accepted: http://host:port"),
-        ("sqlite://", "names no file"),
-        ("sqlite:///", "names no file"),
-        ("sqlite:///:memory:", "names no file"),
+        *((uri, "names no file") for uri in ("sqlite://", "sqlite:///", "sqlite:///:memory:")),
         ("sqlite:////proc/none/mlflow.db", "folder /proc/none cannot be created"),
         ("sqlite:////proc/x.db", "/proc/x.db cannot be written"),
         ("sqlite:////proc", "is a folder"),
@@ -39,14 +37,20 @@ def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
         resolve_store(None, tmp_path / "why?")
 
 
-def test_checking_a_uri_does_not_import_mlflow(tmp_path):
+def test_neither_a_uri_that_is_checked_nor_tracking_off_imports_mlflow(tmp_path):
     code = (
         "import sys; from pathlib import Path; from deepracer_exp.tracking.tracker import *\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
         f"resolve_store(None, Path({str(tmp_path)!r}))\n"
+        f"tracker = open_tracker(TrackingOff(kind='off'), Path({str(tmp_path / 'runs')!r}))\n"
+        "tracker.start('run', 'race', {}, {}, Path('no/tracking.json')); tracker.reopen(Path('none'))\n"
+        "tracker.log({'kl': 1.0}, 1); tracker.safe_until(1); tracker.set_tag('a', 'b')\n"
+        "tracker.log_artifact(Path('x')); assert tracker.finish('FINISHED') == 0\n"
+        "assert tracker.run_id is None\n"
         "assert not {name for name in sys.modules if name.startswith(('mlflow', 'torch'))}"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_relative_sqlite_file_means_the_same_after_a_change_of_folder(tmp_path, monkeypatch):

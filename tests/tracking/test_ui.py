@@ -15,24 +15,14 @@ from deepracer_exp.tracking.metrics import METRICS
 from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.ui import existing_store, running_ui, runs_page, serve_ui
 
-NAMES = {
-    "track": "reinvent_base",
-    "reward": "progress_per_step",
-    "network": "mlp_small",
-    "action_space": "discrete_15",
-    "lr_schedule": "linear",
-}
+NAMES = {"track": "reinvent_base", "reward": "progress_per_step", "network": "mlp_small"}
 
 
 def record(store, runs_dir: Path, seed: int) -> str:
     tracker = MLflowTracker(store)
-    tracker.start(
-        f"progress_per_step s{seed}",
-        "race",
-        run_params({}, NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}, []),
-        run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed)),
-        runs_dir / "tracking.json",
-    )
+    params = run_params({}, NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}, [])
+    tags = run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed))
+    tracker.start(f"progress_per_step s{seed}", "race", params, tags, runs_dir / "tracking.json")
     tracker.log({key: float(seed) for key in reversed(METRICS)}, 8192)
     (runs_dir / "notes.json").write_text('{"seed": 1}')
     tracker.log_artifact(runs_dir / "notes.json", "reports")
@@ -68,10 +58,8 @@ def test_the_ui_shows_runs_by_name_and_opens_their_files(store, tmp_path, free_p
     with running_ui(existing_store(tmp_path, None), free_port) as (url, _):
         client = MlflowClient(tracking_uri=url)
         experiment = client.get_experiment_by_name("race")
-        page = f"{url}/#/experiments/{experiment.experiment_id}/runs"
-        assert (
-            runs_page(url, None, tmp_path) == f"{page}?workflowType=machine_learning&viewStateShareKey={VIEW}"
-        )
+        page = f"{url}/#/experiments/{experiment.experiment_id}/runs?workflowType=machine_learning"
+        assert runs_page(url, None, tmp_path) == f"{page}&viewStateShareKey={VIEW}"
         runs = {run.info.run_id: run for run in client.search_runs([experiment.experiment_id])}
         assert runs.keys() == set(run_ids)
         for seed, run_id in enumerate(run_ids, start=1):
