@@ -68,12 +68,8 @@ def add(
     run_dir = Path(study.user_attrs["runs_dir"]) / study.study_name / f"run-{number}"
     if metrics:
         write_metrics(run_dir, metrics, 1e4 if outcome == "not_learning" else 20.0 + 7 * (number % 8))
-    attributes = {
-        "slot": number,
-        "outcome": outcome,
-        "reason": f"{outcome.replace('_', ' ')}: for a reason",
-        "attempt": 1,
-    }
+    reason = f"{outcome.replace('_', ' ')}: for a reason"
+    attributes = {"slot": number, "outcome": outcome, "reason": reason, "attempt": 1}
     attributes |= {"overrides": [f"{key}={value}" for key, value in params.items()], "run_dir": str(run_dir)}
     attributes |= {"env_steps": 100_000, "wall_clock_s": 40.0, "lap_time_s": 9.5, "completion": 97.0}
     attributes |= {"runs": [{"seed": 0, "run_dir": str(run_dir), "status": "finished", "value": values}]}
@@ -117,29 +113,15 @@ def season(
         values = {"race_score": lap_s * 100 / completion, "lap_time": lap_s, "completion": completion}
         kinds = ["converged", "finished", "overfitting", "plateau"]
         if dice.random() < 0.05:
-            add(
-                study,
-                None,
-                "failed",
-                params=params,
-                reason="RunFailed: reward is NaN",
-                traceback="Traceback\n  x",
-            )
+            error = {"reason": "RunFailed: reward is NaN", "traceback": "Traceback\n  x"}
+            add(study, None, "failed", params=params, **error)
         elif off > 0.9:
             outcome = dice.choice(["not_learning", "collapsed", "median", "hyperband"])
             seen = dice.uniform(60, 100) if len(objectives) == 1 else None
-            add(
-                study,
-                None,
-                outcome,
-                params=params,
-                seen=seen,
-                metrics=rows // 3,
-                completion=20.0,
-                lap_time_s=None,
-            )
+            poor = {"completion": 20.0, "lap_time_s": None}
+            add(study, None, outcome, params=params, seen=seen, metrics=rows // 3, **poor)
         else:
             found = [values[name] for name in objectives]
-            add(study, found, dice.choice(kinds), params=params, metrics=rows, lap_time_s=lap_s, completion=completion,
-                env_steps=350_000, held_out_completion=completion - 4)  # fmt: skip
+            good = {"completion": completion, "held_out_completion": completion - 4, "lap_time_s": lap_s}
+            add(study, found, dice.choice(kinds), params=params, metrics=rows, env_steps=350_000, **good)
     return study

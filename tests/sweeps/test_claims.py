@@ -31,9 +31,13 @@ def test_racing_processes_get_each_trial_once_and_take_over_each_expired_lease_o
     assert sum(map(len, lines)) == 24
 
 
-def test_no_write_of_a_late_owner_is_kept(claims):
+def test_the_next_owner_gets_what_a_late_one_recorded_and_no_later_write_of_that_is_kept(claims):
     late = claims.claim("late", 1, 0.0)
+    runs = [{"seed": 1, "run_dir": "runs/ä", "status": "running", "value": None}]
+    assert claims.record(late, trial_id=3)
+    assert claims.record(late, runs=runs)
     heir = claims.claim("heir", 1, HOUR_S)
+    assert (heir.index, heir.attempt, heir.trial_id, heir.runs) == (0, 2, 3, tuple(runs))
     claims.record(heir, trial_id=7, runs=[{"seed": 1}])
     before = claims.all()
     assert not claims.renew(late, HOUR_S, {"completion": 100.0})
@@ -44,16 +48,6 @@ def test_no_write_of_a_late_owner_is_kept(claims):
     assert claims.settle(heir, result("PRUNED", outcome="collapsed"))
     assert not claims.settle(late, result(values=[1.0]))
     assert claims.all()[0].result.state == "PRUNED"
-
-
-def test_the_next_owner_gets_what_the_earlier_one_recorded(claims):
-    first = claims.claim("first", 1, 0.0)
-    runs = [{"seed": 1, "run_dir": "runs/ä", "status": "running", "value": None}]
-    assert claims.record(first, trial_id=3)
-    assert claims.record(first, runs=runs)
-    heir = claims.claim("heir", 1, HOUR_S)
-    assert (heir.index, heir.attempt) == (0, 2)
-    assert (heir.trial_id, heir.runs) == (3, tuple(runs))
 
 
 def test_a_lease_expires_by_itself_and_not_before(claims):
@@ -155,7 +149,7 @@ def test_kills_in_the_middle_of_claiming_lose_and_double_no_trial(url, claims, r
     printed = {int(line.split()[0]) for lines in racers.lines() for line in lines if line.count(" ") == 2}
     found = claims.all()
     assert [one.index for one in found] == list(range(total)), "the one that lives has claimed the rest"
-    assert printed <= {one.index for one in found}
+    assert printed <= set(range(total))
     for one in found:
         assert claims.release(one.owner) == 1
     _settle_all(claims, total)

@@ -5,6 +5,7 @@ import signal
 import sqlite3
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import optuna
@@ -23,10 +24,6 @@ def _refused(url: str | None, runs_dir: Path) -> str:
         open_storage(url, runs_dir)
     assert "\n" not in str(refused.value)
     return str(refused.value)
-
-
-def _make_study(url: str) -> optuna.Study:
-    return optuna.create_study(study_name="study", storage=open_storage(url, Path()).optuna)
 
 
 @pytest.mark.parametrize("name", ["runs", "two words {0} 50%41 who?x=1 #1 läufe [a]*"])
@@ -112,27 +109,17 @@ def test_a_database_of_another_program_is_refused_and_left_as_it_is(url):
     engine.dispose()
 
 
-def test_no_password_is_shown_by_a_server_that_refuses(postgres_server):
-    wrong = postgres_server.url(password="wr0ng/{p}@ss%")
-    missing = postgres_server.url("nowhere")
-    messages = [_refused(wrong, Path()), _refused(missing, Path())]
-    assert "password authentication failed" in messages[0]
-    assert '"nowhere" does not exist' in messages[1]
-    for message in messages:
-        assert "wr0ng" not in message
-        assert "s3cr" not in message
-
-
-def test_a_storage_never_shows_its_password(postgres_server):
+def test_no_password_is_shown_by_a_storage_nor_by_a_server_that_refuses(postgres_server):
     storage = open_storage(postgres_server.new_database(), Path())
-    for text in (
-        repr(storage),
-        str(storage),
-        storage.url,
-        repr(resolve_database(postgres_server.url(), Path())),
-    ):
-        assert "s3cr" not in text
     assert "127.0.0.1" in storage.url
+    wrong = _refused(postgres_server.url(password="wr0ng/{p}@ss%"), Path())
+    missing = _refused(postgres_server.url("nowhere"), Path())
+    assert "password authentication failed" in wrong
+    assert '"nowhere" does not exist' in missing
+    database = resolve_database(postgres_server.url(), Path())
+    for text in (repr(storage), str(storage), storage.url, repr(database), wrong, missing):
+        assert "s3cr" not in text
+        assert "wr0ng" not in text
 
 
 def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
@@ -164,25 +151,18 @@ def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
     claim = claims.claim("one", 2, HOUR_S)
     trial = study.ask()
     postgres.stop(signal.Signals[how])
-    done = []
     calls = [
         lambda: claims.renew(claim, HOUR_S),
         lambda: claims.record(claim, trial_id=trial._trial_id),
         lambda: study.tell(trial, 1.0, skip_if_finished=True).state.name,
         lambda: open_storage(url, Path(), patience_s=HOUR_S).optuna.get_n_trials(study._study_id),
     ]
-    threads = [
-        threading.Thread(target=lambda call=call: done.append(patiently(call, HOUR_S)), daemon=True)
-        for call in calls
-    ]
-    for thread in threads:
-        thread.start()
-    time.sleep(0.5)
-    assert done == []
-    postgres.start()
-    for thread in threads:
-        thread.join(120.0)
-    assert sorted(map(str, done)) == ["1", "COMPLETE", "True", "True"]
+    with ThreadPoolExecutor(len(calls)) as threads:
+        waiting = [threads.submit(patiently, call, HOUR_S) for call in calls]
+        time.sleep(0.5)
+        assert not any(one.done() for one in waiting)
+        postgres.start()
+        assert [one.result(120.0) for one in waiting] == [True, True, "COMPLETE", 1]
     assert claims.all()[0].trial_id == trial._trial_id
 
 
@@ -199,7 +179,7 @@ def test_a_server_that_stays_away_ends_the_wait_in_one_line(postgres):
 
 def test_a_locked_file_is_waited_for(tmp_path):
     url = f"sqlite:///{tmp_path}/sweeps.db"
-    study = _make_study(url)
+    study = optuna.create_study(study_name="study", storage=open_storage(url, Path()).optuna)
     impatient = sa.create_engine(url, connect_args={"timeout": 0.0})
     claims = TrialClaims(impatient, "study")
     other = sqlite3.connect(tmp_path / "sweeps.db", isolation_level=None, check_same_thread=False)
