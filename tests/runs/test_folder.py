@@ -68,14 +68,6 @@ def test_a_file_is_there_whole_or_not_at_all(folder, monkeypatch):
     assert sorted(path.name for path in folder.path.iterdir()) == [".running", "summary.json"]
 
 
-def test_metrics_are_one_line_a_row(folder):
-    rows = [{"iteration": 1, "mean_return": None}, {"iteration": 2, "mean_return": 0.5}]
-    for row in rows:
-        folder.append_metrics(row)
-    lines = (folder.path / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line) for line in lines] == rows
-
-
 def test_a_folder_that_cannot_be_made_is_bad_input(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match="runs_dir=") as error:

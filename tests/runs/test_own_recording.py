@@ -6,18 +6,24 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.recording import (
     EVALUATION_COLUMNS,
     METRICS_COLUMNS,
     STEP_COLUMNS,
     UPDATE_COLUMNS,
 )
+from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.own_recording import is_own_run, read_own_recording
 from deepracer_exp.runs.trace import read_trace
 
 OWN = ("stream", "worker", "wall_clock")
 """Columns that a trace of ours does not have."""
+
+
+def kinds(table) -> dict[str, str]:
+    return {name: str(kind) for name, kind in table.dtypes.items()}
 
 
 @pytest.fixture
@@ -28,9 +34,8 @@ def folder(trained, tmp_path):
 
 def test_the_steps_are_the_rows_of_the_trace(trained):
     steps = read_own_recording(trained().folder).steps
-    assert {name: str(steps[name].dtype) for name in steps} == {
-        name: kind for name, (kind, _) in STEP_COLUMNS.items()
-    }
+    assert steps.groupby("episode")["iteration"].nunique().max() > 1
+    assert kinds(steps) == {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
     trace = read_trace(trained().folder / "trace")
     assert len(steps) == len(trace) == 4096
     for name in STEP_COLUMNS:
@@ -41,20 +46,10 @@ def test_the_steps_are_the_rows_of_the_trace(trained):
     assert steps["wall_clock"].isna().all()
 
 
-def test_rows_of_an_episode_keep_their_own_iterations(trained):
-    steps = read_own_recording(trained().folder).steps
-    iterations = steps.groupby("episode")["iteration"].nunique()
-    assert iterations.max() > 1
-    # The steps of each follow one another.
-    assert set(steps.groupby("episode")["steps"].diff().dropna()) == {1}
-
-
 def test_iterations_of_updates_evaluations_and_trace_are_those_of_the_metrics(trained):
     run = trained()
     recording = read_own_recording(run.folder)
-    assert {name: str(kind) for name, kind in recording.updates.dtypes.items()} == {
-        name: kind for name, (kind, _) in UPDATE_COLUMNS.items()
-    }
+    assert kinds(recording.updates) == {name: kind for name, (kind, _) in UPDATE_COLUMNS.items()}
     assert (
         recording.updates["iteration"].tolist()
         == sorted(recording.steps["iteration"].unique())
@@ -82,35 +77,29 @@ def test_what_was_trained_with_is_reported_in_the_services_words(trained):
     assert trained().folder / "config.yaml" in recording.files
 
 
-@pytest.mark.parametrize("space", ["grid_fine", "continuous"])
-def test_the_action_space_is_that_of_the_environment(trained, space):
-    from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.env.action_space import build_action_space, metadata_of
-
-    overrides = (f"action_space={space}",)
-    experiment, _ = compose_experiment(overrides)
-    recording = read_own_recording(trained(*overrides, "budget.iterations=1").folder)
+@pytest.mark.parametrize(
+    "overrides", [(), ("action_space=continuous", "budget.iterations=1")], ids=["discrete", "continuous"]
+)
+def test_the_action_space_is_that_of_the_environment(trained, overrides):
+    experiment, _ = compose_experiment(["experiment=tiny", *overrides])
+    recording = read_own_recording(trained(*overrides).folder)
     assert recording.metadata == metadata_of(build_action_space(experiment.action_space))
-    assert recording.steps["action"].isna().all() == (space == "continuous")
+    assert recording.steps["action"].isna().all() == bool(overrides)
 
 
-def test_an_incomplete_file_of_the_trace_is_left_out_and_reported(folder):
-    incomplete = folder / "trace" / "00002-iteration.parquet"
-    incomplete.write_bytes(incomplete.read_bytes()[:-100])
+@pytest.mark.parametrize("kind", ["incomplete", "of another kind"])
+def test_a_file_of_the_trace_that_cannot_be_read_is_left_out_and_reported(folder, kind):
+    file = folder / "trace" / "00002-iteration.parquet"
+    if kind == "incomplete":
+        file.write_bytes(file.read_bytes()[:-100])
+    else:
+        pd.DataFrame({"episode": np.arange(10)}).to_parquet(file)
     recording = read_own_recording(folder)
     assert set(recording.steps["iteration"]) == {1, 3, 4}
     (problem,) = recording.problems
-    assert problem.file == str(incomplete)
+    assert problem.file == str(file)
     assert problem.reason.startswith("left out: ")
-    assert incomplete not in recording.files
-
-
-def test_a_file_of_another_kind_among_the_trace_is_left_out_and_reported(folder):
-    other = folder / "trace" / "00003-iteration.parquet"
-    pd.DataFrame({"episode": np.arange(10)}).to_parquet(other)
-    recording = read_own_recording(folder)
-    assert set(recording.steps["iteration"]) == {1, 2, 4}
-    assert [problem.file for problem in recording.problems] == [str(other)]
+    assert file not in recording.files
 
 
 def test_a_line_of_the_metrics_cut_off_by_a_kill_is_reported(folder):
@@ -123,17 +112,16 @@ def test_a_line_of_the_metrics_cut_off_by_a_kill_is_reported(folder):
 
 
 def test_missing_files_beside_the_trace_are_reported(folder):
-    for name in ("metrics.jsonl", "config.yaml", "reward_function.py"):
-        (folder / name).unlink()
+    missing = [folder / name for name in ("config.yaml", "metrics.jsonl", "reward_function.py")]
+    for file in missing:
+        file.unlink()
     recording = read_own_recording(folder)
     assert len(recording.steps) == 4096
     assert len(recording.updates) == len(recording.evaluations) == 0
     assert (
         recording.metadata is recording.hyperparameters is recording.reward_source is recording.track is None
     )
-    assert sorted(problem.file for problem in recording.problems) == sorted(
-        str(folder / name) for name in ("metrics.jsonl", "config.yaml", "reward_function.py")
-    )
+    assert sorted(problem.file for problem in recording.problems) == list(map(str, missing))
 
 
 def test_without_a_trace_there_is_nothing_to_read(folder):
