@@ -23,13 +23,15 @@ def processes():
 
 
 @pytest.fixture
-def watch(tmp_path, monkeypatch):
+def watch(tmp_path, monkeypatch, processes):
+    """Watch two workers, which have begun."""
     monkeypatch.setattr(watchdog, "_LOOK_EVERY_S", 0.05)
     monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
     made = []
 
     def make(lockstep: bool, timeout_s: float = 1.0) -> Watchdog:
         made.append(Watchdog(tmp_path / "beats", 2, timeout_s, lockstep))
+        made[-1].workers_started(processes)
         return made[-1]
 
     yield make
@@ -61,7 +63,6 @@ def _keep_beating(counters, workers, dog) -> None:
 
 def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, processes):
     dog = watch(lockstep=False)
-    dog.workers_started(processes)
     counters = beats()
     counters[:] = 1
     dog.expect()
@@ -73,9 +74,8 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     assert processes[1].is_alive()
 
 
-def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats, processes):
+def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats):
     dog = watch(lockstep=True)
-    dog.workers_started(processes)
     beats()[:] = 10
     dog.expect()
     dog.delivered(0)
@@ -83,10 +83,9 @@ def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats, proc
     assert list(dog.verdict) == [1]
 
 
-def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats, processes):
+def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats):
     """A worker may hang after the last step of its part as well as within it."""
     dog = watch(lockstep=True)
-    dog.workers_started(processes)
     counters = beats()
     counters[:] = 10
     dog.expect()
@@ -98,19 +97,8 @@ def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats, 
 
 def test_no_worker_is_ended_while_none_is_waited_for(watch, beats, processes):
     dog = watch(lockstep=False)
-    dog.workers_started(processes)
     beats()[:] = 1
     dog.rest()
     time.sleep(1.5)
     assert not dog.verdict
     assert all(process.is_alive() for process in processes)
-
-
-def test_the_first_to_die_is_remembered(watch, processes):
-    dog = watch(lockstep=True, timeout_s=600)
-    dog.workers_started(processes)
-    processes[1].kill()
-    _wait_until(lambda: dog.first_dead is not None)
-    processes[0].kill()
-    processes[0].join()
-    assert dog.first_dead == 1
