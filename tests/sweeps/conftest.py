@@ -1,18 +1,22 @@
 """Databases of the tests of `sweeps`, and processes that race for what is in them."""
 
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import uuid
 from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+import optuna
 import pytest
 import sqlalchemy as sa
 
+from deepracer_exp.commands.startup import start_workers_early
 from sweeps.claims import TrialClaims
 from sweeps.storage import resolve_database
+
+from .studies import season
 
 PATIENCE_S = 120.0
 MYSQL = "SWEEPS_TEST_MYSQL"
@@ -48,56 +52,59 @@ def claims(engine: sa.Engine) -> TrialClaims:
     return TrialClaims(engine, "study")
 
 
+@pytest.fixture(scope="session")
+def study(tmp_path_factory: pytest.TempPathFactory) -> optuna.Study:
+    """A study of 60 trials with every kind of end, which no test changes."""
+    return season(tmp_path_factory.mktemp("runs"), 60)
+
+
 class Racers:
     """Processes that wait at the start line until all of them are there."""
 
-    def __init__(self, arguments: Sequence[Sequence[str]]) -> None:
-        racer = str(Path(__file__).with_name("racer.py"))
+    def __init__(
+        self, what: Callable[..., None], url: str, files: Sequence[Path], arguments: Sequence[object]
+    ):
+        start = multiprocessing.Barrier(len(files) + 1, timeout=PATIENCE_S)
+        self._files = files
         self._processes = [
-            subprocess.Popen(
-                [sys.executable, racer, *each],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                env=os.environ | {"OMP_NUM_THREADS": "1"},
-            )
-            for each in arguments
-        ]  # fmt: skip
+            multiprocessing.Process(target=what, args=(url, file, start, *arguments)) for file in files
+        ]
+        for process in self._processes:
+            process.start()
+        start.wait()
 
-    def __getitem__(self, number: int) -> subprocess.Popen[str]:
+    def __getitem__(self, number: int) -> BaseProcess:
         return self._processes[number]
 
-    def go(self) -> None:
-        for process in self._processes:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n", process.communicate()
-        for process in self._processes:
-            assert process.stdin is not None
-            process.stdin.write("go\n")
-            process.stdin.flush()
-
     def lines(self) -> list[list[str]]:
-        """Return what each of them printed; they must end well, or by a SIGKILL."""
-        printed = []
+        """Return what each of them wrote; they must end well, or by a SIGKILL."""
         for process in self._processes:
-            out, err = process.communicate(timeout=PATIENCE_S)
-            assert process.returncode in (0, -signal.SIGKILL), err
-            printed.append(out.splitlines())
-        return printed
+            process.join(PATIENCE_S)
+            assert process.exitcode in (0, -signal.SIGKILL)
+        return [file.read_text().splitlines() if file.exists() else [] for file in self._files]
 
     def destroy(self) -> None:
         for process in self._processes:
             process.kill()
-            process.communicate()
+            process.join()
+
+
+@pytest.fixture(scope="session")
+def fork_server() -> Iterator[None]:
+    """Let processes fork from one that has imported what a sweep's worker needs, as the command does."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    start_workers_early(True, "sweeps.worker")
+    yield
+    multiprocessing.set_start_method(before, force=True)
 
 
 @pytest.fixture
-def race() -> Iterator[Callable[..., Racers]]:
-    """Start `racer.py WHAT URL OWNER ARGUMENT...` for each of some owners and let them go together."""
+def race(tmp_path: Path, fork_server: None) -> Iterator[Callable[..., Racers]]:
+    """Let each of some owners do the same in a process: `race(WHAT, URL, OWNERS, ARGUMENTS...)`."""
     started: list[Racers] = []
 
-    def start(what: str, url: str, owners: Sequence[str], *arguments: object) -> Racers:
-        more = [str(argument) for argument in arguments]
-        started.append(Racers([[what, url, owner, *more] for owner in owners]))
-        started[-1].go()
+    def start(what: Callable[..., None], url: str, owners: Sequence[str], *arguments: object) -> Racers:
+        started.append(Racers(what, url, [tmp_path / owner for owner in owners], arguments))
         return started[-1]
 
     yield start

@@ -7,6 +7,8 @@ import sqlalchemy as sa
 
 from sweeps.claims import TrialClaims, TrialResult
 
+from .racer import claim_all
+
 THREE = ("anna", "ben", "cleo")
 HOUR_S = 3600.0
 
@@ -25,7 +27,7 @@ def test_racing_processes_get_each_trial_once_and_take_over_each_expired_lease_o
         claims.record(claim := claims.claim(owner, 24, HOUR_S), trial_id=40 + claim.index)
     for owner in ("first", "second"):
         assert claims.release(owner) == 1
-    lines = race("claim", url, THREE, 24, HOUR_S).lines()
+    lines = race(claim_all, url, THREE, 24, HOUR_S).lines()
     claimed = {line for printed in lines for line in printed}
     assert claimed == {"0 2 40", "1 2 41", *(f"{index} 1 None" for index in range(2, 24))}
     assert sum(map(len, lines)) == 24
@@ -142,7 +144,7 @@ def test_studies_of_one_database_share_no_claim(engine, claims):
 
 def test_kills_in_the_middle_of_claiming_lose_and_double_no_trial(url, claims, race):
     total = 20
-    racers = race("claim", url, THREE, total, HOUR_S)
+    racers = race(claim_all, url, THREE, total, HOUR_S)
     for number in (0, 1):
         time.sleep(random.uniform(0.0, 0.05))
         racers[number].kill()

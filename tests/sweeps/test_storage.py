@@ -16,6 +16,8 @@ from deepracer_exp.errors import BadInput, RunFailed
 from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage, patiently, resolve_database
 
+from .racer import make_trials
+
 HOUR_S = 3600.0
 
 
@@ -37,7 +39,7 @@ def test_the_default_is_a_file_in_the_folder_of_the_runs_whatever_its_name(tmp_p
 
 
 def test_processes_that_start_together_share_one_study_and_number_each_trial_once(url, race):
-    lines = race("storage", url, ("anna", "ben", "cleo"), 2).lines()
+    lines = race(make_trials, url, ("anna", "ben", "cleo"), 2).lines()
     assert sorted(int(line) for printed in lines for line in printed) == list(range(6))
     trials = optuna.load_study(study_name="study", storage=open_storage(url, Path()).optuna).trials
     assert [trial.number for trial in trials] == list(range(6))
@@ -45,7 +47,7 @@ def test_processes_that_start_together_share_one_study_and_number_each_trial_onc
 
 
 def test_a_process_killed_while_it_makes_the_tables_leaves_nothing_in_the_way(url, race):
-    racers = race("storage", url, ("anna", "ben"), 1)
+    racers = race(make_trials, url, ("anna", "ben"), 1)
     for number in (0, 1):
         time.sleep(random.uniform(0.0, 0.2))
         racers[number].kill()
