@@ -2,19 +2,12 @@ import itertools
 import random
 
 import numpy as np
-import optuna
 import pytest
 
-from deepracer_exp.errors import BadInput
 from sweeps.figures import FEWEST_COMPLETE, figures, narrowed, thinned
 from sweeps.labels import OUTCOMES, outcome_of, short_keys
 
-from .studies import DISTRIBUTIONS, add, new_study, season
-
-
-@pytest.fixture(scope="module")
-def study(tmp_path_factory):
-    return season(tmp_path_factory.mktemp("runs"), 60)
+from .studies import DISTRIBUTIONS, add, new_study
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +36,12 @@ def test_all_figures_have_one_style_and_a_layout_for_a_narrow_screen(drawn):
     assert all(above[0] > below[1] for above, below in itertools.pairwise(ends))
 
 
-def test_every_complete_trial_is_in_the_history(study, drawn):
+def test_the_history_has_every_complete_trial_and_the_decisive_parameter_is_the_most_important(study, drawn):
     numbers = {number for trace in drawn["history"].data if trace.mode == "markers" for number in trace.x}
     assert numbers == {trial.number for trial in study.trials if trial.state.name == "COMPLETE"}
+    (bars,) = drawn["importance"].data
+    assert bars.y[-1] == "lr"
+    assert sum(bars.x) == pytest.approx(1, abs=0.001)
 
 
 @pytest.mark.parametrize(
@@ -64,12 +60,6 @@ def test_a_few_failures_take_no_room_from_the_others(tmp_path, objective, usual,
     assert low < min(usual) < max(usual) < high
 
 
-def test_the_decisive_parameter_is_the_most_important(drawn):
-    (bars,) = drawn["importance"].data
-    assert bars.y[-1] == "lr"
-    assert sum(bars.x) == pytest.approx(1, abs=0.001)
-
-
 def test_several_objectives_have_a_figure_each_and_a_pareto_front(tmp_path):
     study, dice = new_study(tmp_path, objectives=["lap_time", "completion"]), random.Random(2)
     for made in range(30):
@@ -81,9 +71,8 @@ def test_several_objectives_have_a_figure_each_and_a_pareto_front(tmp_path):
         }
         add(study, [dice.uniform(8, 12), dice.uniform(60, 100)], params=params)
     found = figures(study)
-    of_each = {
-        f"{one}-{name}" for one in ("history", "importance", "slice") for name in ("lap_time", "completion")
-    }
+    kinds = ("history", "importance", "slice")
+    of_each = {f"{kind}-{name}" for kind in kinds for name in ("lap_time", "completion")}
     assert set(found) == of_each | {"pareto", "parallel"}
     drawn = {(x, y) for trace in found["pareto"].data for x, y in zip(trace.x, trace.y, strict=True)}
     assert drawn == {tuple(trial.values) for trial in study.trials}
@@ -137,11 +126,6 @@ def test_an_empty_study_and_one_that_just_begins_have_no_figures(tmp_path):
     study.enqueue_trial({"algorithm.lr": 1e-4})
     study.ask({"algorithm.lr": DISTRIBUTIONS["algorithm.lr"]})
     assert figures(study) == {}
-
-
-def test_a_study_that_no_sweep_made_is_refused():
-    with pytest.raises(BadInput, match="not made by `deepracer-exp sweep`"):
-        figures(optuna.create_study(study_name="theirs"))
 
 
 def test_keys_are_short_and_distinct():

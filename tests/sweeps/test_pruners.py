@@ -84,31 +84,19 @@ def test_hyperband_prunes_losers_of_a_rung():
 
 
 def test_a_patient_pruner_waits_while_a_trial_improves():
-    better = [99, 98, 97, 96, 95, 94]
-    stuck = [95, 95, 99, 99, 99, 99]
+    better, stuck = [99, 98, 97, 96, 95, 94], [95, 95, 99, 99, 99, 99]
     for name in ("median", "percentile", "hyperband"):
-        study = study_of(SIX)
-        hasty = build_pruner(settings(name, warmup_evaluations=0), evaluations=6)
-        patient = build_pruner(settings(name, warmup_evaluations=0, patience=2), evaluations=6)
+        study, own = study_of(SIX), {"warmup_evaluations": 0}
+        patient = build_pruner(settings(name, **own, patience=2), evaluations=6)
         assert pruned_at(study, patient, better) is None
         if name != "hyperband":  # it looks at its rungs only
-            assert pruned_at(study, hasty, better)[0] == 1
+            assert pruned_at(study, build_pruner(settings(name, **own)), better)[0] == 1
             assert pruned_at(study, patient, stuck)[0] == 5
 
 
 @pytest.mark.parametrize("pruners", [(), ("entropy",), ("wilcoxon",)])
 def test_pruners_that_compare_no_evaluations_let_every_trial_continue(pruners):
     assert pruned_at(study_of(SIX), build_pruner(settings(*pruners)), [99, 99, 99]) is None
-
-
-def test_optuna_asks_the_same_pruner():
-    study = study_of(SIX)
-    study.pruner = build_pruner(settings("entropy", "median"))
-    trial = study.ask()
-    trial.report(99, 1)
-    assert not trial.should_prune()
-    trial.report(99, 2)
-    assert trial.should_prune()
 
 
 def test_pruners_that_compare_one_score_are_refused_with_several_objectives():
@@ -154,13 +142,10 @@ def test_wilcoxon_prunes_a_trial_that_is_worse_than_the_best_one_seed_by_seed(be
     assert is_worse_across_seeds(seeded((40, 42, 41), best), values) == is_worse
 
 
-def test_wilcoxon_prunes_low_values_of_an_objective_to_maximize():
+def test_wilcoxon_follows_the_direction_and_needs_a_best_trial():
     study = seeded([90, 92, 91], direction="maximize")
     assert is_worse_across_seeds(study, [60, 70])
     assert not is_worse_across_seeds(study, [95, 96])
-
-
-def test_wilcoxon_prunes_nothing_without_a_best_trial():
     assert not is_worse_across_seeds(seeded(), [36, 35])
     study = optuna.create_study(directions=["minimize", "maximize"])
     study.add_trial(create_trial(values=[30, 90]))

@@ -11,11 +11,6 @@ from tests.page_html import Html
 from .studies import add, new_study, season, write_metrics
 
 
-@pytest.fixture(scope="module")
-def study(tmp_path_factory):
-    return season(tmp_path_factory.mktemp("runs"), 60)
-
-
 def test_the_page_is_complete_and_loads_nothing(study, tmp_path):
     path = write_study_page(study, tmp_path / "report.html")
     html = path.read_text(encoding="utf-8")
@@ -64,9 +59,8 @@ def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_three_megaby
         values = [9 + number % 97 / 50, 80 + number % 89 / 10]
         add(study, values, params=params, distributions=wide, reason="a reason " * 30)
     write_metrics(tmp_path / "lr_entropy" / "run-0", 250)
-    for trial in study.get_trials(
-        deepcopy=False
-    ):  # all of them have the same curve, which saves a thousand files
+    # All of them have the same curve, which saves a thousand files.
+    for trial in study.get_trials(deepcopy=False):
         trial.user_attrs["runs"] = [{"run_dir": str(tmp_path / "lr_entropy" / "run-0")}]
     html = study_page(study)
     assert len(html.encode()) < 3_000_000
