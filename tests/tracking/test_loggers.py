@@ -9,6 +9,7 @@ from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 from deepracer_exp.tracking.metrics import METRICS, metric_name
 from deepracer_exp.tracking.tracker import Tracker, open_tracker
+from tests.conftest import IN_PROCESS
 
 ROWS = [
     {"env_steps": 100 * k, "wall_clock_s": 2.0 * k, "mean_return": float(k), "eval_lap_time_s": None}
@@ -109,7 +110,7 @@ def test_a_missing_package_is_one_line_that_names_the_extra(call, kind, monkeypa
 
 def test_a_training_writes_its_curves_for_tensorboard(call):
     pytest.importorskip("tensorboard")
-    ended = call("train", "experiment=tiny", "tracking=tensorboard", "budget.iterations=2")
+    ended = call("train", *IN_PROCESS, "tracking=tensorboard", "budget.iterations=1")
     assert ended.code == 0, ended.stderr
     found, _ = scalars(ended.folder / TENSORBOARD)
     steps = [row["env_steps"] for row in ended.metrics]
