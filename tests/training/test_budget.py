@@ -27,6 +27,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def sibling(run: Path, name: str, *, ended: bool = True, **spent: float) -> None:
+    """Write what a run of the same experiment has used; one that has not ended was cut off within a row."""
     folder = run.parent / name
     folder.mkdir(exist_ok=True)
     row = json.dumps({"env_steps": 0, "wall_clock_s": 0.0, **spent})
@@ -36,24 +37,22 @@ def sibling(run: Path, name: str, *, ended: bool = True, **spent: float) -> None
         (folder / "metrics.jsonl").write_text(f"{json.dumps({'env_steps': 1})}\n{row}\n" + '{"env_st')
 
 
-def test_the_limit_nearest_to_its_end_counts():
-    budget = Budget(limits(env_steps=1000, iterations=10, minutes=1.0))
-    assert budget.used(100, 2, 3.0) == ("iterations", 0.2)
-    assert budget.used(900, 2, 3.0) == ("env_steps", 0.9)
-    assert budget.used(100, 2, 60.0) == ("minutes", 1.0)
-
-
 @pytest.mark.parametrize(
-    ("limit", "used"),
+    ("limit", "at", "used"),
     [
-        ({"env_steps": 1000}, ("env_steps", 0.5)),
-        ({"iterations": 10}, ("iterations", 0.1)),
-        ({"minutes": 0.5}, ("minutes", 3.0)),
-        ({"max_cost": 1.0, "price_per_hour": 20.0}, ("max_cost", 0.5)),
+        # The limit nearest to its end counts.
+        ({"env_steps": 1000, "iterations": 10, "minutes": 1.0}, (100, 2, 3.0), ("iterations", 0.2)),
+        ({"env_steps": 1000, "iterations": 10, "minutes": 1.0}, (900, 2, 3.0), ("env_steps", 0.9)),
+        ({"env_steps": 1000, "iterations": 10, "minutes": 1.0}, (100, 2, 60.0), ("minutes", 1.0)),
+        # One that is not set never does.
+        ({"env_steps": 1000}, (500, 1, 90.0), ("env_steps", 0.5)),
+        ({"iterations": 10}, (500, 1, 90.0), ("iterations", 0.1)),
+        ({"minutes": 0.5}, (500, 1, 90.0), ("minutes", 3.0)),
+        ({"max_cost": 1.0, "price_per_hour": 20.0}, (500, 1, 90.0), ("max_cost", 0.5)),
     ],
 )
-def test_a_limit_that_is_not_set_never_counts(limit, used):
-    assert Budget(limits(**limit)).used(500, 1, 90.0) == used
+def test_the_limit_nearest_to_its_end_counts_of_those_that_are_set(limit, at, used):
+    assert Budget(limits(**limit)).used(*at) == used
 
 
 def test_a_run_costs_the_price_of_its_time():
@@ -78,14 +77,10 @@ def test_minutes_and_costs_are_summed_at_each_runs_own_price(run):
     assert minutes.used(0, 0, 300.0) == ("experiment_minutes", 0.5)
 
 
-def test_a_run_that_continues_or_was_killed_counts_with_its_last_whole_row(run):
-    sibling(run, "continues", ended=False, env_steps=500)
-    assert Budget(limits(experiment_env_steps=1000), run).used(250, 0, 0.0)[1] == 0.5
-
-
-def test_a_run_on_every_track_of_the_catalogue_counts_though_its_rows_are_long(run):
-    columns = {f"{metric}/{number:080d}": 100 / 3 for metric in TRACK_METRICS for number in range(127)}
-    sibling(run, "everywhere", ended=False, env_steps=500, **columns)
+@pytest.mark.parametrize("tracks", [0, 127], ids=["one track", "every track of the catalogue"])
+def test_a_run_that_continues_or_was_killed_counts_with_its_last_whole_row_however_long(run, tracks):
+    columns = {f"{metric}/{number:080d}": 100 / 3 for metric in TRACK_METRICS for number in range(tracks)}
+    sibling(run, "continues", ended=False, env_steps=500, **columns)
     assert Budget(limits(experiment_env_steps=1000), run).used(250, 0, 0.0)[1] == 0.5
 
 
@@ -120,10 +115,12 @@ def test_an_experiment_that_has_used_everything_starts_no_run(run):
 
 def test_each_share_of_a_limit_is_reported_once():
     budget = Budget(limits(env_steps=1000))
-    percents = [[alert.percent for alert in budget.alerts(steps, 0, 0.0)] for steps in range(0, 1200, 100)]
-    assert [percent for alerts in percents for percent in alerts] == [50, 80, 100]
-    assert percents[5] == [50]
-    assert percents[10] == [100]
+    passed = {steps: [one.percent for one in budget.alerts(steps, 0, 0.0)] for steps in range(0, 1200, 100)}
+    assert {steps: percents for steps, percents in passed.items() if percents} == {
+        500: [50],
+        800: [80],
+        1000: [100],
+    }
 
 
 def test_shares_that_are_passed_together_are_one_alert():
@@ -141,11 +138,6 @@ def test_what_was_passed_before_a_run_began_is_not_reported_by_it(run):
     assert budget.alerts(100, 0, 0.0) == []
     (alert,) = budget.alerts(200, 0, 0.0)
     assert alert.message == "80 % of budget.experiment_env_steps used: 800 steps of 1,000 steps"
-
-
-def test_without_shares_there_are_no_alerts():
-    budget = Budget(limits(env_steps=10, alerts=()))
-    assert [*budget.alerts(0, 0, 0.0), *budget.alerts(10, 0, 0.0)] == []
 
 
 def test_it_reports_the_limits_that_are_set():

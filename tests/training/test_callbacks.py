@@ -73,20 +73,16 @@ def test_a_copy_continues_as_the_run_would_have_while_its_folder_is_held(tmp_pat
     holder.release()
 
 
-def test_a_copy_of_a_copy_has_one_attempt_in_its_name(tmp_path):
-    first = run(tmp_path, None).folder
-    assert copy_run(copy_run(first, 2), 3).name == f"{first.name}-attempt3"
-
-
-def test_a_copy_is_another_run_of_mlflow(tmp_path):
-    outcome = run(tmp_path, None, "tracking=mlflow", run_name="trial 3", tags={"sweep.trial": "3"})
-    before = json.loads((outcome.folder / "tracking.json").read_text())
-    after = json.loads((copy_run(outcome.folder, 2) / "tracking.json").read_text())
+def test_a_copy_of_a_copy_is_another_run_of_mlflow_and_has_one_attempt_in_its_name(tmp_path):
+    one = ("tracking=mlflow", "budget.iterations=1")
+    first = run(tmp_path, None, *one, run_name="trial 3", tags={"sweep.trial": "3"}).folder
+    before = json.loads((first / "tracking.json").read_text())
     assert before["run_id"]
-    assert before["tags"]["sweep.trial"] == "3"
-    assert before["run_name"] == "trial 3"
-    assert after["run_id"] is None
-    assert after["tags"]["run_dir"].endswith("-attempt2")
+    assert (before["run_name"], before["tags"]["sweep.trial"]) == ("trial 3", "3")
+    copy = copy_run(copy_run(first, 2), 3)
+    after = json.loads((copy / "tracking.json").read_text())
+    assert (after["run_id"], after["tags"]["run_dir"]) == (None, str(copy.resolve()))
+    assert copy.name == f"{first.name}-attempt3"
     assert {**after["tags"], "run_dir": ""} == {**before["tags"], "run_dir": ""}
 
 

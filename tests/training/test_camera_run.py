@@ -16,24 +16,18 @@ from deepracer_exp import load_policy
 from tests.conftest import IN_PROCESS
 
 CAMERA = (
-    "observation=camera_small",
-    "collector.cars=8",
-    "algorithm.frames_per_iteration=512",
-    "algorithm.epochs=2",
-    "budget.env_steps=1024",
-    "checkpoints.every=null",
+    *("observation=camera_small", "collector.cars=8", "algorithm.frames_per_iteration=512"),
+    *("algorithm.epochs=2", "budget.env_steps=1024", "checkpoints.every=null"),
 )
 
 
 @pytest.mark.parametrize(
     "overrides",
     [
-        (),
-        ("network.critic=pictures", "action_space=continuous"),
         ("network.critic=pictures", "network.shared_trunk=true", "observation.camera.color=rgb"),
         (
-            *("observation=stereo", "network=medium", "budget.env_steps=512"),
-            *("observation.camera.width=80", "observation.camera.height=60"),
+            *("observation=stereo", "network=medium", "network.critic=pictures", "action_space=continuous"),
+            *("observation.camera.width=80", "observation.camera.height=60", "budget.env_steps=512"),
         ),
         ("observation=camera", "network=deep", "observation.camera.frames=2", "budget.env_steps=512"),
         ("observation=lidar", "network.critic=pictures", "observation.lidar.kind=sectors"),
@@ -42,7 +36,7 @@ CAMERA = (
             *("observation.camera.height=60", "network.shared_trunk=true", "budget.env_steps=512"),
         ),
     ],
-    ids=lambda overrides: " ".join(overrides) or "as it is",
+    ids=" ".join,
 )
 def test_every_kind_of_picture_and_network_trains_and_is_raced(trained, call, overrides):
     ended = trained(*CAMERA, *overrides)
@@ -71,23 +65,16 @@ def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_pat
         seen = {"lidar" if sensors else "pixels": seen}
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
     theirs = session.run(["policy"], seen)[0]
-    policy = load_policy(ended.folder)
+    given = TensorDict({key: torch.from_numpy(values) for key, values in seen.items()}, [6])
     with torch.no_grad():
-        logits = policy.get_dist(policy_input(seen)).probs
-    assert np.abs(theirs - logits.numpy()).max() < 0.01  # products in bfloat16
+        ours = load_policy(ended.folder).get_dist(given).probs.numpy()
+    assert np.abs(theirs - ours).max() < 0.01  # products in bfloat16
     assert np.abs(theirs[0] - theirs[-1]).max() > 0
 
 
-def policy_input(seen: dict[str, np.ndarray]):
-    return TensorDict({key: torch.from_numpy(values) for key, values in seen.items()}, [6])
-
-
-def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(call):
-    (line,) = (
-        line
-        for line in call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512").stderr.splitlines()
-        if line.startswith("pictures: ")
-    )
+def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(trained, call):
+    said = trained(*CAMERA).stderr.splitlines()
+    (line,) = (line for line in said if line.startswith("pictures: "))
     assert "0.0 GB of memory for the 512 steps" in line
     big = "algorithm.frames_per_iteration=10000000"
     refused = call("train", *IN_PROCESS, "observation=camera", "name=big", big)
@@ -104,17 +91,17 @@ def test_the_report_shows_what_the_policy_sees_along_a_lap(trained, call, tmp_pa
     assert html.count("data:image/png;base64,") == 16
 
 
-def test_a_clone_keeps_what_the_networks_were_made_for(call):
-    parent = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512").folder
-    cloned = call("clone", str(parent), "budget.env_steps=512", "tracking=off")
+def test_a_clone_keeps_what_the_networks_were_made_for(copied, call):
+    parent = copied(*CAMERA)
+    cloned = call("clone", parent.name, "budget.env_steps=512")
     assert cloned.code == 0, cloned.stderr
-    other = call("clone", str(parent), "observation.camera.width=100")
-    assert other.code == 2
-    assert "camera.width: 80 -> 100" in other.complaint
-    more = call("clone", str(parent), *SENSORS)
-    assert more.code == 2
-    assert "cannot be changed in a clone" in more.complaint
-    assert "lidar" in more.complaint
+    for changes, words in (
+        (["observation.camera.width=100"], ["camera.width: 80 -> 100"]),
+        (SENSORS, ["cannot be changed in a clone", "lidar"]),
+    ):
+        refused = call("clone", parent.name, *changes)
+        assert refused.code == 2
+        assert all(word in refused.complaint for word in words)
 
 
 def test_a_promoted_model_says_that_it_reads_pictures(call, tmp_path):
@@ -140,10 +127,7 @@ def test_a_promoted_model_says_that_it_reads_pictures(call, tmp_path):
         (("observation=lidar", "network=deep"), ("network", "pictures", "network=lidar")),
         (("observation=camera", "network=lidar"), ("network.filters", "cnn_small")),
         (("network=lidar",), ("network", "observation=lidar")),
-        (
-            ("observation=camera_lidar", "network.lidar_joins_after=1"),
-            ("network.lidar_joins_after", "0 to 0"),
-        ),
+        (("observation=camera_lidar", "network.lidar_joins_after=1"), ("lidar_joins_after", "0 to 0")),
         (("observation=lidar", "observation.lidar.sectors=7"), ("observation.lidar.sectors", "7")),
         (("observation=lidar", "observation.lidar.reach_m=13"), ("observation.lidar.reach_m", "13")),
         (("observation=camera_small", "network.shared_trunk=true"), ("shared_trunk", "features")),

@@ -10,8 +10,10 @@ from tests.conftest import IN_PROCESS
 
 DISTILL = (
     *("observation=camera_small", "algorithm=distill", "algorithm.teacher_iterations=2", "collector.cars=8"),
-    *("algorithm.frames_per_iteration=256", "checkpoints.every=2", "budget.env_steps=null"),
+    *("algorithm.frames_per_iteration=256", "checkpoints.every=2", "evaluation.time_s=4"),
+    "budget.env_steps=null",
 )
+TAUGHT = ("algorithm=distill", "teacher=school/teacher")
 
 
 @pytest.fixture
@@ -51,14 +53,8 @@ def test_it_is_resumed_bit_for_bit_without_the_teachers_folder_and_cloned_withou
         (("algorithm=distill",), ("teacher", "algorithm=distill", "teacher=RUN")),
         (("teacher=school/teacher",), ("teacher", "algorithm=distill")),
         (("algorithm=distill", "teacher=nowhere"), ("nowhere", "no such run")),
-        (
-            ("algorithm=distill", "teacher=school/teacher", "action_space=continuous"),
-            ("teacher=school/teacher", "actions"),
-        ),
-        (
-            ("algorithm=distill", "teacher=school/teacher", "observation.lookahead_m=[1]"),
-            ("teacher=school/teacher", "features"),
-        ),
+        ((*TAUGHT, "action_space=continuous"), (*TAUGHT[1:], "actions")),
+        ((*TAUGHT, "observation.lookahead_m=[1]"), (*TAUGHT[1:], "features")),
     ],
 )
 def test_what_cannot_be_taught_is_refused_in_one_line(teacher, call, overrides, words):

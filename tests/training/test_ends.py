@@ -2,7 +2,6 @@
 
 import os
 import shlex
-import shutil
 import signal
 import threading
 import time
@@ -10,10 +9,13 @@ import time
 import pytest
 
 from deepracer_exp.analysis.findings import findings
+from deepracer_exp.analysis.log_tables import headline
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.setup import build_courses
 from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.training.callbacks import write_pictures
 from deepracer_exp.training.stopping_replay import replay
 
 NOT_LEARNING = (
@@ -36,18 +38,13 @@ def test_a_run_that_does_not_learn_is_stopped_early(trained):
     assert 0.99 < stopping["values"]["entropy"] <= 1
 
 
-def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained):
+def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained, call):
     ended = trained(*NOT_LEARNING)
     found = replay(read_record(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
     assert found.iteration == ended.summary["iteration"]
     assert found.decision.as_dict() == ended.summary["stopping"]
     assert found.saved_steps == 0
-
-
-def test_a_run_that_its_budget_ends_has_no_decision(trained):
-    ended = trained("stopping=entropy")
-    assert ended.summary["reason"] == "budget reached: env_steps"
-    assert ended.summary["stopping"] is None
+    assert "continues to the end" in call("stopping", "replay", str(ended.folder), "stopping=plateau").stdout
 
 
 def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
@@ -66,20 +63,18 @@ def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
 
 
 def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
-    shared = ("budget.experiment_env_steps=6144", "budget.price_per_hour=3600")
+    shared = ("budget.env_steps=2048", "budget.experiment_env_steps=3072", "budget.price_per_hour=3600")
     first = train_here(*shared)
-    assert (first.summary["reason"], first.summary["env_steps"]) == ("budget reached: env_steps", 4096)
+    assert (first.summary["reason"], first.summary["env_steps"]) == ("budget reached: env_steps", 2048)
     assert first.summary["cost"] == pytest.approx(first.summary["wall_clock_s"], abs=0.1)  # 1 a second
-    both = train_here(*shared)
-    second = read_record(both.folders[1]).summary
-    assert (second["reason"], second["env_steps"]) == ("budget reached: experiment_env_steps", 2048)
+    second = read_record(train_here(*shared).folders[1]).summary
+    assert (second["reason"], second["env_steps"]) == ("budget reached: experiment_env_steps", 1024)
     third = train_here(*shared)
     assert third.code == 2
     assert (
-        "budget.experiment_env_steps=6144: the runs in runs/tiny have used 6,144 already" in third.complaint
+        "budget.experiment_env_steps=3072: the runs in runs/tiny have used 3,072 already" in third.complaint
     )
     assert len(third.folders) == 2
-    assert train_here(*shared, "name=another").code == 0
 
 
 def ctrl_c_after(iterations, folder) -> None:
@@ -122,12 +117,27 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
     assert f"recommended: {name}: " in compared.stdout
 
 
-def test_the_lines_to_paste_after_a_training_work(trained, tmp_path, call_at):
-    ended = trained("budget.iterations=3")
-    folder = shutil.copytree(ended.folder.parents[1], tmp_path / "runs", symlinks=True).parent
+def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
+    copied("budget.iterations=1")
+    ended = trained("budget.iterations=1")
     begin = ended.stdout.index("\n  next\n")
     lines = [shlex.split(line, comments=True) for line in ended.stdout[begin:].splitlines()[2:]]
     assert [line[1] for line in lines] == ["evaluate", "evaluate", "clone", "resume"]
     for line in lines:
         if "--video" not in line:  # needs a renderer
-            assert call_at(folder, *line[1:]).code == 0, line
+            assert call(*line[1:]).code == 0, line
+
+
+def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(trained, tmp_path):
+    write_pictures(tmp_path, build_courses(compose_experiment([])[0]))
+    assert not list(tmp_path.iterdir())
+    folder = trained("budget.iterations=1").folder  # without a lap
+    for name in ("best_lap.png", "learning.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+
+
+def test_the_page_counts_the_episodes_that_the_summary_counts(trained):
+    ended = trained("budget.iterations=1")
+    view = prepare(read_own_recording(ended.folder))
+    assert len(view.episodes) > ended.summary["episodes"] > 0  # some were still being driven at the end
+    assert f" in {ended.summary['episodes']} finished episodes and 1 iteration" in headline(view)

@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.service_weights import POLICY, VALUE, to_service
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.deepracer.graph_def import policy_graph
 from deepracer_exp.deepracer.model_archive import read_model
 from deepracer_exp.deepracer.tf_checkpoint import write_checkpoint
 from deepracer_exp.env.action_space import build_action_space
@@ -25,6 +26,7 @@ from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun
+from tests.conftest import IN_PROCESS
 
 NAME = "11_Step-38428.ckpt"
 INDEX, DATA = f"model/{NAME}.index", f"model/{NAME}.data-00000-of-00001"
@@ -131,20 +133,14 @@ def test_an_archive_holds_what_the_folder_does(tmp_path, pack):
     assert model.files["hyperparameters.json"] == SMALL["ip/hyperparameters.json"]
 
 
+ELSE = "the best checkpoint, 7_Step-70.ckpt, is not among the files: 9_Step-90.ckpt is used"
+
+
 @pytest.mark.parametrize(
-    ("asked", "there", "chosen", "note"),
-    [
-        ("best", (3, 7, 9), 7, None),
-        ("last", (3, 7, 9), 9, None),
-        (
-            "best",
-            (3, 9),
-            9,
-            "the best checkpoint, 7_Step-70.ckpt, is not among the files: 9_Step-90.ckpt is used",
-        ),
-    ],
+    ("asked", "there", "chosen", "notes"),
+    [("best", (3, 7, 9), 7, ()), ("last", (3, 7, 9), 9, ()), ("best", (3, 9), 9, (ELSE,))],
 )
-def test_the_best_checkpoint_is_taken_unless_the_last_is_asked_for(tmp_path, asked, there, chosen, note):
+def test_the_best_checkpoint_is_taken_unless_the_last_is_asked_for(tmp_path, asked, there, chosen, notes):
     files = {}
     for number in there:
         index, data = write_checkpoint({"a/bias": np.full(1, number, np.float32)})
@@ -154,16 +150,12 @@ def test_the_best_checkpoint_is_taken_unless_the_last_is_asked_for(tmp_path, ask
     files["model/deepracer_checkpoints.json"] = json.dumps(names).encode()
     model = read_model(str(write_folder(tmp_path / "model", files)), asked)
     assert model.tensors["a/bias"].item() == chosen
-    assert model.notes == ((note,) if note else ())
+    assert model.notes == notes
 
 
-def _without(weights, name):
-    return {key: value for key, value in weights.items() if key != name}
-
-
-def _header(name, kind=tarfile.REGTYPE, size=0, link=""):
+def _header(name, kind=tarfile.REGTYPE, size=0):
     member = tarfile.TarInfo(name)
-    member.type, member.linkname = kind, link
+    member.type = kind
     packed = member.tobuf()
     if size:
         member.size = size
@@ -171,10 +163,23 @@ def _header(name, kind=tarfile.REGTYPE, size=0, link=""):
     return packed
 
 
+def with_bit_flipped(content, chance, until):
+    raw = bytearray(content)
+    raw[chance.randrange(until)] ^= 1 << chance.randrange(8)
+    return bytes(raw)
+
+
+# Of weights that do not fit there is one kind here; the tests of agents.service_weights have the others.
+KINDS = (
+    *("truncated archive", "truncated data", "a flipped bit", "a flipped bit in the index", "a link"),
+    *("a path that leads out", "a promise of terabytes", "a name of gigabytes", "a bomb"),
+    *("a foreign tensor", "other metadata", "other files"),
+)
+
+
 def damaged(kind, seed, weights):
     """Return an archive with one fault."""
     chance = random.Random(seed)
-    name = chance.choice([one for one in weights if "rescalers" not in one and "Dense_0/kernel" not in one])
     files = files_of(weights)
     if kind == "truncated archive":
         whole = tar_of(files)
@@ -182,15 +187,9 @@ def damaged(kind, seed, weights):
     if kind == "truncated data":
         files[DATA] = files[DATA][: chance.randrange(len(files[DATA]))]
     elif kind == "a flipped bit":
-        at = chance.randrange(len(files[DATA]))
-        files[DATA] = (
-            files[DATA][:at] + bytes([files[DATA][at] ^ 1 << chance.randrange(8)]) + files[DATA][at + 1 :]
-        )
+        files[DATA] = with_bit_flipped(files[DATA], chance, len(files[DATA]))
     elif kind == "a flipped bit in the index":
-        at = chance.randrange(len(files[INDEX]) - 48)
-        raw = bytearray(files[INDEX])
-        raw[at] ^= 1 << chance.randrange(8)
-        files[INDEX] = bytes(raw)
+        files[INDEX] = with_bit_flipped(files[INDEX], chance, len(files[INDEX]) - 48)
     elif kind == "a link":
         member = tarfile.TarInfo(chance.choice([DATA, "model/other", "reward_function.py"]))
         member.type, member.linkname = chance.choice([tarfile.SYMTYPE, tarfile.LNKTYPE]), "/etc/passwd"
@@ -205,40 +204,17 @@ def damaged(kind, seed, weights):
     elif kind == "a bomb":
         files["model_metadata.json"] = bytes(2**26)
         return chance.choice([tar_of, zip_of])(files)
-    elif kind == "a wrong shape":
-        value = weights[name]
-        files |= files_of(weights | {name: np.concatenate([value, value[:1]])})
-    elif kind == "a weight that is not a number":
-        value = weights[name].copy()
-        value.flat[chance.randrange(value.size)] = chance.choice([np.nan, np.inf, -np.inf])
-        files |= files_of(weights | {name: value})
     elif kind == "a foreign tensor":
+        name = chance.choice([one for one in weights if "rescalers" not in one])
         files |= files_of(weights | {f"{name}_of_others": np.zeros(chance.randrange(1, 9), np.float32)})
-    elif kind == "a missing tensor":
-        files |= files_of(_without(weights, name))
     elif kind == "other metadata":
         changes = {"sensor": ["STEREO_CAMERAS"]}, {"action_space": METADATA["action_space"][:4]}
         sac = {"training_algorithm": "sac"}
         others = [json.dumps(METADATA | change).encode() for change in (*changes, sac)]
-        other = chance.choice([b"{", b"[]", b"\xff\xfe", *others])
-        files["model_metadata.json"] = other
+        files["model_metadata.json"] = chance.choice([b"{", b"[]", b"\xff\xfe", *others])
     else:
-        assert kind == "other files"
         del files[chance.choice([DATA, INDEX, "model_metadata.json"])]
     return tar_of(files)
-
-
-KINDS = [
-    *("truncated archive", "truncated data", "a flipped bit", "a flipped bit in the index", "a link"),
-    *("a path that leads out", "a promise of terabytes", "a name of gigabytes", "a bomb", "a wrong shape"),
-    *(
-        "a weight that is not a number",
-        "a foreign tensor",
-        "a missing tensor",
-        "other metadata",
-        "other files",
-    ),
-]
 
 
 def assert_refused(call, tmp_path, content):
@@ -258,8 +234,7 @@ def light(weights):
     return {name: np.zeros_like(value) for name, value in weights.items()}
 
 
-# Those of weights are in the tests of agents.service_weights as well.
-@pytest.mark.parametrize("kind", [*KINDS[:9], "a foreign tensor", "other files"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_archive_is_refused_in_one_line_and_leaves_nothing(call, tmp_path, light, kind):
     assert_refused(call, tmp_path, damaged(kind, 0, light))
 
@@ -292,9 +267,9 @@ def actions(networks, frames):
 @pytest.mark.parametrize("space", ["discrete", "continuous"])
 def test_a_policy_that_goes_there_and_back_acts_the_same(call, space):
     trained = call(
-        *("train", "experiment=tiny", "tracking=off", "observation=camera", "network=deep", "name=here"),
-        *(f"action_space={space}", "collector=in_process", "budget.env_steps=256", "collector.cars=4"),
-        *("algorithm.frames_per_iteration=128", "algorithm.batch_size=64", "track=Oval_track"),
+        *("train", *IN_PROCESS, "observation=camera", "network=deep", "name=here", "track=Oval_track"),
+        *(f"action_space={space}", "budget.env_steps=256", "collector.cars=4"),
+        *("algorithm.frames_per_iteration=128", "algorithm.batch_size=64"),
     )
     assert trained.code == 0, trained.stderr
     here = trained.folder
@@ -306,10 +281,8 @@ def test_a_policy_that_goes_there_and_back_acts_the_same(call, space):
         read_checkpoint(StoredRun(folder).experiment, folder / "checkpoints", "last").networks
         for folder in (here, there)
     ]
-    generator = torch.Generator().manual_seed(0)
-    frames = [
-        torch.randint(0, 256, (100, 1, 120, 160), generator=generator, dtype=torch.uint8) for _ in range(10)
-    ]
+    torch.manual_seed(0)
+    frames = [torch.randint(0, 256, (100, 1, 120, 160), dtype=torch.uint8) for _ in range(10)]
     assert torch.equal(actions(policies[0], frames), actions(policies[1], frames))
     assert call("export", str(there), "format=aws-model", "-o", "again").code == 0
     for ending in ("index", "data-00000-of-00001"):
@@ -319,42 +292,22 @@ def test_a_policy_that_goes_there_and_back_acts_the_same(call, space):
         assert sent.read_bytes() == again.read_bytes()
     raced = call("evaluate", str(there), "evaluation=three_trials")
     assert raced.code == 0, raced.stderr
-    small = ("collector=in_process", "collector.cars=4", "stopping=none", "report=false", "tracking=off")
-    cloned = call(
-        *("clone", str(there), "budget.env_steps=64", "algorithm.frames_per_iteration=64", *small),
-        *(
-            "algorithm.episodes_per_iteration=null",
-            "algorithm.batch_size=64",
-            "algorithm.epochs=1",
-            "name=further",
-        ),
-    )
+    small = ("collector=in_process", "collector.cars=4", "report=false", "budget.env_steps=64")
+    small += ("algorithm.frames_per_iteration=64", "algorithm.episodes_per_iteration=null")
+    cloned = call("clone", str(there), *small, "algorithm.batch_size=64", "algorithm.epochs=1")
     assert cloned.code == 0, cloned.stderr
-    (further,) = trained.cwd.glob("runs/further/*")
-    rates = [StoredRun(folder).experiment.algorithm.lr for folder in (there, further)]
-    assert rates[1] == pytest.approx(rates[0] / 10)
-    begun, then = (folder / "checkpoints" for folder in (there, further))
-    before = read_checkpoint(StoredRun(there).experiment, begun, "last").networks.state_dict()
-    after = read_checkpoint(StoredRun(further).experiment, then, "last").networks.state_dict()
-    moved = [(after[name] - before[name]).abs().max().item() for name in before]
-    assert 0 < max(moved) < 0.01, "both trunks begin where the parent's are"
 
 
 def test_of_a_frozen_graph_the_value_network_starts_fresh(call, tmp_path, weights, networks):
-    from deepracer_exp.deepracer.graph_def import policy_graph
-
     policy = {name: value for name, value in weights.items() if name.startswith(POLICY)}
     graph = policy_graph(policy, {SENSORS[0]: (120, 160, 1)}, (4, 2, 2, 1))
-    write_folder(
-        tmp_path / "car", {"agent/model.pb": graph, "model_metadata.json": SMALL["model_metadata.json"]}
-    )
+    metadata = {"model_metadata.json": SMALL["model_metadata.json"]}
+    write_folder(tmp_path / "car", {"agent/model.pb": graph} | metadata)
     ended = call("import", "car", "--name", "mine", "tracking=off")
     assert ended.code == 0, ended.stderr
     assert "the value network starts fresh" in ended.stderr
     run = StoredRun(ended.folder)
     found = to_service(read_checkpoint(run.experiment, run.checkpoints, "best").networks, SENSORS)
     assert all(np.array_equal(found[name], value) for name, value in policy.items())
-    assert not np.array_equal(
-        found[f"{VALUE}/middleware_fc_embedder/Dense_0/kernel"],
-        weights[f"{VALUE}/middleware_fc_embedder/Dense_0/kernel"],
-    )
+    fresh = f"{VALUE}/middleware_fc_embedder/Dense_0/kernel"
+    assert not np.array_equal(found[fresh], weights[fresh])

@@ -1,7 +1,5 @@
 """A training under randomisation, and what its trace shows of it."""
 
-import contextlib
-import io
 import re
 from pathlib import Path
 
@@ -29,13 +27,11 @@ def test_a_policy_trains_under_randomization_and_the_trace_reports_each_episodes
     assert sorted(draws["action_delay_steps"].unique()) == [0, 1, 2]
 
 
-def test_the_pages_question_to_a_trace_is_answered(trained, monkeypatch):
+def test_the_pages_question_to_a_trace_is_answered(trained, monkeypatch, capsys):
     monkeypatch.chdir(trained(*OVERRIDES).cwd)
     (snippet,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        exec(compile(snippet, "docs/randomization.md", "exec"), {})
-    lines = said.getvalue().splitlines()
+    exec(compile(snippet, "docs/randomization.md", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
     assert len(lines) >= 1 + len(QUANTITIES)
     for name in QUANTITIES:
         assert any(line.startswith(name) for line in lines)

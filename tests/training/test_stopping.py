@@ -1,7 +1,7 @@
 import functools
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -54,11 +54,8 @@ def history(
     for iteration in range(1, length + 1):
         laps += at(laps_per_iteration, iteration)
         row = {
-            "iteration": iteration,
             "env_steps": 8192 * iteration,
-            "wall_clock_s": 0.5 * iteration,
             "laps": round(laps),
-            "best_lap_time_s": None,
             "completion": min(100.0, at(completion, iteration) + noise * random.normal()),
             "mean_return": at(mean_return, iteration) * (1 + 0.01 * noise * random.normal()),
             "entropy": at(entropy, iteration) * math.log(ACTIONS),
@@ -77,38 +74,77 @@ def learned(until: int):
 
 
 def converging(until: int, **more) -> list[dict]:
-    return history(
-        **{
-            "completion": learned(until),
-            "mean_return": learned(until),
-            "laps_per_iteration": lambda i: 20 * min(1.0, i / until),
-            "entropy": lambda i: 1 - 0.7 * min(1.0, i / until),
-        }
-        | more
-    )
+    driven = {"completion": learned(until), "mean_return": learned(until)}
+    driven["laps_per_iteration"] = lambda i: 20 * min(1.0, i / until)
+    driven["entropy"] = lambda i: 1 - 0.7 * min(1.0, i / until)
+    return history(**driven | more)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.5])
-@pytest.mark.parametrize("until", [30, 120])
-def test_a_run_that_has_learned_ends_as_converged_when_patience_is_over(until, noise):
-    number, decision = stopped_at(converging(until, noise=noise), rule())
-    assert decision.rule == "converged"
-    assert not decision.stopped_early
-    assert number == pytest.approx(until + 80, abs=10)
+def falling(**more) -> list[dict]:
+    """Held-out completion rises to 90 and falls to 50, as the return rises on."""
+    held_out = {"held_out": lambda i: 90 * i / 50 if i <= 50 else max(50.0, 140 - i)}
+    return history(**{"completion": learned(LONG), "mean_return": learned(LONG)} | held_out | more)
+
+
+RANDOM = {"completion": 11.0, "entropy": 0.999, "laps_per_iteration": 0.0}
+
+
+def assert_reported(decision: Decision) -> None:
+    """It names its rule, and holds values and thresholds as JSON and as tags."""
+    stored = json.loads(json.dumps(decision.as_dict()))
+    assert stored["rule"] in str(decision).replace(" ", "_")
+    assert stored["values"]
+    assert stored["thresholds"]["patience"] > 0
+    assert all(math.isfinite(value) for value in stored["values"].values())
+    tags = decision.tags()
+    assert tags["stopping.rule"] == decision.rule
+    assert {f"stopping.threshold.{key}" for key in decision.thresholds} <= tags.keys()
 
 
 @pytest.mark.parametrize(
-    "still",
+    ("name", "rows", "at", "within"),
     [
-        {"completion": learned(LONG)},
-        {"mean_return": learned(LONG)},
-        {"laps_per_iteration": lambda i: 20 * i / LONG},
-        {"entropy": lambda i: 1 - 0.7 * i / LONG},
+        *(("converged", converging(until, noise=n), until + 80, 10) for until in (30, 120) for n in (0, 0.5)),
+        ("not_learning", history(**RANDOM), 42, 3),
+        ("collapsed", history(completion=20.0, entropy=lambda i: max(0.01, 1 - 0.1 * i)), 31, 3),
+        ("overfitting", falling(), 110, 19),
     ],
-    ids=lambda still: next(iter(still)),
 )
-def test_a_run_in_which_anything_still_moves_has_not_converged(still):
-    assert stopped_at(converging(30, **still), rule()) == (None, None)
+def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
+    number, decision = stopped_at(rows, rule())
+    assert decision.rule == name
+    assert decision.stopped_early == (name in ("not_learning", "collapsed"))
+    assert number == pytest.approx(at, abs=within)
+    assert decision.values.get("held_out_completion_before", 100.0) > 85
+    assert_reported(decision)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    {
+        "completion still grows": converging(30, completion=learned(LONG)),
+        "the return still grows": converging(30, mean_return=learned(LONG)),
+        "laps still grow": converging(30, laps_per_iteration=lambda i: 20 * i / LONG),
+        "entropy still falls": converging(30, entropy=lambda i: 1 - 0.7 * i / LONG),
+        "it drives worse than it did": converging(30, completion=lambda i: 98.0 if i < 60 else 80.0),
+        "random but moves": history(60, **RANDOM | {"completion": lambda i: 11 + 0.3 * i}),
+        "random but decides": history(60, **RANDOM | {"entropy": lambda i: 1 - 0.005 * i}),
+        "random but drives": history(60, **RANDOM | {"completion": 60.0}),
+        "no evaluations": falling(held_out=None),
+        "held-out completion rises": falling(held_out=learned(LONG)),
+        "held-out completion holds": falling(held_out=80.0),
+        "held-out completion wobbles": falling(held_out=lambda i: 80.0 + 4 * (-1) ** (i // 5)),
+        "the return falls, too": falling(mean_return=lambda i: 100 - 0.2 * i),
+    }.items(),
+    ids=lambda rows: rows[0],
+)
+def test_a_run_for_which_no_rule_is_continues(rows):
+    assert stopped_at(rows[1], rule()) == (None, None)
+
+
+def test_a_policy_without_entropy_that_drives_well_has_not_collapsed():
+    rows = history(completion=95.0, entropy=0.01)
+    assert stopped_at(rows, rule("stopping.converged=null")) == (None, None)
 
 
 @pytest.mark.parametrize("share", [0.98, 0.999])
@@ -121,80 +157,9 @@ def test_a_policy_that_has_just_been_evaluated_as_better_puts_off_the_end(share)
     assert number == (better_at + 60 if share < 0.99 else stopped_at(converging(30), rule())[0])
 
 
-def test_a_run_that_drives_worse_than_it_did_has_not_converged():
-    worse = converging(30, completion=lambda i: 98.0 if i < 60 else 80.0)
-    assert stopped_at(worse, rule()) == (None, None)
-
-
-def test_a_policy_that_stays_random_is_not_learning():
-    number, decision = stopped_at(history(completion=11.0, entropy=0.999, laps_per_iteration=0.0), rule())
-    assert decision.rule == "not_learning"
-    assert decision.stopped_early
-    assert number == pytest.approx(42, abs=3)
-
-
-@pytest.mark.parametrize(
-    "sign",
-    [{"completion": lambda i: 11 + 0.3 * i}, {"entropy": lambda i: 1 - 0.005 * i}, {"completion": 60.0}],
-    ids=["moves", "decides", "drives"],
-)
-def test_a_policy_that_shows_any_sign_of_learning_continues(sign):
-    rows = history(60, **{"completion": 11.0, "entropy": 0.999, "laps_per_iteration": 0.0} | sign)
-    assert stopped_at(rows, rule()) == (None, None)
-
-
-def test_a_policy_without_entropy_that_drives_badly_has_collapsed():
-    number, decision = stopped_at(history(completion=20.0, entropy=lambda i: max(0.01, 1 - 0.1 * i)), rule())
-    assert decision.rule == "collapsed"
-    assert decision.stopped_early
-    assert number == pytest.approx(31, abs=3)
-
-
-def test_a_policy_without_entropy_that_drives_well_has_not_collapsed():
-    _, decision = stopped_at(history(completion=95.0, entropy=0.01), rule("stopping.converged=null"))
-    assert decision is None
-
-
-def falling(best_at: int = 50, **more) -> list[dict]:
-    """Held-out completion rises to 90 and falls to 50, as the return rises on."""
-    return history(
-        **{
-            "completion": learned(LONG),
-            "mean_return": learned(LONG),
-            "held_out": lambda i: 90 * min(1.0, i / best_at) if i <= best_at else max(50.0, 140 - i),
-        }
-        | more
-    )
-
-
-def test_a_fall_on_held_out_conditions_while_the_return_rises_is_overfitting():
-    number, decision = stopped_at(falling(), rule())
-    assert decision.rule == "overfitting"
-    assert not decision.stopped_early
-    assert decision.values["held_out_completion_before"] > 85
-    assert 90 < number < 130
-
-
-@pytest.mark.parametrize(
-    "innocent",
-    [
-        {"held_out": None},
-        {"held_out": learned(LONG)},
-        {"held_out": 80.0},
-        {"held_out": lambda i: 80.0 + 4 * (-1) ** (i // 5)},
-        {"mean_return": lambda i: 100 - 0.2 * i},
-    ],
-    ids=["no evaluations", "rises", "holds", "wobbles", "the return falls, too"],
-)
-def test_without_such_a_fall_nothing_is_called_overfitting(innocent):
-    _, decision = stopped_at(falling(**innocent), rule())
-    assert decision is None
-
-
 def test_no_verdict_comes_before_its_warm_up():
-    lazy = [
-        f"stopping.{name}.warmup=200" for name in ("converged", "overfitting", "collapsed", "not_learning")
-    ]
+    rules = ("converged", "overfitting", "collapsed", "not_learning")
+    lazy = [f"stopping.{name}.warmup=200" for name in rules]
     for rows in (
         converging(30),
         history(completion=11.0, entropy=0.999),
@@ -204,7 +169,7 @@ def test_no_verdict_comes_before_its_warm_up():
 
 
 def test_a_rule_of_null_never_stops_a_run():
-    rows = history(completion=11.0, entropy=0.999, laps_per_iteration=0.0)
+    rows = history(**RANDOM)
     assert stopped_at(rows, rule("stopping.not_learning=null", "stopping.converged=null")) == (None, None)
 
 
@@ -215,23 +180,12 @@ def test_the_thresholds_that_are_given_decide():
     assert early + 70 < late
 
 
-def test_decisions_depend_on_the_rows_alone_so_that_a_resumed_run_ends_where_it_would_have():
-    rows, config = converging(60, noise=0.5), rule()
-    number, decision = stopped_at(rows, config)
-    from_file = [json.loads(json.dumps(row)) for row in rows]
-    assert stopped_at(from_file, config) == (number, decision)
-
-
 def test_iterations_in_which_no_episode_ended_break_nothing():
-    rows = [
-        row | ({"completion": None, "mean_return": None} if i % 3 else {})
-        for i, row in enumerate(converging(30))
-    ]
-    number, decision = stopped_at(rows, rule())
+    nothing, rows = {"completion": None, "mean_return": None}, converging(30)
+    number, decision = stopped_at([row | (nothing if i % 3 else {}) for i, row in enumerate(rows)], rule())
     assert decision.rule == "converged"
     assert number == pytest.approx(112, abs=10)
-    never = [row | {"completion": None, "mean_return": None} for row in converging(30)]
-    assert stopped_at(never, rule()) == (None, None)
+    assert stopped_at([row | nothing for row in rows], rule()) == (None, None)
 
 
 def test_the_entropy_of_a_choice_by_chance_is_one_whatever_the_number_of_actions():
@@ -270,27 +224,4 @@ def test_plateau_looks_at_one_number(metric):
     last_growth = {"completion": 100, "mean_return": 200, "held_out_completion": 50}[metric]
     assert number == pytest.approx(last_growth + 80, abs=12)
     assert decision.rule == "plateau"
-
-
-def every_decision() -> Iterator[Decision]:
-    for rows in (
-        *(converging(30), falling()),
-        *(history(completion=11.0, entropy=0.999), history(completion=5.0, entropy=0.0)),
-    ):
-        yield stopped_at(rows, rule())[1]
-    yield stopped_at(converging(30), rule(option="plateau"))[1]
-
-
-def test_a_decision_reports_rule_values_and_thresholds_as_json_and_tags():
-    rules = set()
-    for decision in every_decision():
-        stored = json.loads(json.dumps(decision.as_dict()))
-        assert stored["rule"] in str(decision).replace(" ", "_")
-        assert stored["values"]
-        assert stored["thresholds"]["patience"] > 0
-        assert all(math.isfinite(value) for value in stored["values"].values())
-        tags = decision.tags()
-        assert tags["stopping.rule"] == decision.rule
-        assert {f"stopping.threshold.{key}" for key in decision.thresholds} <= tags.keys()
-        rules.add(decision.rule)
-    assert rules == {"converged", "overfitting", "collapsed", "not_learning", "plateau"}
+    assert_reported(decision)
