@@ -1,4 +1,4 @@
-"""What all benchmarks share: arguments, tables, means, JSON files."""
+"""What all benchmarks share: arguments, exit codes, tables, means, JSON files."""
 
 import argparse
 import json
@@ -6,26 +6,48 @@ import math
 import os
 import platform
 import statistics
+import sys
 from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import ttest_1samp
 
+from deepracer_exp.errors import BadInput
+
 CONFIDENCE = 0.95
 
 
-def benchmark_parser(name: str, doc: str | None, command: str | None = "train") -> argparse.ArgumentParser:
+def benchmark_parser(
+    name: str, doc: str | None, command: str | None = "train", json: bool = True
+) -> argparse.ArgumentParser:
     """Return a parser with --json and, unless `command` is None, overrides for that command of deepracer-exp."""
     parser = argparse.ArgumentParser(
         prog=f"benchmarks.{name}", description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
+    if json:
+        parser.add_argument("--json", type=Path, help="also write the figures as JSON to this file")
     if command is not None:
         what = f"as for deepracer-exp {command}"
         parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help=what)
     return parser
+
+
+def with_exit_code(main: Callable[[Sequence[str] | None], None]) -> Callable[..., int]:
+    """Let a benchmark's `main` print bad input as one line, and return the exit code."""
+
+    @wraps(main)
+    def guarded(arguments: Sequence[str] | None = None) -> int:
+        try:
+            main(arguments)
+        except BadInput as error:
+            print(error, file=sys.stderr)
+            return error.exit_code
+        return 0
+
+    return guarded
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
