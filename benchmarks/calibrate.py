@@ -33,7 +33,7 @@ from benchmarks.recorded import (
     sample,
 )
 from benchmarks.replay import OBSERVER, Observer, Windows, errors, replay
-from benchmarks.report import number, table
+from benchmarks.report import benchmark_parser, number, table, with_exit_code
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.options import find
 from deepracer_exp.errors import BadInput
@@ -292,12 +292,30 @@ def _starting_car(name: str | None, recorded: Sequence[Recorded]) -> str:
     return f"deepracer_v{versions[0]}"
 
 
-def run(options: argparse.Namespace) -> None:
+@with_exit_code
+def main(arguments: Sequence[str] | None = None) -> None:
     """Fit and report.
 
     Raises:
         BadInput: nothing to fit to, or nowhere to write the car.
     """
+    parser = benchmark_parser("calibrate", __doc__, None, json=False)
+    parser.add_argument(
+        "--traces", type=Path, nargs="+", required=True, help="folders, files or archives of recorded drives"
+    )
+    parser.add_argument(
+        "--car", help="the car to begin with (an option of conf/car); else that of the version"
+    )
+    parser.add_argument("--output", type=Path, help="write the fitted car as an option file to this path")
+    parser.add_argument(
+        "--leave-one-out", action="store_true", help="also fit without each recording, and measure on it"
+    )
+    parser.add_argument(
+        "--evaluations", type=int, default=25, help="steps of the least squares solver, at most"
+    )
+    parser.add_argument("--windows", type=int, default=3000, help="windows to fit to, at most")
+    parser.add_argument("--seed", type=int, default=0, help="which windows are taken")
+    options = parser.parse_args(arguments)
     if options.evaluations < 1:
         raise BadInput(f"--evaluations {options.evaluations}: accepted: 1 or more")
     if options.windows < LEAST_WINDOWS:
@@ -365,36 +383,6 @@ def _require_writable(path: Path) -> None:
             path.unlink()
     except OSError as error:
         raise BadInput(f"--output {path}: cannot be written: {error.strerror}") from error
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Fit as the command line says; return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.calibrate",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--traces", type=Path, nargs="+", required=True, help="folders, files or archives of recorded drives"
-    )
-    parser.add_argument(
-        "--car", help="the car to begin with (an option of conf/car); else that of the version"
-    )
-    parser.add_argument("--output", type=Path, help="write the fitted car as an option file to this path")
-    parser.add_argument(
-        "--leave-one-out", action="store_true", help="also fit without each recording, and measure on it"
-    )
-    parser.add_argument(
-        "--evaluations", type=int, default=25, help="steps of the least squares solver, at most"
-    )
-    parser.add_argument("--windows", type=int, default=3000, help="windows to fit to, at most")
-    parser.add_argument("--seed", type=int, default=0, help="which windows are taken")
-    try:
-        run(parser.parse_args(arguments))
-    except BadInput as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    return 0
 
 
 if __name__ == "__main__":

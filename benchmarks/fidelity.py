@@ -28,7 +28,7 @@ from benchmarks.recorded import (
     sample,
 )
 from benchmarks.replay import OBSERVER, WARM_UP_STEPS, Windows, errors, replay
-from benchmarks.report import benchmark_parser, number, table, write_json
+from benchmarks.report import benchmark_parser, number, table, with_exit_code, write_json
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput
 
@@ -202,7 +202,8 @@ def show(version: int, name: str, figures: dict[str, Any]) -> str:
     return table(head, rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@with_exit_code
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and draw."""
     parser = benchmark_parser("fidelity", __doc__, None)
     parser.add_argument(
@@ -216,43 +217,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--figures", type=Path, help="also draw the figures of docs/fidelity.md into this folder"
     )
     options = parser.parse_args(arguments)
-    try:
-        if options.car is not None:
-            car_named(options.car)
-        recorded = read_recorded(options.traces)
-        versions, drawn = {}, []
-        for one in recorded:
-            print(describe(one))
-        for version in sorted({one.version for one in recorded}):
-            mine = [one for one in recorded if one.version == version]
-            measured = prepare(options.car or f"deepracer_v{version}", mine)
-            figures = measure(measured, mine, options.held_out)
-            print(f"\n{show(version, measured.name, figures)}", flush=True)
-            versions[str(version)] = {
-                "car": measured.name,
-                "observer": measured.fitted.observer._asdict(),
-                "formula_values": measured.formula._asdict(),
-                **figures,
-                "recordings": {
-                    one.name: {
-                        "version_stated": one.stated,
-                        "windows_left_out": one.windows["one_second"].left_out,
-                        **measure(measured, [one], options.held_out),
-                    }
-                    for one in mine
-                },
-            }
-            drawn.append((version, measured, mine))
-    except BadInput as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
+    if options.car is not None:
+        car_named(options.car)
+    recorded = read_recorded(options.traces)
+    versions, drawn = {}, []
+    for one in recorded:
+        print(describe(one))
+    for version in sorted({one.version for one in recorded}):
+        mine = [one for one in recorded if one.version == version]
+        measured = prepare(options.car or f"deepracer_v{version}", mine)
+        figures = measure(measured, mine, options.held_out)
+        print(f"\n{show(version, measured.name, figures)}", flush=True)
+        versions[str(version)] = {
+            "car": measured.name,
+            "observer": measured.fitted.observer._asdict(),
+            "formula_values": measured.formula._asdict(),
+            **figures,
+            "recordings": {
+                one.name: {
+                    "version_stated": one.stated,
+                    "windows_left_out": one.windows["one_second"].left_out,
+                    **measure(measured, [one], options.held_out),
+                }
+                for one in mine
+            },
+        }
+        drawn.append((version, measured, mine))
     write_json(options.json, {"versions": versions, "held_out": options.held_out})
     if options.figures is not None:
         from benchmarks.fidelity_figures import draw
 
         for path in draw(drawn, options.figures):
             print(path)
-    return 0
 
 
 if __name__ == "__main__":

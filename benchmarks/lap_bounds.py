@@ -27,7 +27,7 @@ from deepracer_exp.config.options import options_of
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracks.track import Track
 
-from .report import benchmark_parser, number, table, write_json
+from .report import benchmark_parser, number, table, with_exit_code, write_json
 
 Floats = NDArray[np.float64]
 
@@ -145,7 +145,8 @@ def measure(car: CarConfig, boards: pd.DataFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@with_exit_code
+def main(arguments: Sequence[str] | None = None) -> None:
     """Compute, print and store."""
     parser = benchmark_parser("lap_bounds", __doc__, None)
     parser.add_argument("--anchors", type=Path, required=True, help="records of leaderboards as CSV")
@@ -171,7 +172,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     below = sum(bool(row["below"]) for row in rows)
     print(f"\n{below} of {len(rows)} worlds: the bound is below the record")
     write_json(options.json, {"car": options.car, "worlds": rows, "below": below})
-    return 0
 
 
 if __name__ == "__main__":

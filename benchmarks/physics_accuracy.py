@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.recorded import car_named
-from benchmarks.report import benchmark_parser, number, table, write_json
+from benchmarks.report import benchmark_parser, number, table, with_exit_code, write_json
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarBatch
 
 Array = NDArray[np.float64]
@@ -69,17 +68,14 @@ def measure(name: str, n_cars: int) -> list[dict[str, Any]]:
     return rows
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@with_exit_code
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = benchmark_parser("physics_accuracy", __doc__, None)
     parser.add_argument("--car", default="deepracer", help="the simulated car (an option of conf/car)")
     parser.add_argument("--cars", type=int, default=64)
     options = parser.parse_args(arguments)
-    try:
-        rows = measure(options.car, options.cars)
-    except BadInput as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
+    rows = measure(options.car, options.cars)
     head = ("substeps", *(f"after {seconds} s: median, p90 (mm)" for seconds in SECONDS), "µs")
     lines = [
         (
@@ -91,7 +87,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     print(table(head, lines))
     write_json(options.json, {"substeps": rows, "cars": options.cars, "car": options.car})
-    return 0
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ there; a value network of features beside pictures is not. `--car-racing` trains
 (96x96 in colour, its discrete actions), with one process per core.
 """
 
-import argparse
 import json
 import math
 import time
@@ -34,6 +33,8 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, MLPConfig
 from deepracer_exp.env.gym_env import DeepRacerVectorEnv
 from deepracer_exp.env.setup import build_setup
+
+from .report import benchmark_parser
 
 _ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
 
@@ -166,16 +167,13 @@ def measure(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, prog="benchmarks.sb3_peer"
-    )
+    parser = benchmark_parser("sb3_peer", __doc__, json=False)
     parser.add_argument("--iterations", type=int, required=True)
     parser.add_argument("--physics-threads", type=int, default=0, help="0: one per core")
     parser.add_argument("--torch-threads", type=int, default=1)
     parser.add_argument(
         "--car-racing", action="store_true", help="on Gymnasium's CarRacing-v3, not on our cars"
     )
-    parser.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="as for deepracer-exp train")
     args = parser.parse_args(arguments)
     experiment, _ = compose_experiment(args.overrides)
     threads = args.physics_threads, args.torch_threads

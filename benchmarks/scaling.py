@@ -3,7 +3,7 @@
     python -m benchmarks.scaling --storage postgresql+psycopg://racer@127.0.0.1/study --tracking http://127.0.0.1:5000
 
 Both servers are the reader's own (docs/scaling.md starts them). A real sweep talks to them through a relay that counts
-what passes. Prints tables and writes scaling.json.
+what passes.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from sweeps.claims import TrialClaims
 from sweeps.storage import Storage, open_storage
 
 from .command import command_line
-from .report import machine, number, table
+from .report import benchmark_parser, number, table, write_json
 
 _REQUEST = re.compile(rb"(GET|POST|PUT|PATCH) /\S* HTTP/1\.1\r\n")
 _SWEEP = (
@@ -249,18 +249,15 @@ def rate(calls: list[Callable[[], object]], seconds: float) -> float:
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = benchmark_parser("scaling", __doc__, None)
     parser.add_argument("--storage", required=True, help="PostgreSQL, an empty database")
     parser.add_argument("--tracking", required=True, help="an MLflow server")
     parser.add_argument("--trials", type=int, default=2)
     parser.add_argument("--iterations", type=int, nargs=2, default=(5, 15), metavar=("FEW", "MANY"))
-    parser.add_argument("--output", type=Path, default=Path("scaling.json"))
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
-        found: dict[str, Any] = {"machine": machine(), "trials": args.trials}
+        found: dict[str, Any] = {"trials": args.trials}
         steps: dict[str, Callable[[], Any]] = {
             "sweeps": lambda: [real_sweep(args, folder, iterations) for iterations in args.iterations],
             "calls": lambda: single_calls(args, folder),
@@ -270,7 +267,7 @@ def main() -> None:
         for name, step in steps.items():
             found[name] = step()
             print(name, "measured", flush=True)
-    args.output.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    write_json(args.json, found)
     rows = [
         [f"{sweep['iterations']} iterations: {part} {name}", number(value / args.trials)]
         for sweep in found["sweeps"]
