@@ -112,13 +112,14 @@ def train_groups() -> list[tuple[str, str | None, str]]:
 
 
 def _explaining(group: str, default: str | None) -> list[Path]:
-    """Return the files of a group that together explain all of its keys, the default option's first."""
+    """Return the files of a group that together explain all of its keys: the default option's, then whole ones."""
     if default is None:
         return []
-    files = sorted((conf_dir() / group).glob("*.yaml"), key=lambda path: (path.stem != default, path.stem))
+    keys_of = {path: yaml.safe_load(path.read_text()).keys() for path in (conf_dir() / group).glob("*.yaml")}
+    files = sorted(keys_of, key=lambda path: (path.stem != default, "defaults" in keys_of[path], path.stem))
     chosen, known = [], {"defaults"}
     for path in files:
-        keys = yaml.safe_load(path.read_text()).keys()
+        keys = keys_of[path]
         if keys - known:
             chosen.append(path)
             known |= keys
