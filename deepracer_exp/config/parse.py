@@ -143,11 +143,13 @@ def _check_shape(key: str, track: TrackConfig) -> None:
 def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
     finding = error.errors(include_url=False)[0]
     path = [str(part) for part in finding["loc"]]
-    key = _key_of(mapping, path)
+    absent = finding["type"] == "missing"
+    unknown = finding["type"] in ("unexpected_keyword_argument", "extra_forbidden")
+    key = _key_of(mapping, path, absent or unknown)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    if finding["type"] == "missing":
+    if absent:
         return f"{key}: missing{more}"
-    if finding["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+    if unknown:
         parent = _lookup(mapping, key.split(".")[:-1])
         siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
         return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
@@ -163,8 +165,14 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
     return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
 
 
-def _key_of(mapping: dict[str, Any], path: list[str]) -> str:
-    """Return the dotted key of a finding; pydantic also puts the tags of unions into its path."""
+def _key_of(mapping: dict[str, Any], path: list[str], ends_in_key: bool) -> str:
+    """Return the dotted key of a finding; pydantic also puts the tags of unions into its path.
+
+    Args:
+        mapping: the values.
+        path: of the finding.
+        ends_in_key: whether its last part is a key, even if the values do not have it.
+    """
     key: list[str] = []
     node: Any = mapping
     for index, part in enumerate(path):
@@ -172,7 +180,7 @@ def _key_of(mapping: dict[str, Any], path: list[str]) -> str:
             node = node[part]
         elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
             node = node[int(part)]
-        elif index + 1 < len(path) or not isinstance(node, dict):
+        elif index + 1 < len(path) or not ends_in_key:
             continue  # a union's tag
         key.append(part)
     return ".".join(key)
