@@ -132,10 +132,12 @@ def test_tracks_draws_one_and_writes_nothing_unasked(call, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_tracks_draws_a_picture_of_one(call, tmp_path):
-    ended = call("tracks", "reinvent_base", "-o", "picture.png")
+@pytest.mark.parametrize("output", ["picture.png", "picture"])
+def test_tracks_draws_a_picture_of_one_and_says_where_it_is(call, tmp_path, output):
+    ended = call("tracks", "reinvent_base", "-o", output)
     assert ended.code == 0
     assert "re:Invent 2018" in ended.stdout
+    assert ended.stdout.endswith("\npicture: picture.png\n")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -32,7 +32,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         runs_rewards=True,
     )
     add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
-    parser.add_argument("-o", "--output", help="picture to write (default: runs/validate/REWARD-TRACK.png)")
+    parser.add_argument(
+        *("-o", "--output"), type=_picture, help="picture to write (default: runs/validate/REWARD-TRACK.png)"
+    )
     parser.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
 
     parser = add_command(
@@ -81,7 +83,12 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
     name.completer = _names  # type: ignore[attr-defined]
-    parser.add_argument("-o", "--output", metavar="FILE", help="also write a picture of it")
+    parser.add_argument("-o", "--output", type=_picture, metavar="FILE", help="also write a picture of it")
+
+
+def _picture(output: str) -> str:
+    """Return where a picture is written: without an ending, matplotlib appends this one."""
+    return output if Path(output).suffix else f"{output}.png"
 
 
 _IMPORT_EPILOG = """\
