@@ -6,15 +6,7 @@ resumed run needs no replay of past steps. Only `adaptive_kl` has a state.
 
 import math
 
-from deepracer_exp.config.learning import (
-    AdaptiveKLLR,
-    CosineLR,
-    ExponentialLR,
-    LinearLR,
-    LRScheduleConfig,
-    PresetLR,
-    StepLR,
-)
+from deepracer_exp.config.learning import AdaptiveKLLR, FallingLR, LRScheduleConfig, MultipliedLR, PresetLR
 from deepracer_exp.config.own_class import OwnClass, build_own
 
 # A warm-up counted in fractions of the budget begins at fraction 0; its first update must still learn.
@@ -85,13 +77,13 @@ class PresetSchedule(Schedule):
 
     def _decay(self, position: float) -> float:
         match self._config:
-            case LinearLR(length=length, end_factor=end):
+            case FallingLR(kind="linear", length=length, end_factor=end):
                 return 1 + (end - 1) * min(position / length, 1.0)
-            case CosineLR(length=length, end_factor=end):
+            case FallingLR(length=length, end_factor=end):
                 return end + (1 - end) * (1 + math.cos(math.pi * min(position / length, 1.0))) / 2
-            case StepLR(length=length, factor=factor):
+            case MultipliedLR(kind="step", length=length, factor=factor):
                 return factor ** math.floor(position / length)
-            case ExponentialLR(length=length, factor=factor):
+            case MultipliedLR(length=length, factor=factor):
                 return factor ** (position / length)
         return self._adapted
 

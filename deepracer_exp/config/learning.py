@@ -141,37 +141,19 @@ class ConstantLR(_WarmedUp):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinearLR(_WarmedUp):
-    """A straight line down to `end_factor` over `length`."""
+class FallingLR(_WarmedUp):
+    """A straight line, or half a cosine, down to `end_factor` over `length`."""
 
-    kind: Literal["linear"]
+    kind: Literal["linear", "cosine"]
     length: Positive
     end_factor: NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)
-class CosineLR(_WarmedUp):
-    """Half a cosine down to `end_factor` over `length`."""
+class MultipliedLR(_WarmedUp):
+    """Multiplied by `factor` after every `length`, or over each `length` continuously."""
 
-    kind: Literal["cosine"]
-    length: Positive
-    end_factor: NonNegative
-
-
-@dataclass(frozen=True, kw_only=True)
-class StepLR(_WarmedUp):
-    """Multiplied by `factor` after every `length`."""
-
-    kind: Literal["step"]
-    length: Positive
-    factor: Positive
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExponentialLR(_WarmedUp):
-    """Multiplied by `factor` over each `length`, continuously."""
-
-    kind: Literal["exponential"]
+    kind: Literal["step", "exponential"]
     length: Positive
     factor: Positive
 
@@ -189,7 +171,7 @@ class AdaptiveKLLR(_WarmedUp):
     highest_factor: Positive
 
 
-PresetLR = ConstantLR | LinearLR | CosineLR | StepLR | ExponentialLR | AdaptiveKLLR
+PresetLR = ConstantLR | FallingLR | MultipliedLR | AdaptiveKLLR
 LRScheduleConfig = Annotated[
     Annotated[PresetLR, Field(discriminator="kind"), Tag("ours")] | Annotated[OwnClass, Tag("own")],
     OURS_OR_OWN,
