@@ -141,8 +141,6 @@ def supervised(call: Callable[[], int]) -> int:
     Args:
         call: returns 0 to 255; an exception ends the child with a traceback.
     """
-    if not hasattr(os, "fork"):
-        return call()
     results, result = os.pipe()
     heard, hears = os.pipe()
     supervisor = os.getpid()

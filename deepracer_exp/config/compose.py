@@ -98,10 +98,9 @@ def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Compos
     """Compose `conf/evaluate.yaml` with the overrides and validate the result.
 
     Raises:
-        BadInput: as for `compose_experiment`, or no run is given.
+        BadInput: as for `compose_experiment`.
     """
     composition = compose_entry("evaluate", overrides)
-    _require_run(composition)
     config = parse_config(composition.mapping, EvaluateConfig)
     _check_names(config.evaluation)
     return config, composition
@@ -111,23 +110,14 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     """Compose `conf/export.yaml` with the overrides and validate the result.
 
     Raises:
-        BadInput: as for `compose_experiment`, or no run or format is given.
+        BadInput: as for `compose_experiment`, or no format is given.
     """
     composition = compose_entry("export", overrides)
-    _require_run(composition)
     if composition.mapping["format"] is None:
         raise BadInput(
             "format: missing; write format=onnx, format=car, format=aws, format=aws-model or format=aws-logs"
         )
     return parse_config(composition.mapping, ExportConfig), composition
-
-
-def _require_run(composition: Composition) -> None:
-    if composition.mapping["run"] is None:
-        raise BadInput(
-            "RUN: missing; accepted: a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, "
-            "MODEL@ALIAS or ALIAS"
-        )
 
 
 def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
