@@ -207,8 +207,8 @@ def _ordered(pair: tuple[Number, ...]) -> tuple[Number, ...]:
     return pair
 
 
-_TWO = Field(min_length=2, max_length=2)
-_ORDERED = AfterValidator(_ordered)
+Range = Annotated[tuple[Number, ...], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
+"""The lowest and the highest value."""
 
 # Beyond half and twice the configured values, light cars with strong motors and servos begin to hop; beyond a fifth
 # and five times the physics diverges.
@@ -217,53 +217,41 @@ Scale = Annotated[float, Field(ge=0.5, le=2, allow_inf_nan=False)]
 Delay = Annotated[int, Field(ge=0, le=15)]
 Offset = Annotated[float, Field(ge=-15, le=15, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(ge=0, le=15, allow_inf_nan=False)]
-
-FrictionRange = Annotated[tuple[Friction, ...], _TWO, _ORDERED]
-ScaleRange = Annotated[tuple[Scale, ...], _TWO, _ORDERED]
-ShareRange = Annotated[tuple[Fraction, ...], _TWO, _ORDERED]
-DelayRange = Annotated[tuple[Delay, ...], _TWO, _ORDERED]
-OffsetRange = Annotated[tuple[Offset, ...], _TWO, _ORDERED]
-DeviationRange = Annotated[tuple[Deviation, ...], _TWO, _ORDERED]
-
-
 Objects = Annotated[int, Field(ge=0, le=50)]
-ObjectRange = Annotated[tuple[Objects, ...], _TWO, _ORDERED]
 Height = Annotated[float, Field(ge=-0.1, le=0.5, allow_inf_nan=False)]
-HeightRange = Annotated[tuple[Height, ...], _TWO, _ORDERED]
 # From -1/3 on, the picture's corners would show what lies nearer to its middle once more.
 Distortion = Annotated[float, Field(ge=-0.3, le=0.3, allow_inf_nan=False)]
-DistortionRange = Annotated[tuple[Distortion, ...], _TWO, _ORDERED]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureRandomizationConfig:
     """What pictures differ in: the lowest and highest value of each quantity, drawn for each episode of each car."""
 
-    brightness_scale: ScaleRange
+    brightness_scale: Range[Scale]
     """Factor on all values."""
-    contrast_scale: ScaleRange
+    contrast_scale: Range[Scale]
     """Factor on the distance of all values from the middle grey."""
-    gamma_scale: ScaleRange
+    gamma_scale: Range[Scale]
     """Exponent of all values, where white is 1: above 1 dark colours become darker."""
-    color_noise: ShareRange
+    color_noise: Range[Fraction]
     """Standard deviation of the factor on red, green and blue of each material."""
-    light: ShareRange
+    light: Range[Fraction]
     """How much darker a shadow in the picture is at its middle, or a spot of light brighter."""
-    blur: ShareRange
+    blur: Range[Fraction]
     """Share of a pixel that comes from its four neighbours."""
-    pixel_noise: ShareRange
+    pixel_noise: Range[Fraction]
     """Standard deviation of the Gaussian noise on each pixel at each step, as a fraction of white."""
-    height_m: HeightRange
+    height_m: Range[Height]
     """Added to the height of the camera."""
-    pitch_deg: OffsetRange
+    pitch_deg: Range[Offset]
     """Added to the pitch of the camera, downwards."""
-    field_of_view_scale: ScaleRange
+    field_of_view_scale: Range[Scale]
     """Factor on the tangent of half the field of view."""
-    dirt: ShareRange = (0.0, 0.0)
+    dirt: Range[Fraction] = (0.0, 0.0)
     """How much darker spots of dirt on the lens are at their middle."""
-    objects: ObjectRange = (0, 0)
+    objects: Range[Objects] = (0, 0)
     """How many boxes stand beside the road; whole numbers."""
-    lens_k1: DistortionRange = (0.0, 0.0)
+    lens_k1: Range[Distortion] = (0.0, 0.0)
     """Radial distortion: how much farther out the corners look than through a pinhole, as a share."""
 
 
@@ -274,27 +262,27 @@ class RandomizationConfig:
     Draws are uniform, ends included, and constant for the episode. Their names are columns of the trace.
     """
 
-    friction_scale: FrictionRange
+    friction_scale: Range[Friction]
     """Factor on the grip of the tyres (1: as configured for the car and the floor)."""
-    mass_scale: ScaleRange
+    mass_scale: Range[Scale]
     """Factor on all masses and inertias."""
-    motor_scale: ScaleRange
+    motor_scale: Range[Scale]
     """Factor on the motors' gain and largest torque."""
-    servo_scale: ScaleRange
+    servo_scale: Range[Scale]
     """Factor on the steering servos' gain: how fast the wheels turn."""
-    battery_sag: ShareRange
+    battery_sag: Range[Fraction]
     """Share of the commanded speed that is lost linearly over the first 20 s of driving."""
-    action_delay_steps: DelayRange
+    action_delay_steps: Range[Delay]
     """Control steps by which commands are delayed; whole numbers."""
-    steering_offset_deg: OffsetRange
+    steering_offset_deg: Range[Offset]
     """Degrees added to every steering command, as by a badly calibrated centre; positive to the left."""
-    steering_noise_deg: DeviationRange
+    steering_noise_deg: Range[Deviation]
     """Standard deviation of the Gaussian noise added to each steering command, degrees."""
-    speed_noise: ShareRange
+    speed_noise: Range[Fraction]
     """Standard deviation of the Gaussian noise on each speed command, as a fraction of it."""
-    observation_noise: ShareRange
+    observation_noise: Range[Fraction]
     """Standard deviation of the Gaussian noise on each measured feature, in units of its scale."""
-    observation_dropout: ShareRange
+    observation_dropout: Range[Fraction]
     """Probability at each step that the previous observation is repeated."""
     pictures: PictureRandomizationConfig | None = None
     """Of a camera's pictures; None: nothing."""

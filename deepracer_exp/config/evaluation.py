@@ -112,8 +112,8 @@ class StoreConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig:
-    """The request of `deepracer-exp evaluate`."""
+class StoredRunConfig:
+    """A stored run, where it is looked up, and which of its checkpoints is meant."""
 
     run: Annotated[str, Field(min_length=1)]
     """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
@@ -123,23 +123,21 @@ class EvaluateConfig:
     runs_dir: Annotated[str, Field(min_length=1)]
     tracking: StoreConfig
     debug: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig(StoredRunConfig):
+    """The request of `deepracer-exp evaluate`."""
+
     evaluation: EvaluationConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportConfig:
+class ExportConfig(StoredRunConfig):
     """The request of `deepracer-exp export`."""
 
-    run: Annotated[str, Field(min_length=1)]
-    """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
-    of a registered model."""
     format: Literal["onnx", "car", "aws", "aws-model", "aws-logs"]
     """The network as a file or as an archive for a car, the files that AWS trains from, with the weights as well, or
     the run's logs as AWS writes them."""
     layout: Literal["console", "deepracer-for-cloud"]
     """The folder layout of `aws-logs`."""
-    checkpoint: Annotated[str, AfterValidator(checked_checkpoint_name)] | None
-    """`best`, `last` or an iteration; null: the one of the alias that names the run, else `best`. Network only."""
-    runs_dir: Annotated[str, Field(min_length=1)]
-    tracking: StoreConfig
-    debug: bool
