@@ -108,12 +108,12 @@ class CustomFiles:
 
     def remarks(self) -> list[str]:
         """Return a line for each key that is not used or that needs an explanation."""
-        lines: list[str] = []
-        if self.metadata is not None:
-            lines += _remarks("model_metadata.json", self._metadata_remarks(self.metadata))
-        if self.hyperparameters is not None:
-            lines += _remarks("hyperparameters.json", self._learning_remarks(self.hyperparameters))
-        return lines
+        metadata = self._metadata_remarks(self.metadata) if self.metadata else ()
+        learning = self._learning_remarks(self.hyperparameters) if self.hyperparameters else ()
+        return [
+            *(f"model_metadata.json: {what}: {why}" for what, why in metadata),
+            *(f"hyperparameters.json: {what}: {why}" for what, why in learning),
+        ]
 
     def _metadata_remarks(self, metadata: ModelMetadata) -> Iterable[tuple[str, str]]:
         values = {
@@ -305,10 +305,6 @@ def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, 
     unknown = [key for key in given if key not in known]
     if unknown:
         yield ", ".join(unknown), "ignored, as by the service"
-
-
-def _remarks(file: str, findings: Iterable[tuple[str, str]]) -> list[str]:
-    return [f"{file}: {what}: {why}" for what, why in findings]
 
 
 _GROUPS = {

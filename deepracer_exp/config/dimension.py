@@ -78,7 +78,24 @@ def dimension(key: str, expression: str) -> Choices | Range:
             f"{key}={expression}: nothing to search in a single value; accepted: A,B, choice(A,B), "
             "range(FROM,BELOW,STEP), interval(LOW,HIGH), tag(log,interval(LOW,HIGH)) and glob(PATTERN)"
         )
-    return _dimension(override)
+    value = override.value()
+    line = override.input_line or ""
+    if isinstance(value, Glob):
+        return Choices(tuple(_options(override, value)))
+    assert isinstance(value, Sweep)
+    tags = value.tags - {"log"}
+    if tags or (value.tags and isinstance(value, ChoiceSweep)):
+        raise BadInput(
+            f"{line}: tag {', '.join(sorted(value.tags))}; accepted: log, with a range or an interval"
+        )
+    if isinstance(value, ChoiceSweep):
+        return _choices(line, value.list)
+    if isinstance(value, IntervalSweep):
+        assert value.start is not None
+        assert value.end is not None
+        return _interval(line, value.start, value.end, "log" in value.tags)
+    assert isinstance(value, RangeSweep)
+    return _range(line, value, "log" in value.tags)
 
 
 def plain_expression(override: Override, expression: str) -> str:
@@ -103,27 +120,6 @@ def as_override(key: str, value: Choice) -> str:
 def override_value(line: str) -> Any:
     """Return the plain value of an override."""
     return parse_single(line).value()
-
-
-def _dimension(override: Override) -> Choices | Range:
-    value = override.value()
-    line = override.input_line or ""
-    if isinstance(value, Glob):
-        return Choices(tuple(_options(override, value)))
-    assert isinstance(value, Sweep)
-    tags = value.tags - {"log"}
-    if tags or (value.tags and isinstance(value, ChoiceSweep)):
-        raise BadInput(
-            f"{line}: tag {', '.join(sorted(value.tags))}; accepted: log, with a range or an interval"
-        )
-    if isinstance(value, ChoiceSweep):
-        return _choices(line, value.list)
-    if isinstance(value, IntervalSweep):
-        assert value.start is not None
-        assert value.end is not None
-        return _interval(line, value.start, value.end, "log" in value.tags)
-    assert isinstance(value, RangeSweep)
-    return _range(line, value, "log" in value.tags)
 
 
 def _options(override: Override, glob: Glob) -> list[str]:
