@@ -18,6 +18,7 @@ from deepracer_exp.commands.arguments import runs_and_overrides
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment, compose_export, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep
+from tests.test_own_classes import write_examples
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -100,10 +101,7 @@ def _path_restored(monkeypatch):
 def folder(tmp_path_factory):
     """Return a working folder with the files that the commands name, among them those of docs/extending.md."""
     folder = tmp_path_factory.mktemp("docs")
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
-    for name, content in re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', page, re.DOTALL | re.MULTILINE):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(content, encoding="utf-8")
+    write_examples(folder)
     for name in ("DIR", "model_1", "model_2"):
         (folder / name).mkdir()
         (folder / name / "reward_function.py").write_text(

@@ -81,8 +81,13 @@ CASES = {
     ("analyze", "unknown"): "unknown: no such file or folder, and no run",
     ("analyze", "pipe"): "pipe: is a pipe",
     ("analyze", "log.txt", "--reward", "nothing.py"): "nothing.py",
-    ("analyze", "log.txt", "--target", "soon"): "--target soon",
-    ("analyze", "log.txt", "--output", "nowhere/page.html"): "--output nowhere",
+    ("analyze", "log.txt", "--target", "soon"): "--target soon: accepted: seconds above 0",
+    (
+        "analyze",
+        "log.txt",
+        "--output",
+        "nowhere/page.html",
+    ): "--output nowhere/page.html: its folder does not exist",
     ("compare",): "RUN LOGS: 0 given; accepted: a run, and logs of the service",
     (
         "compare",

@@ -12,25 +12,15 @@ from deepracer_exp.config.dimension import Choices, Range, as_override, dimensio
 from deepracer_exp.config.options import conf_dir, options
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.sweep import SweepConfig, SweepEntry, compose_sweep
-from deepracer_exp.errors import BadInput
+
+from .conftest import refused
 
 READY = [name for name in options("sweep") if name != "own"]
 FILES = ["sweep", *(f"sweep/{name}" for name in options("sweep")), "sweep/executor/local"]
 
 
 def refusal(*overrides: str) -> str:
-    with pytest.raises(BadInput) as caught:
-        compose_sweep(overrides)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
-
-
-def refused_dimension(key: str, expression: str) -> str:
-    with pytest.raises(BadInput) as caught:
-        dimension(key, expression)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+    return refused(compose_sweep, overrides)
 
 
 # --- The files
@@ -233,7 +223,7 @@ def test_a_range_is_all_its_values():
     ],
 )
 def test_a_search_of_nothing_is_refused(expression, part):
-    message = refused_dimension("algorithm.lr", expression)
+    message = refused(dimension, "algorithm.lr", expression)
     assert message.startswith("algorithm.lr=")
     assert part in message
 

@@ -18,7 +18,7 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.errors import BadInput
 
-from .conftest import CONTINUOUS, HYPERPARAMETERS, METADATA
+from .conftest import CONTINUOUS, HYPERPARAMETERS, METADATA, refused
 
 
 @cache
@@ -38,11 +38,7 @@ def overrides_of(folder: Path, *overrides: str) -> FileOverrides:
 
 
 def refusal(folder: Path) -> str:
-    with pytest.raises(BadInput) as caught:
-        overrides_of(folder)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
+    return refused(overrides_of, folder)
 
 
 # --- What is taken

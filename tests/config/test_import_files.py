@@ -6,9 +6,8 @@ import pytest
 
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.custom_files import import_files, read_custom_files
-from deepracer_exp.errors import BadInput
 
-from .conftest import CONTINUOUS, METADATA, REWARD
+from .conftest import CONTINUOUS, METADATA, REWARD, refused
 
 
 @pytest.fixture(autouse=True)
@@ -31,11 +30,8 @@ def default_composition() -> Composition:
 
 
 def refusal(folder: Path, name: str) -> str:
-    with pytest.raises(BadInput) as caught:
-        # Its values are not what is refused.
-        import_files(read_custom_files(str(folder)), name, default_composition().mapping)
-    message = str(caught.value)
-    assert "\n" not in message
+    # Its values are not what is refused.
+    message = refused(import_files, read_custom_files(str(folder)), name, default_composition().mapping)
     assert message.startswith(("--name ", "conf"))
     return message
 
