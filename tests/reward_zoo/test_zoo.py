@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.rewards.reward import RewardFunction
@@ -199,8 +199,8 @@ def test_every_constant_has_an_effect(name: str) -> None:
 def test_every_reward_of_the_zoo_has_its_option_file() -> None:
     assert sorted(file.stem for file in CONF.glob("*.yaml")) == zoo_names()
     for name in zoo_names():
-        values = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-        assert RewardConfig(**values) == RewardConfig(name=name, file=None, constants={}, time_limit_s=5.0)
+        found = compose_option("reward", name, RewardConfig)
+        assert found == RewardConfig(name=name, file=None, constants={}, time_limit_s=5.0)
 
 
 def test_follow_center_line_pays_more_nearer_to_the_line() -> None:
