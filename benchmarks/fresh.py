@@ -42,11 +42,16 @@ class Driven:
         return {f"{key}_{which}": None if v is None else round(v, 4) for key, v in asdict(self).items()}
 
 
+def protocol(*overrides: str) -> EvaluationConfig:
+    """Return the evaluation that overrides of `deepracer-exp evaluate` describe."""
+    return compose_evaluation(["run=any", *overrides])[0].evaluation
+
+
 def fresh_trials(trials: int = TRIALS) -> EvaluationConfig:
     """Return trials of one lap each whose starts and conditions no training's evaluation has."""
     starts = ",".join(repr((place + _SHIFT) / trials) for place in range(trials))
-    overrides = [f"evaluation.trials={trials}", f"evaluation.seed={_SEED}", f"evaluation.starts=[{starts}]"]
-    return compose_evaluation(["run=any", "evaluation=three_trials", *overrides])[0].evaluation
+    conditions = (f"evaluation.seed={_SEED}", f"evaluation.starts=[{starts}]")
+    return protocol("evaluation=three_trials", f"evaluation.trials={trials}", *conditions)
 
 
 def stored_policy(run: Path, checkpoint: str | None = None) -> tuple[Experiment, nn.Module]:

@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 
 import torch
 
-from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 
 from .command import train
-from .fresh import stored_policy
+from .fresh import protocol, stored_policy
 from .report import benchmark_parser, number, table, write_json
 
 SEEN = (
@@ -84,8 +84,7 @@ def drive(run: Path, tracks: Sequence[str], starts: int = STARTS) -> dict[str, D
     torch.set_num_threads(1)
     experiment, policy = stored_policy(run)
     driven_on = compose_experiment([f"track=[{','.join(tracks)}]", "track.direction=alternate"])[0]
-    protocol = ("evaluation=three_trials", "evaluation.held_out=null", f"evaluation.trials={starts}")
-    config = compose_evaluation(["run=any", *protocol])[0].evaluation
+    config = protocol("evaluation=three_trials", "evaluation.held_out=null", f"evaluation.trials={starts}")
     evaluation = Evaluator(dataclasses.replace(experiment, track=driven_on.track), config)(policy)
     ways = {group.track: group for group in evaluation.groups}
     found = {}

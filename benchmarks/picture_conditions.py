@@ -26,13 +26,13 @@ from pathlib import Path
 
 import torch
 
-from deepracer_exp.config.compose import compose_evaluation, compose_experiment
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import PictureRandomizationConfig
 from deepracer_exp.config.overrides import override_line
 from deepracer_exp.evaluation.evaluator import Evaluator
 
 from .command import train
-from .fresh import stored_policy
+from .fresh import protocol, stored_policy
 from .report import benchmark_parser, interval_text, mean_and_interval, number, table, write_json
 
 STARTS = 20
@@ -70,8 +70,8 @@ def drive(run: Path, under: dict[str, PictureRandomizationConfig | None]) -> dic
     """Let a run's last policy drive under each condition; return the completion."""
     torch.set_num_threads(1)
     stored, policy = stored_policy(run, "last")
-    protocol = ("evaluation=three_trials", "evaluation.usual=null", "evaluation.held_out=null")
-    config = compose_evaluation(["run=any", *protocol, f"evaluation.trials={STARTS}"])[0].evaluation
+    conditions = ("evaluation.usual=null", "evaluation.held_out=null")
+    config = protocol("evaluation=three_trials", f"evaluation.trials={STARTS}", *conditions)
     completion = {}
     for name, pictures in under.items():
         randomization = dataclasses.replace(stored.randomization, pictures=pictures)

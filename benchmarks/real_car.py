@@ -21,12 +21,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.real_car import compare, key_figures
 
 from .command import trained
-from .fresh import stored_policy
+from .fresh import protocol, stored_policy
 from .report import benchmark_parser, interval_text, mean_and_interval, number, percent, table, write_json
 
 TEACHER_STEPS, ITERATIONS, STARTS = 300_000, 40, 20
@@ -39,8 +38,7 @@ Figures = dict[str, dict[str, Any]]
 def drive(run: Path) -> Figures:
     """Let a run's last policy drive as in the simulator and as on the car."""
     experiment, policy = stored_policy(run, "last")
-    trials = f"evaluation.trials={STARTS}"
-    config = compose_evaluation(["run=any", "evaluation=real_car", trials])[0].evaluation
+    config = protocol("evaluation=real_car", f"evaluation.trials={STARTS}")
     return key_figures(compare(experiment, config, policy, Evaluator(experiment, config)(policy)))
 
 
