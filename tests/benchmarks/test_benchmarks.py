@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from benchmarks import all_tracks, generalisation, sb3_peer, throughput, time_to_lap
-from benchmarks.driving import PASS_STEPS, SameDriving, scalar_setup
 from benchmarks.report import median
+from benchmarks.throughput import PASS_STEPS, SameDriving, scalar_setup
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.tracks.track import world_track
