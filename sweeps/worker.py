@@ -38,7 +38,7 @@ from deepracer_exp.tracking.metadata import PARENT
 from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import STUDY, TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
-from deepracer_exp.training.budget import Budget, RunEnded
+from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.clone import prepare_clone
 from deepracer_exp.training.run import copy_run, resume, run_training
 from deepracer_exp.training.signals import Interruption
@@ -209,8 +209,7 @@ class TrialRun(Callback):
         """Keep the claim and ask the pruners."""
         row = trainer.row
         self._lease.confirm()
-        budget = Budget(trainer.experiment.budget)
-        _, spent = budget.used(row["env_steps"], row["iteration"], row["wall_clock_s"])
+        _, spent = trainer.budget.used(*trainer.usage)
         self._show(spent, {name: row.get(name) for name in _SHOWN})
         value = intermediate_value(row, self._config.config.objectives[0], self._config.protocol.time_s)
         if value is None or self._seed > 0:

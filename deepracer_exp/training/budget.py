@@ -52,11 +52,8 @@ class Alert:
 class Budget:
     """The limits of a run and of its experiment; the first one reached ends the run."""
 
-    def __init__(self, config: BudgetConfig, folder: Path | None = None):
-        """Set the limits.
-
-        The folders beside the run's own are the other runs of the experiment; without `folder` there are none.
-        """
+    def __init__(self, config: BudgetConfig, folder: Path):
+        """Set the limits of the run in `folder`; the folders beside it are the other runs of the experiment."""
         self._config, self._folder = config, folder
         self._others: dict[str, float] = {}
         self._look_again_at = 0.0
@@ -109,7 +106,7 @@ class Budget:
         }
         found = [(name, own[name], 0.0, most) for name, most in _limits(self._config).items()]
         shared = _limits(self._config, _EXPERIMENT)
-        if shared and self._folder is not None:
+        if shared:
             # They may run at the same time.
             if time.monotonic() >= self._look_again_at:
                 self._others = _spent_in(self._folder.parent, self._config, besides=self._folder.name)
@@ -163,7 +160,7 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
             f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it anyway, `{clone}` starts a new run "
             "from its best checkpoint"
         )
-    used = Budget(config).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
+    used = Budget(config, run_dir).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
     if used[1] >= 1:
         raise RunEnded(
             f"{run_dir}: has ended ({reason}); to resume it, give it more, such as budget.{used[0]}="

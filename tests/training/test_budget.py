@@ -9,7 +9,7 @@ from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.metrics import TRACK_METRICS
 from deepracer_exp.training import budget as module
-from deepracer_exp.training.budget import Budget, refuse_spent
+from deepracer_exp.training.budget import Budget, RunEnded, refuse_ended, refuse_spent
 
 NONE = {field.name: None for field in dataclasses.fields(BudgetConfig)}
 
@@ -26,7 +26,7 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def sibling(run: Path, name: str, *, ended: bool = True, **spent: float) -> None:
+def sibling(run: Path, name: str, *, ended: bool = True, **spent: Any) -> None:
     """Write what a run of the same experiment has used; one that has not ended was cut off within a row."""
     folder = run.parent / name
     folder.mkdir(exist_ok=True)
@@ -52,12 +52,12 @@ def sibling(run: Path, name: str, *, ended: bool = True, **spent: float) -> None
     ],
 )
 def test_the_limit_nearest_to_its_end_counts_of_those_that_are_set(limit, at, used):
-    assert Budget(limits(**limit)).used(*at) == used
+    assert Budget(limits(**limit), Path()).used(*at) == used
 
 
 def test_a_run_costs_the_price_of_its_time():
-    assert Budget(limits(env_steps=1, price_per_hour=3.0)).cost(1800.0) == 1.5
-    assert Budget(limits(env_steps=1)).cost(1800.0) is None
+    assert Budget(limits(env_steps=1, price_per_hour=3.0), Path()).cost(1800.0) == 1.5
+    assert Budget(limits(env_steps=1), Path()).cost(1800.0) is None
 
 
 def test_the_runs_of_an_experiment_share_its_limits(run):
@@ -113,8 +113,17 @@ def test_an_experiment_that_has_used_everything_starts_no_run(run):
         refuse_spent(limits(experiment_env_steps=1000), run.parent)
 
 
+def test_a_run_that_used_up_the_limit_of_its_experiment_needs_a_higher_one_to_resume(run):
+    sibling(run, "first", env_steps=600)
+    spent = {"status": "finished", "reason": "budget reached: experiment_env_steps", "iteration": 4}
+    sibling(run, run.name, env_steps=400, **spent)
+    with pytest.raises(RunEnded, match=r"give it more, such as budget\.experiment_env_steps="):
+        refuse_ended(run, limits(experiment_env_steps=1000), [])
+    refuse_ended(run, limits(experiment_env_steps=1001), [])
+
+
 def test_each_share_of_a_limit_is_reported_once():
-    budget = Budget(limits(env_steps=1000))
+    budget = Budget(limits(env_steps=1000), Path())
     passed = {steps: [one.percent for one in budget.alerts(steps, 0, 0.0)] for steps in range(0, 1200, 100)}
     assert {steps: percents for steps, percents in passed.items() if percents} == {
         500: [50],
@@ -124,7 +133,7 @@ def test_each_share_of_a_limit_is_reported_once():
 
 
 def test_shares_that_are_passed_together_are_one_alert():
-    budget = Budget(limits(env_steps=1000, minutes=10.0))
+    budget = Budget(limits(env_steps=1000, minutes=10.0), Path())
     assert budget.alerts(0, 0, 0.0) == []
     (steps,) = budget.alerts(950, 0, 60.0)
     assert (steps.limit, steps.percent) == ("env_steps", 80)
@@ -141,9 +150,9 @@ def test_what_was_passed_before_a_run_began_is_not_reported_by_it(run):
 
 
 def test_it_reports_the_limits_that_are_set():
-    assert str(Budget(limits(env_steps=3_000_000, minutes=1.5))) == "3,000,000 steps or 1.5 min"
+    assert str(Budget(limits(env_steps=3_000_000, minutes=1.5), Path())) == "3,000,000 steps or 1.5 min"
     costs = limits(max_cost=2.0, experiment_max_cost=5.0, price_per_hour=1.0)
-    assert str(Budget(costs)) == "2.00 in cost or 5.00 in cost of all runs"
+    assert str(Budget(costs, Path())) == "2.00 in cost or 5.00 in cost of all runs"
 
 
 @pytest.mark.parametrize("name", ["max_cost", "experiment_max_cost"])
