@@ -426,11 +426,11 @@ def _clean(args: argparse.Namespace) -> int:
 def _overview(uri: str | None, runs_dir: Path) -> "tuple[StoreOverview | None, str | None]":
     """Ask MLflow if there is a store; return what it knows, or what is skipped because it does not answer."""
     from deepracer_exp.tracking.registry import read_overview
-    from deepracer_exp.tracking.store import has_store, resolve_store
+    from deepracer_exp.tracking.store import existing_store, has_store
 
     if not has_store(uri, runs_dir):
         return None, None
-    resolve_store(uri, runs_dir)  # an unusable address is bad input, not a store that does not answer
+    existing_store(uri, runs_dir)  # an unusable address is bad input, not a store that does not answer
     try:
         return read_overview(uri, runs_dir), None
     except BadInput as error:

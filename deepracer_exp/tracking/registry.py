@@ -19,7 +19,7 @@ from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, rea
 
 from .metadata import picture, race_result
 from .metrics import metric_names
-from .store import has_store, open_client, pages, resolve_store
+from .store import existing_store, has_store, open_client, pages
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -88,7 +88,7 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
     if len(matches) == 1:
         with open_client(reference, uri, runs_dir) as client:
             return _registered(reference, client.get_model_version_by_alias(*matches[0]), alias)
-    names = [f"{name}@{given}" for name, given in known]
+    names = [f"{name}@{given}" for name, given in matches or known]
     if matches:
         raise BadInput(
             f"{reference}: ambiguous: {len(matches)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS"
@@ -101,7 +101,7 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
 
 def _aliases(what: str, uri: str | None, runs_dir: Path) -> list[tuple[str, str]]:
     """Return model and name of each alias; those of a file are read without MLflow, which takes seconds to import."""
-    if has_store(uri, runs_dir) and (file := resolve_store(uri, runs_dir).sqlite_file) is not None:
+    if has_store(uri, runs_dir) and (file := existing_store(uri, runs_dir).sqlite_file) is not None:
         with suppress(sqlite3.Error), closing(sqlite3.connect(file)) as database:
             return database.execute("SELECT name, alias FROM registered_model_aliases").fetchall()
     with open_client(what, uri, runs_dir) as client:

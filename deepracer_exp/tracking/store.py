@@ -213,6 +213,24 @@ def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
     return Path(run.data.tags["run_dir"])
 
 
+def existing_store(uri: str | None, runs_dir: Path) -> Store:
+    """Return a store to read from, as `resolve_store` does for one to record in.
+
+    Raises:
+        BadInput: `uri` can never work, or the file does not exist.
+    """
+    default = runs_dir / MLFLOW_DB
+    if uri is None and not default.exists():
+        raise BadInput(
+            f"{default}: no runs recorded yet; run `deepracer-exp train` first, or give tracking.uri="
+        )
+    # Before `resolve_store`, which creates the file's folder.
+    path = (uri or "").removeprefix(_SQLITE_PREFIX)
+    if uri is not None and uri.startswith(_SQLITE_PREFIX) and path and not Path(path).exists():
+        raise BadInput(f"tracking.uri={uri}: no such file; train with this tracking.uri first")
+    return resolve_store(uri, runs_dir)
+
+
 @contextmanager
 def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowClient]":
     """Open a store and turn its errors into BadInput.
@@ -226,7 +244,7 @@ def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowC
         raise BadInput(
             f"{what}: {runs_dir} has no mlflow.db to look it up in; give tracking.uri=URI or a run's folder"
         )
-    store = resolve_store(uri, runs_dir)
+    store = existing_store(uri, runs_dir)
     # Imported here: it takes three seconds, and nothing else needs it.
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError

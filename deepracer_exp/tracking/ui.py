@@ -17,10 +17,9 @@ from typing import IO
 from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import running
-from deepracer_exp.runs.files import MLFLOW_DB
 
 from .metadata import VIEW, WORKFLOW
-from .store import Store, open_client, pages, resolve_store
+from .store import Store, existing_store, open_client, pages
 
 _HOST = "127.0.0.1"
 _START_S = 90.0
@@ -38,7 +37,7 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
         BadInput: no run is recorded yet, or the port is in use.
         RunFailed: the server did not start, or ended by itself.
     """
-    store = existing_store(runs_dir, uri)
+    store = existing_store(uri, runs_dir)
     if store.is_server:
         announce(runs_page(store.shown, uri, runs_dir))
         return
@@ -51,19 +50,6 @@ def serve_ui(runs_dir: Path, uri: str | None, port: int, announce: Callable[[str
         except KeyboardInterrupt:
             return
     raise RunFailed(f"MLflow's server at {url} ended by itself (exit code {code})")
-
-
-def existing_store(runs_dir: Path, uri: str | None) -> Store:
-    """Return the store; refuse an SQLite file that does not exist."""
-    default = runs_dir / MLFLOW_DB
-    if uri is None and not default.exists():  # resolve_store would create runs_dir
-        raise BadInput(
-            f"{default}: no runs recorded yet; run `deepracer-exp train` first, or give tracking.uri="
-        )
-    store = resolve_store(uri, runs_dir)
-    if store.sqlite_file is not None and not store.sqlite_file.exists():
-        raise BadInput(f"tracking.uri={store.shown}: no such file; train with this tracking.uri first")
-    return store
 
 
 @contextmanager
@@ -124,7 +110,7 @@ def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO
         try:
             with _DIRECTLY.open(f"{url}/health", timeout=_ANSWER_S):
                 return
-        except (urllib.error.URLError, OSError):
+        except OSError:
             time.sleep(0.2)
     output.seek(0)
     lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]

@@ -159,7 +159,8 @@ def test_what_no_model_is_called_by_is_refused(season, client):
 
 def test_a_bare_alias_of_two_models_is_refused(season, client):
     season.promote(season.champion(client), model="spring")
-    assert "2 models have this alias: season@champion, spring@champion" in refusal("champion", season)
+    client.set_registered_model_alias("spring", "rain", "1")
+    assert "2 models have this alias: season@champion, spring@champion; give" in refusal("champion", season)
     assert resolve("spring@champion", season.runs_dir, None).registered == "spring@champion"
 
 

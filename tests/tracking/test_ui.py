@@ -12,8 +12,10 @@ from mlflow import MlflowClient
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.metadata import VIEW, run_params, run_tags
 from deepracer_exp.tracking.metrics import METRICS
+from deepracer_exp.tracking.registry import look_up
+from deepracer_exp.tracking.store import existing_store
 from deepracer_exp.tracking.tracker import MLflowTracker
-from deepracer_exp.tracking.ui import existing_store, running_ui, runs_page, serve_ui
+from deepracer_exp.tracking.ui import running_ui, runs_page, serve_ui
 
 NAMES = {"track": "reinvent_base", "reward": "progress_per_step", "network": "mlp_small"}
 
@@ -41,9 +43,11 @@ def test_a_port_in_use_is_bad_input_that_names_a_free_one(store, free_port):
 
 def test_a_look_at_no_runs_says_to_train_first_and_creates_nothing(tmp_path):
     with pytest.raises(BadInput, match="run `deepracer-exp train` first"):
-        existing_store(tmp_path / "runs", None)
+        existing_store(None, tmp_path / "runs")
     with pytest.raises(BadInput, match=r"nothing\.db: no such file"):
-        existing_store(tmp_path / "runs", f"sqlite:///{tmp_path}/nothing.db")
+        existing_store(f"sqlite:///{tmp_path}/typo/nothing.db", tmp_path / "runs")
+    with pytest.raises(BadInput, match=r"nothing\.db: no such file"):
+        look_up("season@champion", f"sqlite:///{tmp_path}/typo/nothing.db", tmp_path / "runs")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -55,7 +59,7 @@ def test_a_server_that_does_not_answer_has_no_page_to_open(tmp_path, free_port):
 @pytest.mark.slow
 def test_the_ui_shows_runs_by_name_and_opens_their_files(store, tmp_path, free_port):
     run_ids = [record(store, tmp_path, seed) for seed in (1, 2)]
-    with running_ui(existing_store(tmp_path, None), free_port) as (url, _):
+    with running_ui(existing_store(None, tmp_path), free_port) as (url, _):
         client = MlflowClient(tracking_uri=url)
         experiment = client.get_experiment_by_name("race")
         page = f"{url}/#/experiments/{experiment.experiment_id}/runs?workflowType=machine_learning"
