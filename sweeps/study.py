@@ -62,11 +62,12 @@ def load_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Stu
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
     request = compose_sweep(overrides)
-    known = _known(request, _names_only(overrides))
+    names_only = _names_only(overrides)
+    known = _known(request, names_only)
     if known is None:
         return list(overrides), request, None
     whole = list(overrides)
-    if _names_only(overrides):
+    if names_only:
         # The total of the last start: it may have been raised since the study was begun.
         total = [f"sweep.trials={known.user_attrs['trials']}"] if "trials" in known.user_attrs else []
         whole = [*known.user_attrs.get("overrides", ()), *total, *overrides]
