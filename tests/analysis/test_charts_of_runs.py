@@ -59,7 +59,7 @@ def test_seeds_become_a_median_with_a_band_and_single_runs_lines_without() -> No
 
 def test_rounds_of_a_recording_are_generations() -> None:
     view = run("a", iterations=6)
-    rounds = (Round("first", 0, 0), Round("second", 4, 4))
+    rounds = (Round("first", 0), Round("second", 4))
     chart = generations([replace(view, recording=replace(view.recording, rounds=rounds))])
     assert [layer.x.tolist() for layer in layers(chart.rows[0][0], "points")] == [[0, 1, 2, 3], [4, 5]]
     assert {mark.x0 for mark in layers(chart, "mark")} == {3.5}
