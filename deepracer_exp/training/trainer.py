@@ -161,14 +161,17 @@ class Trainer:
         kept = experiment.checkpoints
         self.checkpoints = CheckpointStore(folder.path, kept.keep, kept.every)
         self.budget = Budget(experiment.budget, folder.path)
-        cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+        collector = experiment.collector
+        cars = max(1, worker_count(collector)) * collector.cars
         self.metrics = RunMetrics(
             track_names(setup), cars, experiment.car.control_period_s, experiment.stopping
         )
         self._trace = TraceWriter(folder.path / TRACE)
         # More threads do not speed up networks of features, and on a busy machine they wait for one another: an
-        # update took 25 times as long. Convolutions are worth them while the workers wait for the update.
-        self._update_threads = cores() if experiment.observation.camera is not None else 1
+        # update took 25 times as long. Convolutions are worth them while the workers wait for the update, but a trial
+        # of a sweep has only the cores that its worker gives it (`collector.threads`).
+        share = collector.threads if collector.mode == "in_process" else 0
+        self._update_threads = 1 if experiment.observation.camera is None else share or cores()
         torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
         with reading(f"network={experiment.network}", "a network that fits into memory"):

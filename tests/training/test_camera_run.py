@@ -82,6 +82,17 @@ def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fi
     assert int(refused.complaint.split("up to ")[1].split(",")[0]) < 10_000_000
 
 
+@pytest.mark.parametrize(("threads", "most"), [(1, 1), (0, 2)])
+def test_an_update_takes_the_cores_that_are_the_trainings_own(call, monkeypatch, threads, most):
+    # Two trials of a sweep, or two trainings, that each update on all cores take five times as long.
+    asked, set_threads = [], torch.set_num_threads
+    monkeypatch.setattr("deepracer_exp.training.trainer.cores", lambda: 2)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: (asked.append(count), set_threads(count)))
+    ended = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512", f"collector.threads={threads}")
+    assert ended.code == 0, ended.stderr
+    assert max(asked) == most
+
+
 def test_the_report_shows_what_the_policy_sees_along_a_lap(trained, call, tmp_path):
     ended = trained(*CAMERA)
     page = tmp_path / "report.html"
