@@ -76,7 +76,7 @@ class LivePage:
         policy, evaluator = stored.networks.policy, self._evaluator
         recorder = LapRecorder(evaluator)
         evaluation = evaluator(policy, recorder)
-        lines = lines_figure(driven_lines(evaluator, evaluation, recorder))
+        lines = lines_figure(track_lines(evaluator, evaluation, recorder))
         camera, strip = self._run.experiment.observation.camera, list[Glimpse]()
         if camera is not None:
             again = LapRecorder(evaluator, best_attempt(evaluation))
@@ -113,7 +113,7 @@ class LivePage:
         self.shown = (version, page)
 
 
-def driven_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecorder) -> list[TrackLines]:
+def track_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecorder) -> list[TrackLines]:
     """Return the laps on the usual conditions, by track; those that the end of the race cut off do not count."""
     shown = []
     groups = [group for group in evaluation.groups if group.condition == USUAL]

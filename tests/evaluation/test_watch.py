@@ -24,7 +24,7 @@ from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, write_film
-from deepracer_exp.evaluation.live import LivePage, driven_lines
+from deepracer_exp.evaluation.live import LivePage, track_lines
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
 from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames, rays
@@ -163,7 +163,7 @@ def test_a_lap_that_the_end_of_the_race_cuts_off_is_drawn_but_not_counted(experi
     evaluation = evaluator(driver(), recorder)
     *complete, last = evaluation.groups[0].attempts
     assert last.end == "time_up"
-    (shown,) = driven_lines(evaluator, evaluation, recorder)
+    (shown,) = track_lines(evaluator, evaluation, recorder)
     assert shown.words.startswith(f"{len(complete)} of {len(complete)} laps complete, the fastest in ")
     assert len(shown.lines) == len(complete) + 1
 
