@@ -115,7 +115,8 @@ def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
     assert decision.rule == name
     assert decision.stopped_early == (name in ("not_learning", "collapsed"))
     assert number == pytest.approx(at, abs=within)
-    assert decision.values.get("held_out_completion_before", 100.0) > 85
+    if name == "overfitting":
+        assert decision.values["held_out_completion_before"] > 85
     assert_reported(decision)
 
 
