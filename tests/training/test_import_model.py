@@ -292,10 +292,25 @@ def test_a_policy_that_goes_there_and_back_acts_the_same(call, space):
         assert sent.read_bytes() == again.read_bytes()
     raced = call("evaluate", str(there), "evaluation=three_trials")
     assert raced.code == 0, raced.stderr
-    small = ("collector=in_process", "collector.cars=4", "report=false", "budget.env_steps=64")
-    small += ("algorithm.frames_per_iteration=64", "algorithm.episodes_per_iteration=null")
-    cloned = call("clone", str(there), *small, "algorithm.batch_size=64", "algorithm.epochs=1")
+    small = ("collector=in_process", "collector.cars=4", "stopping=none", "report=false", "tracking=off")
+    cloned = call(
+        *("clone", str(there), "budget.env_steps=64", "algorithm.frames_per_iteration=64", *small),
+        *(
+            "algorithm.episodes_per_iteration=null",
+            "algorithm.batch_size=64",
+            "algorithm.epochs=1",
+            "name=further",
+        ),
+    )
     assert cloned.code == 0, cloned.stderr
+    (further,) = trained.cwd.glob("runs/further/*")
+    rates = [StoredRun(folder).experiment.algorithm.lr for folder in (there, further)]
+    assert rates[1] == pytest.approx(rates[0] / 10)
+    begun, then = (folder / "checkpoints" for folder in (there, further))
+    before = read_checkpoint(StoredRun(there).experiment, begun, "last").networks.state_dict()
+    after = read_checkpoint(StoredRun(further).experiment, then, "last").networks.state_dict()
+    moved = [(after[name] - before[name]).abs().max().item() for name in before]
+    assert 0 < max(moved) < 0.01, "both trunks begin where the parent's are"
 
 
 def test_of_a_frozen_graph_the_value_network_starts_fresh(call, tmp_path, weights, networks):
