@@ -22,7 +22,7 @@ from .log_tables import best_laps, candidate_rows, facts, headline, iteration_ro
 from .log_view import LogView, prepare
 from .next_steps import next_steps, outcome
 from .page import Glimpse, Plot, plot_of, render
-from .reward_comparison import RewardComparison
+from .reward_replay import ReplayedRewards
 
 MOST_FILES = 400
 _BESIDE, _PAID = "Generations, runs and tracks", "What the reward pays for"
@@ -72,7 +72,7 @@ class LogPage:
     """The most important first."""
     others: Sequence[LogView] = ()
     """Recordings that it is compared with."""
-    replay: RewardComparison | None = None
+    replay: ReplayedRewards | None = None
     """The same driving, paid by another reward function."""
     terms: pd.DataFrame | None = None
     """What each term of the reward function contributed, as `contributed_terms` returns it."""
@@ -128,7 +128,7 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     view, views = page.view, [page.view, *page.others]
     drawn: dict[str, list[Chart | None]] = {}
     if page.replay is not None:
-        drawn["Another reward function"] = list(page.replay.charts)
+        drawn["Another reward function"] = [*page.replay.charts]
     sections = SECTIONS if view.trained else RACES
     drawn |= {title: [draw_one(view) for draw_one in some] for title, some in sections.items()}
     drawn[_BESIDE] += [runs_compared(views), generations(views), generalisation_matrix(views)]

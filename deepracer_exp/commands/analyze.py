@@ -127,9 +127,8 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.log_report import LogPage, write_page
     from deepracer_exp.analysis.log_tables import headline
     from deepracer_exp.analysis.log_view import prepare
-    from deepracer_exp.analysis.reward_comparison import compare_rewards
-    from deepracer_exp.evaluation.reward_replay import replay_reward
-    from deepracer_exp.evaluation.reward_terms import run_terms
+    from deepracer_exp.analysis.reward_replay import replay_reward
+    from deepracer_exp.analysis.reward_terms import run_terms
     from deepracer_exp.runs.files import read_config, sees_pictures
     from deepracer_exp.runs.own_recording import is_own_run, read_log
 
@@ -146,7 +145,7 @@ def _analyze(args: argparse.Namespace) -> int:
 
         view, strip = run_glimpses(view, place)
     others = [_light(prepare(read_log(other))) for other in beside]
-    replay = None if reward is None else compare_rewards(view, replay_reward(view, reward, car))
+    replay = None if reward is None else replay_reward(view, reward, car)
     default = place / REPORT if is_own_run(place) else _page("analysis", recording.name)
     out = Path(args.output or default)
     found = findings(view, target_s)

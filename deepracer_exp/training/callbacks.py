@@ -398,7 +398,7 @@ def _write_page(run_dir: Path, car: CarConfig) -> str | None:
         from deepracer_exp.analysis.log_report import LogPage, write_page
         from deepracer_exp.analysis.log_view import prepare
         from deepracer_exp.analysis.page import Glimpse
-        from deepracer_exp.evaluation.reward_terms import run_terms
+        from deepracer_exp.analysis.reward_terms import run_terms
         from deepracer_exp.runs.own_recording import read_own_recording
 
         view, terms = run_terms(prepare(read_own_recording(run_dir)), car, just_trained=True)

@@ -12,7 +12,7 @@ from deepracer_exp.analysis.log_report import SECTIONS, LogPage, write_report
 from deepracer_exp.analysis.log_report import html as page_html
 from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, facts, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.analysis.reward_comparison import compare_rewards
+from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.deepracer.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.result import RunResult
@@ -203,49 +203,47 @@ def test_of_very_many_iterations_the_table_has_every_second_or_third_and_the_las
     assert table.rows[-1][0] == str(len(drives) - 1)
 
 
-class Replayed:
-    """Laps and places whose ranks are known: the new reward turns the order of the laps round."""
-
-    reward = "mine"
-    laps = pd.DataFrame(
-        {
-            "stream": "training",
-            "iteration": [0, 1, 2],
-            "episode": [0, 4, 8],
-            "time_s": [10.0, 11.0, 12.0],
-            "reward": [1.0, 2.0, 3.0],
-            "new_reward": [30.0, 20.0, 10.0],
-            "rank": [3, 2, 1],
-            "new_rank": [1, 2, 3],
-            "time_rank": [1, 2, 3],
-        }
-    )
-    correlations = {"old_new": -1.0, "old_time": 1.0, "new_time": -1.0}  # noqa: RUF012
-    waypoints = pd.DataFrame(
-        {
-            "reversed": False,
-            "closest_waypoint": [0, 10, 20],
-            "visits": [9, 9, 9],
-            "reward": [0.0, 1.0, 2.0],
-            "new_reward": [2.0, 1.0, 0.0],
-            "share": [0.0, 0.5, 1.0],
-            "new_share": [1.0, 0.5, 0.0],
-        }
-    )
+LAPS = pd.DataFrame(
+    {
+        "stream": "training",
+        "iteration": [0, 1, 2],
+        "episode": [0, 4, 8],
+        "time_s": [10.0, 11.0, 12.0],
+        "reward": [1.0, 2.0, 3.0],
+        "new_reward": [30.0, 20.0, 10.0],
+        "rank": [3, 2, 1],
+        "new_rank": [1, 2, 3],
+        "time_rank": [1, 2, 3],
+    }
+)
+"""The new reward turns the order of the laps round."""
+WAYPOINTS = pd.DataFrame(
+    {
+        "reversed": False,
+        "closest_waypoint": [0, 10, 20],
+        "visits": [9, 9, 9],
+        "reward": [0.0, 1.0, 2.0],
+        "new_reward": [2.0, 1.0, 0.0],
+        "share": [0.0, 0.5, 1.0],
+        "new_share": [1.0, 0.5, 0.0],
+    }
+)
 
 
 def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
-    comparison = compare_rewards(view, Replayed())
-    assert comparison.sentences[0] == (
+    replayed = ReplayedRewards(
+        reward="mine", course=view.course, steps=view.steps, laps=LAPS, waypoints=WAYPOINTS
+    )
+    assert replayed.sentences[0] == (
         "Of 3 complete laps mine would have paid most for the one of episode 0 (10.00 s, 1st by time, 3rd by the "
         "recorded reward); the fastest lap (10.00 s) is 1st instead of 3rd."
     )
-    assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in comparison.sentences[1]
-    assert "waypoint 0 gains most and waypoint 20 loses most" in comparison.sentences[2]
-    assert comparison.laps.rows[0][:3] == ("1", "3", "1")
-    assert [chart.name for chart in comparison.charts] == ["replayed_laps", "replayed_places"]
-    text = Html(page_html(LogPage(view, findings(view), replay=comparison))).text
-    assert text.index(comparison.sentences[0]) < text.rindex("The best laps")
+    assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in replayed.sentences[1]
+    assert "waypoint 0 gains most and waypoint 20 loses most" in replayed.sentences[2]
+    assert replayed.best_laps.rows[0][:3] == ("1", "3", "1")
+    assert [chart.name for chart in replayed.charts] == ["replayed_laps", "replayed_places"]
+    text = Html(page_html(LogPage(view, findings(view), replay=replayed))).text
+    assert text.index(replayed.sentences[0]) < text.rindex("The best laps")
 
 
 def test_the_gallery_lists_every_figure_of_the_page_and_every_finding_names_one_of_them():

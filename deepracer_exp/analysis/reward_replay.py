@@ -1,22 +1,40 @@
-"""Apply another reward function to recorded steps and compare the rewards of laps and waypoints."""
+"""Another reward function on the same driving: what it pays for laps and places, in sentences, a table and figures."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.rewards.guard import Guard, Misconduct
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
 from deepracer_exp.rewards.source import RewardSource
+from deepracer_exp.tracks.track import Track
 
+from .charts.figure import Chart, Panel, colored_points, line, points
+from .charts.maps import map_panel
+from .charts.style import BLUE, ORANGE
+from .log_tables import Table, table_of
+from .log_view import LogView
 from .recorded_params import Ids, RecordedParams
 
 TIME_LIMIT_S = 5.0
 """CPU seconds of one call; the default of trainings."""
+MOST_LAPS = 10
+_LAP_COLUMNS = {
+    "new_rank": ("By the new reward", "d"),
+    "rank": ("By the recorded one", "d"),
+    "time_rank": ("By time", "d"),
+    "time_s": ("Lap time, s", ".2f"),
+    "iteration": ("Iteration", "d"),
+    "episode": ("Episode", "d"),
+    "new_reward": ("New reward", ".5g"),
+    "reward": ("Recorded reward", ".5g"),
+}
 _AT_ONCE = 4096
 """Rows whose params are rebuilt together and passed to one call of `reward_batch`; a training's step has hundreds."""
 _SPREAD = (0.02, 0.98)
@@ -29,18 +47,136 @@ class ReplayedRewards:
 
     reward: str
     """Its name."""
+    course: Track
     steps: pd.DataFrame
     """All steps on the course and `new_reward`; NaN where the params could not be rebuilt."""
     laps: pd.DataFrame
     """Episodes that are a whole lap, recorded from its start, highest new reward first: stream, iteration (of the last
     row), episode, time_s, the sums reward and new_reward, rank, new_rank (1: the highest reward) and time_rank (1: the
     fastest); ties share the better rank."""
-    correlations: dict[str, float]
-    """With at least three laps, Spearman's rank correlations old_new, old_time and new_time, NaN if all values are
-    equal. A reward that prefers fast laps correlates with time at -1."""
     waypoints: pd.DataFrame
     """One row per direction (`reversed`) and closest waypoint: visits, means reward and new_reward, and both as share
     and new_share: 0 and 1 are the 2nd and 98th percentile of the waypoints, values beyond are clipped."""
+
+    @cached_property
+    def correlations(self) -> dict[str, float]:
+        """With at least three laps, Spearman's rank correlations old_new, old_time and new_time.
+
+        They are NaN if all values are equal. A reward that prefers fast laps correlates with time at -1.
+        """
+        if len(self.laps) < 3:
+            return {}
+        table = self.laps[["reward", "new_reward", "time_s"]].corr("spearman")
+        return {
+            "old_new": float(table.loc["reward", "new_reward"]),
+            "old_time": float(table.loc["reward", "time_s"]),
+            "new_time": float(table.loc["new_reward", "time_s"]),
+        }
+
+    @cached_property
+    def places(self) -> pd.DataFrame:
+        """Rows of `waypoints` in the direction driven most, with the `change` of the share."""
+        rows = self.waypoints
+        if len(rows):
+            rows = rows[rows["reversed"] == rows.groupby("reversed")["visits"].sum().idxmax()]
+        return rows.assign(change=rows["new_share"] - rows["share"])
+
+    @property
+    def best_laps(self) -> Table:
+        """The laps that it pays best."""
+        return table_of(self.laps.head(MOST_LAPS), _LAP_COLUMNS, max(0, len(self.laps) - MOST_LAPS))
+
+    @property
+    def sentences(self) -> list[str]:
+        """How it would rank the laps and the places."""
+        laps, places, name = self.laps, self.places, self.reward
+        found = [f"There is no complete lap that {name} could rank."]
+        if len(laps):
+            evaluated = ", evaluations included," if laps["stream"].nunique() > 1 else ""
+            best, fastest = laps.iloc[0], laps.loc[laps["time_s"].idxmin()]
+            ranks = f"{_ordinal(best['time_rank'])} by time, {_ordinal(best['rank'])} by the recorded reward"
+            found = [
+                f"Of {count(len(laps), 'complete lap')}{evaluated} {name} would have paid most for the one of episode "
+                f"{best['episode']} ({best['time_s']:.2f} s, {ranks}); the fastest lap ({fastest['time_s']:.2f} s) is "
+                f"{_ordinal(fastest['new_rank'])} instead of {_ordinal(fastest['rank'])}."
+            ]
+        if self.correlations:
+            texts = {
+                key: f"{r:.2f}" if math.isfinite(r) else "not defined (all equal)"
+                for key, r in self.correlations.items()
+            }
+            found.append(
+                f"Rank correlation with lap time (-1: laps are ranked by speed alone): {name} {texts['new_time']}, "
+                f"recorded reward {texts['old_time']}; between both rewards {texts['old_new']}."
+            )
+        if len(places):
+            up, down = places.loc[places["change"].idxmax()], places.loc[places["change"].idxmin()]
+            found.append(
+                f"Compared with the other places of the track, waypoint {up['closest_waypoint']} gains most and "
+                f"waypoint {down['closest_waypoint']} loses most."
+            )
+        return found
+
+    @property
+    def charts(self) -> list[Chart]:
+        """The laps and the places, as far as there are any."""
+        charts = [self._laps_chart()] if len(self.laps) else []
+        return [*charts, self._places_chart()] if len(self.places) else charts
+
+    def _laps_chart(self) -> Chart:
+        laps = self.laps
+        hover = [
+            f"episode {row.episode}: {row.time_s:.2f} s\nranks {row.new_rank} new, {row.rank} recorded"
+            for row in laps.itertuples()
+        ]
+        panels = [
+            Panel(
+                layers=[points(laps["time_s"], laps[column], color, size=9.0, hover=hover)],
+                x_label="lap time, s",
+                y_label="reward of the lap",
+                title=title,
+            )
+            for column, color, title in (("reward", ORANGE, "recorded"), ("new_reward", BLUE, self.reward))
+        ]
+        return Chart(
+            name="replayed_laps",
+            title="The rewards of fast laps",
+            caption="Each point is a complete lap, with its lap time and the sum of its rewards. A reward that asks "
+            "for speed falls from the left to the right; where slow laps are paid like fast ones, the car has no "
+            "reason to be faster.",
+            rows=[panels],
+        )
+
+    def _places_chart(self) -> Chart:
+        places, course = self.places, self.course
+        waypoint = places["closest_waypoint"].to_numpy(np.intp)
+        lines = [
+            line(waypoint, 100 * places[column], color, label)
+            for column, color, label in (("share", ORANGE, "recorded"), ("new_share", BLUE, self.reward))
+        ]
+        rows = [
+            [Panel(layers=lines, x_label="waypoint", y_label="per cent of its range", y_range=(-4.0, 104.0))]
+        ]
+        if waypoint.max() < len(course.waypoints):
+            change = 100 * places["change"]
+            reach = float(change.abs().max()) or 1.0
+            x, y = course.waypoints[waypoint].T
+            scale = "change, % of the range"
+            spots = colored_points(x, y, change, scale, value_range=(-reach, reach), size=11.0)
+            rows.append([map_panel(course, [spots])])
+        return Chart(
+            name="replayed_places",
+            title="Where the new reward pays more, and where less",
+            caption="Mean reward of a step at each waypoint, between the least and the most that each reward function "
+            "pays anywhere (2nd and 98th percentile). The curves differ at places that the new reward considers more "
+            "or less important than the recorded one does.",
+            rows=rows,
+        )
+
+
+def _ordinal(rank: int) -> str:
+    ending = "th" if 10 <= rank % 100 <= 20 else {1: "st", 2: "nd", 3: "rd"}.get(rank % 10, "th")
+    return f"{rank}{ending}"
 
 
 def replay_reward(
@@ -79,12 +215,11 @@ def replay_reward(
             some = own[begin : begin + _AT_ONCE]
             new_reward[some] = pay(function, params, steps, some)
     steps["new_reward"] = new_reward
-    laps = _laps(steps, episode)
     return ReplayedRewards(
         reward=source.name,
+        course=view.course,
         steps=steps,
-        laps=laps,
-        correlations=_correlations(laps) if len(laps) >= 3 else {},
+        laps=_laps(steps, episode),
         waypoints=_waypoints(steps[params.paid].assign(reversed=params.is_reversed[params.paid])),
     )
 
@@ -142,16 +277,6 @@ def _laps(steps: pd.DataFrame, episode: NDArray[np.int64]) -> pd.DataFrame:
     ):
         laps[name] = laps[of].rank(method="min", ascending=ascending).astype(int)
     return laps.sort_values("new_rank", kind="stable", ignore_index=True)
-
-
-def _correlations(laps: pd.DataFrame) -> dict[str, float]:
-    pairs = {
-        "old_new": ("reward", "new_reward"),
-        "old_time": ("reward", "time_s"),
-        "new_time": ("new_reward", "time_s"),
-    }
-    table = laps[["reward", "new_reward", "time_s"]].corr("spearman")
-    return {name: float(table.loc[pair]) for name, pair in pairs.items()}
 
 
 def _waypoints(paid: pd.DataFrame) -> pd.DataFrame:

@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.analysis.log_course import progress_along
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.tracks.track import Track, Tracks
+
+from .log_course import progress_along
 
 Ids = NDArray[np.intp]
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.reward_replay import replay_reward
+from deepracer_exp.analysis.reward_terms import contributed_terms, run_terms
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.reward_replay import replay_reward
-from deepracer_exp.evaluation.reward_terms import contributed_terms, run_terms
 from deepracer_exp.rewards.source import RewardSource, load_reward_source, zoo_names
 
-from ..analysis.made_up import Drive, made_up_recording  # noqa: TID252
+from .made_up import Drive, made_up_recording
 
 CAR = compose_experiment([])[0].car
 WITH_TERMS = (

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.deepracer.recording import LogProblem
 from deepracer_exp.errors import BadInput
@@ -17,6 +16,7 @@ from deepracer_exp.rewards.guard import CtrlC, Guard
 from deepracer_exp.rewards.reward import RewardFunction, Unusable
 from deepracer_exp.rewards.source import RewardSource, is_of_zoo
 
+from .log_view import LogView
 from .recorded_params import RecordedParams
 from .reward_replay import TIME_LIMIT_S
 

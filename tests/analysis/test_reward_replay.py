@@ -7,7 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from deepracer_exp.analysis import reward_replay
 from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.deepracer.recording import (
@@ -19,8 +21,6 @@ from deepracer_exp.deepracer.recording import (
 )
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation import reward_replay
-from deepracer_exp.evaluation.reward_replay import ReplayedRewards
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs.files import read_config
 from deepracer_exp.runs.own_recording import read_own_recording
