@@ -39,7 +39,7 @@ from deepracer_exp.tracking.tracker import Tracker
 
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
-from .metrics import NOT_EVALUATED, EvalResult, Finished, Ranking
+from .metrics import NOT_EVALUATED, Finished, Ranking, eval_columns
 from .trainer import Callback, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
@@ -94,7 +94,6 @@ class EvalCallback(Callback):
             BadInput: a track or a condition is unknown or malformed.
         """
         self._every = experiment.checkpoints.every
-        self._metric = experiment.checkpoints.metric
         self._console = console
         # The cars of the training wait meanwhile, so that all cores are free.
         self._evaluator = None if self._every is None else Evaluator(experiment, experiment.evaluation)
@@ -125,8 +124,8 @@ class EvalCallback(Callback):
 
     def _evaluate(self, trainer: Trainer) -> None:
         assert self._evaluator is not None
-        trainer.evaluation = EvalResult.of(self._evaluator(trainer.networks.policy), self._metric)
-        trainer.row |= trainer.evaluation.columns()
+        trainer.evaluation = self._evaluator(trainer.networks.policy)
+        trainer.row |= eval_columns(trainer.evaluation)
 
 
 class StoppingCallback(Callback):
@@ -255,7 +254,7 @@ class TrackingCallback(Callback):
     def on_train_end(self, trainer: Trainer) -> None:
         """Log the last evaluation of a run that is over; of one that may be resumed, MLflow would keep it."""
         if trainer.evaluation is not None and not trainer.is_interrupted:
-            self._tracker.log(trainer.evaluation.columns(), step=trainer.env_steps)
+            self._tracker.log(eval_columns(trainer.evaluation), step=trainer.env_steps)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Log files and end the run in the store."""
@@ -358,7 +357,9 @@ class BestCallback(Callback):
 
     def _is_best_evaluated(self, trainer: Trainer) -> bool:
         found = trainer.evaluation
-        return found is not None and self._is_better(trainer, found.rank, self._metric, found.columns())
+        return found is not None and self._is_better(
+            trainer, found.rank(self._metric), self._metric, eval_columns(found)
+        )
 
     def _is_better(
         self, trainer: Trainer, rank: Rank, metric: str, columns: Mapping[str, float | None]

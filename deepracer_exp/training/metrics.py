@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Metric, Rank
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.tracking.metrics import track_labels, track_metric
 
@@ -90,28 +90,35 @@ class Record:
         self.finished, self.laps, self.best_lap_s = state["finished"], state["laps"], state["best_lap_s"]
 
 
-class EpisodeBook:
-    """Numbers the episodes of a run and remembers how they ended.
+class RunMetrics:
+    """Numbers the episodes of a run and remembers how they ended, on one track or on each of several.
 
     Attributes:
+        track_names: in the order of their numbers in the trace.
+        labels: what the tracks are called in metrics; empty with one track, whose metrics need no name.
+        remembered: how many of the last finished episodes `lap_share` looks at.
         all: the episodes of all tracks.
         tracks: those of each track.
     """
 
-    def __init__(self, n_cars: int, n_tracks: int, remembered: int, step_s: float):
-        """Start without an episode.
+    def __init__(self, names: Sequence[str], n_cars: int, step_s: float, stopping: StoppingConfig):
+        """Begin without an episode.
 
         Args:
+            names: of the tracks, in the order of their numbers in the trace.
             n_cars: cars over all processes.
-            n_tracks: tracks the cars drive on.
-            remembered: how many of the last finished episodes `Record.lap_share` looks at.
             step_s: simulated seconds of a control step.
+            stopping: its rule decides over how many episodes `lap_share` is taken.
         """
+        self.track_names = names
+        self.labels = track_labels(names) if len(names) > 1 else []
+        self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else REMEMBERED_EPISODES
+        self.all = Record(self.remembered)
+        self.tracks = tuple(Record(self.remembered) for _ in names)
+        self._last: list[dict[str, float | None]] = [{} for _ in self.labels]
         self._number = np.full(n_cars, -1)
         self._next_number = 0
         self._step_s = step_s
-        self.all = Record(remembered)
-        self.tracks = tuple(Record(remembered) for _ in range(n_tracks))
 
     def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
         """Number and count the episodes of a batch.
@@ -134,19 +141,67 @@ class EpisodeBook:
         rows = trace.reshape(-1, trace.shape[-1])
         return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
 
+    @property
+    def lap_share(self) -> float | None:
+        """Share of complete laps among the last episodes on the track where it is lowest.
+
+        None before as many episodes as are remembered have ended on every track.
+        """
+        shares = [record.lap_share for record in self.tracks]
+        known = [share for share in shares if share is not None]
+        return min(known) if len(known) == len(shares) else None
+
+    def row(self, finished: Finished) -> dict[str, float | None]:
+        """Return the figures of the episodes of an iteration, means over episodes.
+
+        Lap times of different tracks do not compare: with several tracks there are only those of each.
+        """
+        figures = _figures(finished, self.all)
+        if self.labels:
+            figures |= {"lap_share": self.lap_share, "best_lap_time_s": None, "mean_lap_time_s": None}
+        return {"mean_return": _mean(finished.returns), **figures}
+
+    def row_of_tracks(self, finished: Finished) -> dict[str, float | None]:
+        """Return the figures of each track, empty with one track; None where none is known."""
+        row: dict[str, float | None] = {}
+        for number, label in enumerate(self.labels):
+            figures = _figures(finished.on(number), self.tracks[number])
+            self._last[number] |= {key: value for key, value in figures.items() if value is not None}
+            row |= {track_metric(metric, label): value for metric, value in figures.items()}
+        return row
+
     def state_dict(self) -> dict[str, Any]:
-        """Return the numbers of the episodes under way and the records."""
-        return {
-            "number": self._number,
-            "next_number": self._next_number,
-            "records": [record.state_dict() for record in (self.all, *self.tracks)],
-        }
+        """Return the numbers of the episodes under way, the records, and what was known last of each track."""
+        records = [record.state_dict() for record in (self.all, *self.tracks)]
+        book = {"number": self._number, "next_number": self._next_number, "records": records}
+        return {"book": book, "last": self._last}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a `state_dict`."""
-        self._number, self._next_number = state["number"].copy(), state["next_number"]
-        for record, own in zip((self.all, *self.tracks), state["records"], strict=True):
+        book = state["book"]
+        self._number, self._next_number = book["number"].copy(), book["next_number"]
+        for record, own in zip((self.all, *self.tracks), book["records"], strict=True):
             record.load_state_dict(own)
+        self._last = [dict(last) for last in state["last"]]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures at the end; with several tracks, `tracks` has those of each by its name."""
+        best_s = None if self.labels else self.all.best_lap_s
+        whole = {"lap_share": self.lap_share, "best_lap_time_s": best_s}
+        if not self.labels:
+            return whole
+        tracks = {
+            name: {
+                "episodes": record.finished,
+                "laps": record.laps,
+                "completion": last.get("completion"),
+                "lap_share": record.lap_share,
+                "best_lap_time_s": record.best_lap_s,
+                "mean_lap_time_s": last.get("mean_lap_time_s"),
+            }
+            for name, record, last in zip(self.track_names, self.tracks, self._last, strict=True)
+        }
+        return {**whole, "tracks": tracks}
 
     def _numbers(self, cars: np.ndarray, begins: np.ndarray) -> np.ndarray:
         """Return the number of each step's episode, (cars, T), from where episodes begin."""
@@ -183,87 +238,6 @@ def _each_car_once(cars: np.ndarray) -> list[np.ndarray]:
     turn = np.empty(len(cars), np.int64)
     turn[order] = np.arange(len(cars)) - np.repeat(first, counts)
     return [np.flatnonzero(turn == nth) for nth in range(turn.max() + 1)]
-
-
-class RunMetrics(EpisodeBook):
-    """Results of a run on one track, or of each of its tracks.
-
-    Attributes:
-        track_names: in the order of their numbers in the trace.
-        labels: what the tracks are called in metrics; empty with one track, whose metrics need no name.
-    """
-
-    def __init__(self, names: Sequence[str], n_cars: int, step_s: float, stopping: StoppingConfig):
-        """Begin without a result.
-
-        Args:
-            names: of the tracks, in the order of their numbers in the trace.
-            n_cars: cars over all processes.
-            step_s: simulated seconds of a control step.
-            stopping: its rule decides over how many episodes `lap_share` is taken.
-        """
-        self.track_names = names
-        self.remembered = stopping.episodes if isinstance(stopping, ReliableStopping) else REMEMBERED_EPISODES
-        super().__init__(n_cars, len(names), self.remembered, step_s)
-        self.labels = track_labels(names) if len(names) > 1 else []
-        self._last: list[dict[str, float | None]] = [{} for _ in self.labels]
-
-    @property
-    def lap_share(self) -> float | None:
-        """Share of complete laps among the last episodes on the track where it is lowest.
-
-        None before as many episodes as are remembered have ended on every track.
-        """
-        shares = [record.lap_share for record in self.tracks]
-        known = [share for share in shares if share is not None]
-        return min(known) if len(known) == len(shares) else None
-
-    def row(self, finished: Finished) -> dict[str, float | None]:
-        """Return the figures of the episodes of an iteration, means over episodes.
-
-        Lap times of different tracks do not compare: with several tracks there are only those of each.
-        """
-        figures = _figures(finished, self.all)
-        if self.labels:
-            figures |= {"lap_share": self.lap_share, "best_lap_time_s": None, "mean_lap_time_s": None}
-        return {"mean_return": _mean(finished.returns), **figures}
-
-    def row_of_tracks(self, finished: Finished) -> dict[str, float | None]:
-        """Return the figures of each track, empty with one track; None where none is known."""
-        row: dict[str, float | None] = {}
-        for number, label in enumerate(self.labels):
-            figures = _figures(finished.on(number), self.tracks[number])
-            self._last[number] |= {key: value for key, value in figures.items() if value is not None}
-            row |= {track_metric(metric, label): value for metric, value in figures.items()}
-        return row
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything."""
-        return {"book": super().state_dict(), "last": self._last}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a `state_dict`."""
-        super().load_state_dict(state["book"])
-        self._last = [dict(last) for last in state["last"]]
-
-    def summary(self) -> dict[str, Any]:
-        """Return the figures at the end; with several tracks, `tracks` has those of each by its name."""
-        best_s = None if self.labels else self.all.best_lap_s
-        whole = {"lap_share": self.lap_share, "best_lap_time_s": best_s}
-        if not self.labels:
-            return whole
-        tracks = {
-            name: {
-                "episodes": record.finished,
-                "laps": record.laps,
-                "completion": last.get("completion"),
-                "lap_share": record.lap_share,
-                "best_lap_time_s": record.best_lap_s,
-                "mean_lap_time_s": last.get("mean_lap_time_s"),
-            }
-            for name, record, last in zip(self.track_names, self.tracks, self._last, strict=True)
-        }
-        return {**whole, "tracks": tracks}
 
 
 def _figures(finished: Finished, record: Record) -> dict[str, float | None]:
@@ -322,40 +296,25 @@ class Ranking:
         self._episodes = state["episodes"].copy()
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvalResult:
-    """Figures of one evaluation during a training."""
-
-    rank: Rank
-    eval_completion: float
-    """Per cent of the lap, mean over the laps tried on the usual conditions."""
-    held_out_completion: float | None
-    """The same on the held-out conditions; None where there are none."""
-    eval_lap_share: float
-    """Complete laps per lap tried on the usual conditions, 0 to 1."""
-    eval_lap_time_s: float | None
-    """Mean time of the complete laps on the usual conditions, over all tracks."""
-    eval_race_score_s: float | None
-    """Seconds per complete lap on all conditions, failed laps included; None without a lap on each track."""
-
-    @classmethod
-    def of(cls, evaluation: Evaluation, metric: Metric) -> "EvalResult":
-        """Return the figures of an evaluation that is ranked by `metric`."""
-        usual = evaluation.on(USUAL)
-        has_held_out = HELD_OUT in evaluation.conditions
-        return cls(
-            rank=evaluation.rank(metric),
-            eval_completion=usual.completion,
-            held_out_completion=evaluation.on(HELD_OUT).completion if has_held_out else None,
-            eval_lap_share=usual.lap_share,
-            eval_lap_time_s=usual.mean_lap_time_s,
-            eval_race_score_s=evaluation.race_score_s,
-        )
-
-    def columns(self) -> dict[str, float | None]:
-        """Return the columns of metrics.jsonl."""
-        return {name: getattr(self, name) for name in EVAL_COLUMNS}
-
-
-EVAL_COLUMNS = tuple(field.name for field in fields(EvalResult) if field.name != "rank")
+EVAL_COLUMNS = (
+    "eval_completion",
+    "held_out_completion",
+    "eval_lap_share",
+    "eval_lap_time_s",
+    "eval_race_score_s",
+)
 NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)
+
+
+def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
+    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`."""
+    usual = evaluation.on(USUAL)
+    held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
+    figures = (
+        usual.completion,
+        None if held_out is None else held_out.completion,
+        usual.lap_share,
+        usual.mean_lap_time_s,
+        evaluation.race_score_s,
+    )
+    return dict(zip(EVAL_COLUMNS, figures, strict=True))

@@ -22,6 +22,7 @@ from deepracer_exp.deepracer.trace import to_table
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed, reading
+from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
 from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
@@ -31,7 +32,7 @@ from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED
 from deepracer_exp.runs.trace import TraceWriter
 
 from .budget import Budget
-from .metrics import NOT_EVALUATED, EvalResult, Finished, RunMetrics, track_names
+from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
 from .signals import Interruption
 from .teacher import read_teacher
 
@@ -188,7 +189,7 @@ class Trainer:
         )
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}
-        self.evaluation: EvalResult | None = None
+        self.evaluation: Evaluation | None = None
         self.is_best = False
         self.stop_reason: str | None = None
         self.status = FINISHED

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from deepracer_exp.config.stopping import NoStopping, ReliableStopping
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.runs.convergence import build_rule
-from deepracer_exp.training.metrics import EpisodeBook, Finished, Ranking, RunMetrics
+from deepracer_exp.training.metrics import Finished, Ranking, RunMetrics
 
 
 class Driven:
@@ -34,6 +34,11 @@ class Driven:
         return np.stack([self.rows(car, steps) for car in (range(len(self.cars)) if cars is None else cars)])
 
 
+def book_of(n_cars: int, remembered: int = 5) -> RunMetrics:
+    rule = ReliableStopping(kind="reliable", lap_share=0.75, episodes=remembered)
+    return RunMetrics(["Oval_track"], n_cars, 1 / 15, rule)
+
+
 def _check(rows: list[np.ndarray]) -> None:
     """Every car's steps count up within an episode and every episode has one car."""
     table = np.concatenate(rows)
@@ -50,7 +55,7 @@ lengths = st.lists(st.lists(st.integers(1, 9), min_size=40, max_size=40), min_si
 
 @given(lengths, st.lists(st.integers(1, 7), min_size=1, max_size=5))
 def test_episodes_are_numbered_without_gaps_over_batches_of_any_length(lengths, batches):
-    driven, book = Driven(lengths), EpisodeBook(len(lengths), 1, remembered=5, step_s=1 / 15)
+    driven, book = Driven(lengths), book_of(len(lengths))
     given = [driven.batch(steps) for steps in batches]
     before = [batch.copy() for batch in given]
     rows = [book.enter(batch)[0] for batch in given]
@@ -65,7 +70,7 @@ def test_episodes_are_numbered_without_gaps_over_batches_of_any_length(lengths, 
 @given(st.lists(st.lists(st.integers(0, 2), min_size=1, max_size=4), min_size=1, max_size=5))
 def test_a_process_that_delivers_twice_in_one_iteration_keeps_its_episodes_apart(deliveries):
     """Asynchronous collection: cars 0 and 1, 2 and 3, 4 and 5 belong together; one of them may be faster."""
-    driven, book = Driven([[3, 1, 4, 2, 5] * 20] * 6), EpisodeBook(6, 1, remembered=5, step_s=1 / 15)
+    driven, book = Driven([[3, 1, 4, 2, 5] * 20] * 6), book_of(6)
     rows = []
     for iteration in deliveries:
         parts = [driven.batch(4, [2 * process, 2 * process + 1]) for process in iteration]
@@ -74,7 +79,7 @@ def test_a_process_that_delivers_twice_in_one_iteration_keeps_its_episodes_apart
 
 
 def test_finished_episodes_come_in_the_order_of_their_ends():
-    driven, book = Driven([[3, 9], [2, 9], [4, 9]]), EpisodeBook(3, 1, remembered=5, step_s=1 / 15)
+    driven, book = Driven([[3, 9], [2, 9], [4, 9]]), book_of(3)
     _, finished = book.enter(driven.batch(4))
     assert finished.returns.tolist() == [12, 3, 24]
     assert finished.lap.all()
@@ -84,7 +89,7 @@ def test_finished_episodes_come_in_the_order_of_their_ends():
 
 
 def test_the_share_of_laps_is_known_only_once_enough_episodes_have_ended():
-    driven, book = Driven([[2] * 20]), EpisodeBook(1, 1, remembered=3, step_s=1 / 15)
+    driven, book = Driven([[2] * 20]), book_of(1, remembered=3)
     book.enter(driven.batch(5))
     assert book.all.lap_share is None
     book.enter(driven.batch(1))
