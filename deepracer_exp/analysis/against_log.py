@@ -1,7 +1,8 @@
-"""Simulated laps of a policy beside the laps of a log: the numbers of both, and where on the track they differ."""
+"""Simulated laps of a policy beside the laps of a log: numbers, figures, and where on the track they differ."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,13 +10,19 @@ from numpy.typing import NDArray
 
 from deepracer_exp.deepracer.recording import STEP_COLUMNS, TRAINING, Recording
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.files import atomic_write
 from deepracer_exp.tracks.track import Track
 
 from .charts.actions import COLUMNS, ActionClasses, classify
+from .charts.figure import Chart, Layer, Panel, band, bars, in_rows, line
+from .charts.laps import time_lost_panel
+from .charts.maps import beside, map_panel
+from .charts.style import BLUE, ORANGE, VERMILION
 from .log_course import waypoint_positions
-from .log_tables import NONE, Table
+from .log_tables import NONE, Table, facts, problem_rows
 from .log_view import DISCOUNT, PREPARE, LogView, prepare
-from .sectors import sector_at, sectors_of
+from .page import plot_of, render
+from .sectors import interval_times, sector_at, sectors_of
 from .statistics import Values, totals
 from .tables import add_derived, episode_table, first_rows
 
@@ -34,6 +41,12 @@ _SAME_ACTION = 0.02
 """Degrees and m/s by which the same action may differ between log and simulation: text logs are rounded."""
 _SAME = 0.005
 """m and m/s below which line and speed count as the same."""
+SIDES = {"log": ORANGE, "simulated": BLUE}
+_PER_CENT = 100.0 * PLACES
+_RANGES = (
+    " Actions are counted in ranges of steering (split at 0.2 and 0.6 of the largest angle) and speed (three of equal "
+    "width): they are continuous, or log and run have different lists of them."
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -292,3 +305,103 @@ class AgainstLog:
 def quantile(curves: Values, share: float) -> Values:
     """Return a quantile over laps, (places,); NaN where no lap passed."""
     return pd.DataFrame(curves).quantile(share).to_numpy()
+
+
+def lines_compared(both: AgainstLog) -> Chart:
+    """Draw the lines of all laps and their medians on the course, and the stretch where they differ most."""
+    layers: list[Layer] = []
+    if (one := both.stretch) is not None:
+        end = one.end if one.end > one.begin else one.end + 100
+        there = both.course.points_at(np.linspace(one.begin, end, 60) / 100.0 % 1.0)
+        layers.append(line(there[:, 0], there[:, 1], VERMILION, "where they differ most", width=9.0))
+    for laps, color in zip((both.logged, both.simulated), SIDES.values(), strict=True):
+        # NaN between the laps.
+        apart = laps.steps[["X", "Y"]].to_numpy(np.float64)
+        apart = np.insert(apart, np.flatnonzero(np.diff(laps.number)) + 1, np.nan, axis=0)
+        layers.append(line(apart[:, 0], apart[:, 1], color, width=0.6))
+    for (name, color), curves in zip(SIDES.items(), both.curves["offset_m"], strict=True):
+        path = beside(both.course, PLACES, quantile(curves, 0.5))
+        path = np.vstack([path, path[:1]]) if both.course.closed else path
+        layers.append(line(path[:, 0], path[:, 1], color, f"{name}, median", width=2.5))
+    return Chart(
+        name="lines_compared",
+        title="Both lines",
+        caption="Thin lines are the laps, thick ones their medians at each place. The marked stretch is the tenth of "
+        "the track where line or speed differ most: the line in halves of the road's width, the speed in means of "
+        "the logged one.",
+        rows=[[map_panel(both.course, layers)]],
+    )
+
+
+def along_the_track(both: AgainstLog) -> Chart:
+    """Draw time, speed, steering and distance from the centre line along the course."""
+    bounds = np.append(PLACES, 1.0)
+    spent = [interval_times(laps.steps, bounds) for laps in (both.logged, both.simulated)]
+    panels = []
+    if all(len(times) for times in spent):
+        logged, simulated = (times.median().to_numpy() for times in spent)
+        lost_s = np.r_[0.0, np.cumsum(simulated - logged)]
+        delta = pd.DataFrame({"lap_position": bounds, "delta_s": lost_s})
+        title = "Time the simulated laps lose to the logged ones"
+        panels.append(time_lost_panel(title, delta, sectors_of(both.course), 100.0))
+    for column, title, label in (
+        ("track_speed_mps", "Speed along the track", "m/s"),
+        ("steer", "Steering commanded, positive to the left", "degrees"),
+        ("offset_m", "Distance from the centre line, positive to the left", "m"),
+    ):
+        layers: list[Layer] = []
+        for (name, color), curves in zip(SIDES.items(), both.curves[column], strict=True):
+            layers.append(band(_PER_CENT, quantile(curves, 0.1), quantile(curves, 0.9), color))
+            layers.append(line(_PER_CENT, quantile(curves, 0.5), color, name, width=2.5))
+        panels.append(Panel(title=title, y_label=label, layers=layers))
+    panels[-1] = replace(panels[-1], x_label="per cent of the track from waypoint 0")
+    return Chart(
+        name="along_the_track",
+        title="Along the track",
+        caption="Lines are medians over the laps, bands reach from the 10th to the 90th percentile. Where the line of "
+        "the time rises, the simulated car is slower.",
+        rows=in_rows(panels, 1),
+        share_x=True,
+    )
+
+
+def actions_compared(both: AgainstLog) -> Chart | None:
+    """Draw how often each action is taken."""
+    if both.actions is None:
+        return None
+    # From left to right, as on the road seen from above.
+    at, names = np.arange(len(both.actions.names)), both.actions.names[::-1]
+    layers = [
+        bars(at + side * 0.2, share[::-1], color, name, width=0.38)
+        for side, share, (name, color) in zip((-1, 1), both.action_shares, SIDES.items(), strict=True)
+    ]
+    return Chart(
+        name="actions_compared",
+        title="Actions taken",
+        caption="Share of all control steps. Equal policies in an equal simulation would take equal shares."
+        + _RANGES * both.actions.continuous,
+        rows=[[Panel(layers=layers, x_names=names, x_label="action", y_label="% of the steps")]],
+    )
+
+
+def write_against_log(path: Path, run: str, both: AgainstLog, view: LogView) -> Path:
+    """Write the page of simulated laps, driven by the policy of `run`, beside those of a log atomically.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    drawn = (lines_compared(both), along_the_track(both), actions_compared(both))
+    charts = [chart for chart in drawn if chart is not None]
+    page = render(
+        __package__,
+        "against_log.html.j2",
+        [plot_of(chart) for chart in charts],
+        run=run,
+        log=view.name,
+        sentences=both.sentences,
+        table=both.texts,
+        captions={chart.name: chart.caption for chart in charts},
+        facts=[("Log", both.logged.words), ("Simulated", both.simulated.words), *facts(view)[:1]],
+        problems=problem_rows(view),
+    )
+    return atomic_write(path, page)

@@ -13,8 +13,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head
 
-from .against_log import AgainstLog
-from .charts import actions, against_log, driving_line, laps, mistakes, rewards, training
+from .charts import actions, driving_line, laps, mistakes, rewards, training
 from .charts.figure import Chart
 from .charts.runs import generalisation_matrix, generations, run_folder, runs_compared
 from .findings import Finding, findings
@@ -98,29 +97,6 @@ def write_page(path: Path, page: LogPage) -> Path:
         OSError: it cannot be written.
     """
     return atomic_write(path, html(page))
-
-
-def write_against_log(path: Path, run: str, both: AgainstLog, view: LogView) -> Path:
-    """Write the page of simulated laps, driven by the policy of `run`, beside those of a log atomically.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    drawn = (against_log.lines_compared, against_log.along_the_track, against_log.actions_compared)
-    charts = [chart for draw_one in drawn if (chart := draw_one(both)) is not None]
-    page = render(
-        __package__,
-        "against_log.html.j2",
-        [plot_of(chart) for chart in charts],
-        run=run,
-        log=view.name,
-        sentences=both.sentences,
-        table=both.texts,
-        captions={chart.name: chart.caption for chart in charts},
-        facts=[("Log", both.logged.words), ("Simulated", both.simulated.words), *facts(view)[:1]],
-        problems=problem_rows(view),
-    )
-    return atomic_write(path, page)
 
 
 def draw_sections(page: LogPage) -> dict[str, list[Chart]]:

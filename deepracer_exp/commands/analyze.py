@@ -187,7 +187,7 @@ def _compare(args: argparse.Namespace) -> int:
         raise BadInput(f"{logs}: {why}; accepted: logs of the service; {runs} compares runs")
     check_policy(name, str(stores.runs_dir), stores.uri, chosen)
 
-    from deepracer_exp.analysis.against_log import prepare_races
+    from deepracer_exp.analysis.against_log import prepare_races, write_against_log
     from deepracer_exp.deepracer.recording_reader import read_recording
 
     view = prepare_races(read_recording(place), args.track)
@@ -195,7 +195,6 @@ def _compare(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from deepracer_exp.analysis.log_report import write_against_log
     from deepracer_exp.evaluation.against_log import race_against_log
     from deepracer_exp.runs.resolve import resolve
 

@@ -6,8 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps, prepare_races
-from deepracer_exp.analysis.charts.against_log import actions_compared, along_the_track, lines_compared
+from deepracer_exp.analysis.against_log import (
+    AgainstLog,
+    actions_compared,
+    along_the_track,
+    laps_on,
+    lines_compared,
+    logged_laps,
+    prepare_races,
+)
 from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.errors import BadInput
 
