@@ -14,13 +14,12 @@ from deepracer_exp.errors import count
 from deepracer_exp.runs.convergence import POOR, convergence, convergence_rule, overfitting
 from deepracer_exp.runs.result import RunResult
 
-from . import candidates as chosen
 from . import off_track
-from .candidates import candidates, evaluated_candidates
 from .log_view import LogView
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .sectors import Sector, sector_at, sectors_of, times_by_sector
 from .statistics import wilson
+from .tables import CANDIDATE_LAPS, DENSE, evaluated_candidates
 
 LATE_SHARE = 1 / 3
 """Share of the iterations, the last ones, that show how the car drives now."""
@@ -160,8 +159,8 @@ def _race_with(best: RunResult) -> Finding:
 def _submit(view: LogView) -> Finding:
     if view.recording.best is not None:
         return _race_with(view.recording.best)
-    best, evaluated = candidates(view.iterations), evaluated_candidates(view.recording)
-    thresholds = {"least_laps": chosen.LEAST_LAPS, "dense": chosen.DENSE}
+    best, evaluated = view.candidates, evaluated_candidates(view.recording)
+    thresholds = {"least_laps": CANDIDATE_LAPS, "dense": DENSE}
     laps = int(view.iterations["complete"].sum())
     values: _Numbers
     if len(best):
@@ -199,7 +198,7 @@ def _submit(view: LogView) -> Finding:
     else:
         farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
         sentence = (
-            f"Nothing to submit yet: no iteration has {chosen.LEAST_LAPS} complete laps ({count(laps, 'lap')} in "
+            f"Nothing to submit yet: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
             f"all); the farthest episode drove {farthest['progress']:.0f} % of the lap in iteration "
             f"{farthest['iteration']}."
         )

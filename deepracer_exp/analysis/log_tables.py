@@ -8,7 +8,6 @@ import pandas as pd
 
 from deepracer_exp.errors import count
 
-from .candidates import candidates_of
 from .log_view import LogView
 
 NONE = "\N{EN DASH}"
@@ -91,7 +90,7 @@ def iteration_rows(view: LogView) -> Table:
 
 def candidate_rows(view: LogView) -> Table:
     """Return the iterations whose policy is worth submitting, the best first."""
-    return table_of(candidates_of(view), _CANDIDATE_COLUMNS)
+    return table_of(view.candidates, _CANDIDATE_COLUMNS)
 
 
 def best_laps(view: LogView) -> Table:

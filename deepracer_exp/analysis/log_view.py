@@ -13,7 +13,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 
 from .log_course import catalogue_track, directed, estimated_course, find_courses, numbered_as_logged
-from .tables import add_derived, episode_table, first_rows, iteration_table
+from .tables import add_derived, candidates, episode_table, first_rows, iteration_table
 
 DISCOUNT = Hyperparameters().discount_factor
 """For logs without hyperparameters: the service's default."""
@@ -68,6 +68,11 @@ class LogView:
     def traced(self) -> str:
         """What to add to a number of episodes that are counted in the traces."""
         return " with a trace" if self.untraced else ""
+
+    @property
+    def candidates(self) -> pd.DataFrame:
+        """Iterations worth submitting; none of our own runs, which keep few checkpoints and have evaluated them."""
+        return candidates(self.iterations if self.recording.best is None else self.iterations.iloc[:0])
 
     @property
     def waypoint_count(self) -> int:

@@ -1,4 +1,4 @@
-"""The tables of a recording: columns derived from its steps, and one row an episode and an iteration."""
+"""The tables of a recording: columns derived from its steps, one row an episode and an iteration, the candidates."""
 
 from collections.abc import Mapping
 
@@ -83,6 +83,11 @@ ITERATION_COLUMNS: Mapping[str, str] = {
 """Names of the columns, with meaning and unit."""
 FINISHED = 0.75
 """Share of the usual number of episodes below which the last iteration of a metrics file was not finished."""
+CANDIDATE_LAPS = 3
+"""Complete laps of an iteration below which its 25th percentile means nothing."""
+DENSE = 0.5
+"""Share of complete laps a candidate must have, over the highest share of an iteration with `CANDIDATE_LAPS`."""
+MOST_CANDIDATES = 3
 _REPORTED = ("entropy", "kl", "policy_loss", "value_loss", "lr")
 
 
@@ -312,3 +317,26 @@ def _evaluated(recording: Recording) -> pd.DataFrame:
     rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
     means = rows.groupby("iteration")["completion"].mean().to_frame("eval_completion")
     return means.assign(held_out_completion=np.nan)
+
+
+def candidates(iterations: pd.DataFrame) -> pd.DataFrame:
+    """Return the iterations whose policy is worth submitting, the best first, at most `MOST_CANDIDATES`.
+
+    Fast and dense (after TheRayG/deepracer-log-analysis): at least `CANDIDATE_LAPS` complete laps, and `DENSE` of the
+    highest share of complete laps among these; of them the ones with the lowest 25th percentile of the lap time.
+    """
+    enough = iterations["lap_time_p25_s"].notna() & (iterations["complete"] >= CANDIDATE_LAPS)
+    dense = iterations["lap_share"] >= DENSE * iterations.loc[enough, "lap_share"].max()
+    return iterations[enough & dense].sort_values("lap_time_p25_s", kind="stable").head(MOST_CANDIDATES)
+
+
+def evaluated_candidates(recording: Recording) -> pd.DataFrame:
+    """Return the iterations after which the service's evaluation completed every lap it tried, the fastest first.
+
+    Returns:
+        By iteration: `laps` and `lap_time_s`, their mean.
+    """
+    rows = recording.metrics
+    groups = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")].groupby("iteration")
+    found = pd.DataFrame({"laps": groups.size(), "lap_time_s": groups["time_s"].mean()})
+    return found[groups["completion"].min() >= 100.0].sort_values("lap_time_s", kind="stable")

@@ -8,7 +8,6 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from deepracer_exp.analysis.candidates import candidates
 from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.charts.laps import (
     CHANCES,
@@ -202,7 +201,7 @@ def test_one_lap_is_a_histogram_without_chances() -> None:
 
 def test_stars_are_the_candidates_for_submission(lapping: LogView) -> None:
     star = next(one for one in layers(lap_time_percentile(lapping), "points") if one.marker.symbol == "star")
-    assert sorted(star.x) == sorted(candidates(lapping.iterations)["iteration"])
+    assert sorted(star.x) == sorted(lapping.candidates["iteration"])
 
 
 def test_time_is_lost_where_the_slower_lap_is_slower() -> None:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from deepracer_exp.analysis.candidates import candidates
 from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.findings import Finding, findings
 from deepracer_exp.analysis.log_report import LogPage, draw_sections, html
@@ -91,7 +90,7 @@ def laps_of(*iterations: tuple[int, int, float]) -> LogView:
 def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
     # Fast but rare, dense but slow, and both; the fourth has too few laps to have a percentile.
     view = laps_of((3, 7, 3.0), (10, 0, 2.0), (8, 2, 2.5), (2, 0, 3.0))
-    assert candidates(view.iterations)["iteration"].tolist() == [2, 1]
+    assert view.candidates["iteration"].tolist() == [2, 1]
     found = of(view, "submit")
     assert found.sentence.startswith("Submit the checkpoint (its name is not logged")
     assert "8 of its 10 episodes are complete laps (49% to 94% with 95 % confidence)" in found.sentence

@@ -8,7 +8,6 @@ import pandas as pd
 from numpy.polynomial import Polynomial
 from scipy.stats import norm
 
-from deepracer_exp.analysis.candidates import candidates_of
 from deepracer_exp.analysis.log_view import LogView, thirds
 from deepracer_exp.analysis.sectors import Sector, sectors_of, time_lost
 from deepracer_exp.analysis.statistics import Values, histogram, subsample
@@ -111,7 +110,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     laps = view.episodes[view.episodes["lap_time_s"].notna()]
     shown = laps.iloc[subsample(len(laps), 2500)]
     x, y, share = table["iteration"], table["lap_time_p25_s"], 100 * table["lap_share"]
-    best = candidates_of(view)
+    best = view.candidates
     hover = [
         f"iteration {row.iteration}: 25th percentile {row.lap_time_p25_s:.2f} s, best {row.lap_time_best_s:.2f} s, "
         f"{row.complete} of {row.episodes} episodes are complete laps"
