@@ -21,8 +21,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.evaluation.evaluate import car_figures, race_car_parts
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.real_car import compare, key_figures
 
 from .command import trained
 from .fresh import protocol, stored_policy
@@ -39,7 +39,7 @@ def drive(run: Path) -> Figures:
     """Let a run's last policy drive as in the simulator and as on the car."""
     experiment, policy = stored_policy(run, "last")
     config = protocol("evaluation=real_car", f"evaluation.trials={STARTS}")
-    return key_figures(compare(experiment, config, policy, Evaluator(experiment, config)(policy)))
+    return car_figures(race_car_parts(experiment, config, policy, Evaluator(experiment, config)(policy)))
 
 
 def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figures]:

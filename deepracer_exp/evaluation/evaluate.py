@@ -1,9 +1,9 @@
-"""The command `evaluate`: race a stored policy, print the results and record them."""
+"""The command `evaluate`: race a stored policy, in the simulator or as the physical car; print and record results."""
 
 import datetime
 import json
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +11,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
+from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
+from deepracer_exp.deepracer.car_controls import full_scale, throttle
+from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
@@ -24,7 +26,6 @@ from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
 from .evaluator import Evaluator
 from .film import LapRecorder, best_attempt
-from .real_car import compare, explain_controls, key_figures, losses_table
 from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number
 
 if TYPE_CHECKING:
@@ -32,6 +33,15 @@ if TYPE_CHECKING:
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s")
+SIMULATOR, CAR = "simulator", "car"
+"""Names of what is compared, beside the parts of `RealCarConfig`."""
+_PARTS = tuple(field.name for field in fields(RealCarConfig))
+CURES = {
+    "picture": "pictures (blur, pixel_noise)",
+    "timing": "action_delay_steps, observation_dropout",
+    "controls": "speed_noise, motor_scale, servo_scale, in part",
+}
+"""What of `randomization=sim2real` prepares a policy for a part."""
 
 
 def results_table(
@@ -88,7 +98,7 @@ def write_evaluation(
     stored: StoredPolicy,
     car: Mapping[str, Evaluation] | None = None,
 ) -> Path:
-    """Write `evaluations/<time>.json` into a run's folder and return it; `car`: what `real_car.compare` returns.
+    """Write `evaluations/<time>.json` into a run's folder and return it; `car`: what `race_car_parts` returns.
 
     Raises:
         RunFailed: the file cannot be written.
@@ -101,7 +111,7 @@ def write_evaluation(
         **evaluation.as_dict(),
     }
     if car is not None:
-        content["real_car"] = key_figures(car)
+        content["real_car"] = car_figures(car)
     target = folder / EVALUATIONS
     with writing(target, failure=RunFailed):
         target.mkdir(exist_ok=True)
@@ -155,13 +165,13 @@ def evaluate_run(
     evaluation = evaluator(stored.networks.policy, recorder if video is not None else None)
     car = None
     if config.evaluation.real_car is not None:
-        car = compare(run.experiment, config.evaluation, stored.networks.policy, evaluation)
+        car = race_car_parts(run.experiment, config.evaluation, stored.networks.policy, evaluation)
     file = write_evaluation(run.path, evaluation, config.evaluation, stored, car)
     known = trained_on(run.experiment, config.evaluation, evaluation)
     out.print(results_table(evaluation, config.evaluation, known, out))
     if car is not None:
         out.print()
-        out.print(losses_table(car))
+        out.print(car_table(car))
         for line in explain_controls(run.experiment, config.evaluation):
             out.print(f"  {line}", soft_wrap=True, highlight=False)
     out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
@@ -201,3 +211,85 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
         else:
             found[evaluate_metric("held_out_completion", label)] = group.completion
     return found
+
+
+def car_protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
+    """Return the protocol without any part of the real car and with each part alone, by name."""
+    assert config.real_car is not None
+    none = RealCarConfig(**dict.fromkeys(_PARTS))
+    chosen = [name for name in _PARTS if getattr(config.real_car, name) is not None]
+    alone = {name: replace(none, **{name: getattr(config.real_car, name)}) for name in chosen}
+    # A single part alone is the whole car.
+    shown = alone if len(alone) > 1 else {}
+    return {
+        SIMULATOR: replace(config, real_car=None),
+        **{name: replace(config, real_car=real_car) for name, real_car in shown.items()},
+    }
+
+
+def race_car_parts(
+    experiment: Experiment, config: EvaluationConfig, policy: torch.nn.Module, of_car: Evaluation
+) -> dict[str, Evaluation]:
+    """Race the policy in the plain simulator and with each part of the car alone; add `of_car`, with all parts."""
+    found = {name: Evaluator(experiment, one)(policy) for name, one in car_protocols(config).items()}
+    return {**found, CAR: of_car}
+
+
+def car_figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, Any]]:
+    """Return `lap_share`, `completion` (0 to 1) and `lap_time_s` (None on several tracks) of each, JSON types."""
+    found = {}
+    for name, evaluation in evaluations.items():
+        group = evaluation.on(USUAL)
+        found[name] = {
+            "lap_share": group.lap_share,
+            "completion": group.completion / 100,
+            "lap_time_s": group.mean_lap_time_s if len(evaluation.tracks) == 1 else None,
+        }
+    return found
+
+
+def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
+    """Return what is lost under usual conditions as a table: simulator, each part of the car alone, all of them."""
+    found = car_figures(evaluations)
+    base = found[SIMULATOR]
+    shown = Table(box=None, pad_edge=False, title="from the simulator to the car", title_justify="left")
+    for name in ("as on the car", "laps %", "lost %", "done %", "lap s", "lost s"):
+        shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
+    shown.add_column("in sim2real against it")
+    names = {SIMULATOR: "nothing", CAR: "all"}
+    for name, one in found.items():
+        lap_s, base_s = one["lap_time_s"], base["lap_time_s"]
+        lost_s = None if name == SIMULATOR or None in (lap_s, base_s) else lap_s - base_s
+        shown.add_row(
+            names.get(name, name),
+            f"{100 * one['lap_share']:.0f}",
+            NOTHING if name == SIMULATOR else f"{100 * (base['lap_share'] - one['lap_share']):.0f}",
+            f"{100 * one['completion']:.1f}",
+            number(lap_s, 2),
+            NOTHING if lost_s is None else f"{lost_s:+.2f}",
+            CURES.get(name, ""),
+        )
+    return shown
+
+
+def explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[str]:
+    """Return what the car makes of the action space, in words."""
+    controls = None if config.real_car is None else config.real_car.controls
+    if controls is None:
+        return []
+    actions = build_action_space(experiment.action_space)
+    scale = full_scale(metadata_of(actions))
+    top_mps = controls.full_throttle_mps or scale.speed_mps
+    half_mps = top_mps * float(throttle(0.5 * scale.speed_mps, scale.speed_mps))
+    lines = [
+        f"steering: {scale.steering_deg:g} degrees are full lock, {controls.full_lock_deg:g} degrees on the car",
+        f"speed: {scale.speed_mps:g} m/s are full throttle, {top_mps:g} m/s on the car; half of it becomes "
+        f"{half_mps:g} m/s",
+    ]
+    if 0 < scale.steering_deg != controls.full_lock_deg:
+        lines[0] += f": {controls.full_lock_deg / scale.steering_deg:.2g} times as much"
+    if -actions.low[0] > scale.steering_deg > 0:
+        lines.append(
+            f"the servo refuses steering beyond {-scale.steering_deg:g} degrees and keeps the last angle"
+        )
+    return lines

@@ -9,8 +9,8 @@ import torch
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR, car_figures, car_protocols, race_car_parts
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.real_car import CAR, SIMULATOR, compare, key_figures, protocols
 
 
 class BrightSide(torch.nn.Module):
@@ -35,20 +35,20 @@ def sees():
 
 def test_each_part_is_driven_alone_and_no_part_is_the_simulator_bit_for_bit(sees, config):
     policy = BrightSide()
-    found = compare(sees, config, policy, Evaluator(sees, config, threads=1)(policy))
+    found = race_car_parts(sees, config, policy, Evaluator(sees, config, threads=1)(policy))
     assert list(found) == [SIMULATOR, "picture", "timing", "controls", CAR]
     attempts = {name: one.groups[0].attempts for name, one in found.items()}
     assert len(set(attempts.values())) == len(attempts)  # each part makes a difference
     nothing = replace(config, real_car=RealCarConfig(picture=None, timing=None, controls=None))
     assert Evaluator(sees, nothing, threads=1)(policy).groups[0].attempts == attempts[SIMULATOR]
-    assert all(np.isfinite(one["completion"]) for one in key_figures(found).values())
+    assert all(np.isfinite(one["completion"]) for one in car_figures(found).values())
 
 
 def test_parts_that_are_off_are_not_driven(config):
     timing = replace(config, real_car=replace(config.real_car, picture=None, controls=None))
-    assert list(protocols(timing)) == [SIMULATOR]
+    assert list(car_protocols(timing)) == [SIMULATOR]
     two = replace(config, real_car=replace(config.real_car, picture=None))
-    assert list(protocols(two)) == [SIMULATOR, "timing", "controls"]
+    assert list(car_protocols(two)) == [SIMULATOR, "timing", "controls"]
 
 
 def test_a_policy_of_features_is_refused(config):
