@@ -19,7 +19,7 @@ from . import pitfalls
 from .console import ConsoleFinding, console_findings
 from .pitfalls import action_space_laps
 from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
-from .reward_grid import RewardGrid, State, sample_reward_grid, state_of
+from .reward_map import RewardGrid, State, sample_reward_grid, state_of
 from .situations import NamedSituation, Situations, named_situations, sample, seam, situations
 
 _WARM = 25

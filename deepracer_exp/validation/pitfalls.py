@@ -15,7 +15,7 @@ from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.sim.batch import CarBatch
 
 from .probe import Probe
-from .reward_grid import RewardGrid
+from .reward_map import RewardGrid
 from .situations import Situations
 
 Floats = NDArray[np.float64]

@@ -5,7 +5,7 @@ import pytest
 from deepracer_exp.errors import BadInput
 from deepracer_exp.validation.check import read
 from deepracer_exp.validation.probe import NOT_CALLED, Probe
-from deepracer_exp.validation.reward_grid import state_of
+from deepracer_exp.validation.reward_map import state_of
 
 
 def function(body: str, before: str = "") -> str:

@@ -5,7 +5,7 @@ import pytest
 
 from deepracer_exp.validation import pitfalls
 from deepracer_exp.validation.probe import Probe
-from deepracer_exp.validation.reward_grid import sample_reward_grid, state_of
+from deepracer_exp.validation.reward_map import sample_reward_grid, state_of
 
 
 def paying(expression: str) -> str:
