@@ -10,10 +10,10 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.tracks.track import Track
-from deepracer_exp.validation import check as checking
 from deepracer_exp.validation import reward_map
-from deepracer_exp.validation.check import Check, look_closer, read, try_named_situations
+from deepracer_exp.validation import validate as checking
 from deepracer_exp.validation.pitfalls import DrivenLap, action_space_laps
+from deepracer_exp.validation.validate import Check, look_closer, read, try_named_situations
 
 
 @pytest.fixture(scope="session")

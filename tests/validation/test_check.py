@@ -3,9 +3,9 @@ import re
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.validation.check import read
 from deepracer_exp.validation.probe import NOT_CALLED, Probe
 from deepracer_exp.validation.reward_map import state_of
+from deepracer_exp.validation.validate import read
 
 
 def function(body: str, before: str = "") -> str:
@@ -177,7 +177,7 @@ def test_stateful_and_random_rewards_are_distinguished(race_with, text, memory):
 
 
 def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with, monkeypatch):
-    from deepracer_exp.validation import check as checking
+    from deepracer_exp.validation import validate as checking
 
     first = "done = []\n" + function(
         "if not done:\n    done.append(sum(i % 3 for i in range(2000000)))\nreturn params['speed']"

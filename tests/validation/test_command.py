@@ -7,7 +7,7 @@ from matplotlib.image import imread
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.rewards.source import zoo_names
-from deepracer_exp.validation import check as checking
+from deepracer_exp.validation import validate as checking
 from deepracer_exp.validation.validate import compare_thirds
 
 pytestmark = pytest.mark.usefixtures("coarsely")
