@@ -96,8 +96,9 @@ def evaluate(run: str | Path, *overrides: str) -> Evaluation:
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
     config, _ = compose_evaluation([*overrides, override_line("run", str(run))])
+    stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     quiet = Console(quiet=True)
-    return evaluate_run(config, None, quiet, quiet)
+    return evaluate_run(stored, config, None, quiet, quiet)
 
 
 def load_policy(

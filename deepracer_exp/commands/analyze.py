@@ -185,7 +185,7 @@ def _compare(args: argparse.Namespace) -> int:
         why = "no such file or folder" if place is None else "is a run"
         runs = shlex.join(["deepracer-exp", "runs", "compare", name, logs])
         raise BadInput(f"{logs}: {why}; accepted: logs of the service; {runs} compares runs")
-    check_policy(name, str(stores.runs_dir), stores.uri, chosen)
+    run = check_policy(name, str(stores.runs_dir), stores.uri, chosen)
 
     from deepracer_exp.analysis.against_log import prepare_races, write_against_log
     from deepracer_exp.deepracer.recording_reader import read_recording
@@ -196,9 +196,7 @@ def _compare(args: argparse.Namespace) -> int:
     from rich.table import Table
 
     from deepracer_exp.evaluation.against_log import race_against_log
-    from deepracer_exp.runs.resolve import resolve
 
-    run = resolve(name, stores.runs_dir, stores.uri)
     with warnings_on_stderr():
         both = race_against_log(run, chosen, view, args.track, Console(stderr=True, highlight=False))
     out = Path(args.output or _page("comparison", view.name))

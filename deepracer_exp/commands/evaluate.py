@@ -15,6 +15,7 @@ from .startup import check_policy
 
 if TYPE_CHECKING:
     from deepracer_exp.config.evaluation import EvaluateConfig
+    from deepracer_exp.runs.resolve import StoredRun
 
 _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
@@ -116,7 +117,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.video is not None:
         _check_film("--video", Path(args.video))
         _choose_graphics()
-    check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation)
+    run = _policy(config)
 
     from rich.console import Console
 
@@ -125,7 +126,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     video = None if args.video is None else (Path(args.video), args.view)
     out = Console(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
-        evaluate_run(config, video, out, Console(stderr=True))
+        evaluate_run(run, config, video, out, Console(stderr=True))
     return 0
 
 
@@ -138,6 +139,13 @@ def _composed(args: argparse.Namespace) -> "tuple[EvaluateConfig, bool]":
     config, _ = compose_evaluation([*overrides, override_line("run", run)])
     args.debug = config.debug
     return config, not any(group_of(given) == "evaluation" for given in overrides)
+
+
+def _policy(config: "EvaluateConfig") -> "StoredRun":
+    """Return the run to race, after what can be checked before the imports that take seconds."""
+    return check_policy(
+        config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation
+    )
 
 
 def _checkpoints_given(args: argparse.Namespace) -> list[str]:
@@ -166,7 +174,7 @@ def _watch(args: argparse.Namespace) -> int:
         _check_film("--output", Path(args.output))
     config, own_trials = _composed(args)
     if not args.live:
-        check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation)
+        run = _policy(config)
 
         from rich.console import Console
 
@@ -174,7 +182,7 @@ def _watch(args: argparse.Namespace) -> int:
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
-            film_run(config, file, Console(), Console(stderr=True))
+            film_run(run, config, file, Console(), Console(stderr=True))
         return 0
     from deepracer_exp.config.own_class import OF_POLICY
     from deepracer_exp.config.parse import import_own_classes
@@ -240,7 +248,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
         if page.suffix != ".html" or not page.absolute().parent.is_dir():
             raise BadInput(f"--output {page}: accepted: the name of a page (.html) in a folder")
     config, own_trials = _composed(args)
-    check_policy(config.run, config.runs_dir, config.tracking.uri, None, config.evaluation)
+    run = _policy(config)
 
     from rich.console import Console
 
@@ -248,7 +256,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
 
     progress = Console(stderr=True, highlight=False, markup=False)
     with warnings_on_stderr():
-        show_checkpoints(config, own_trials, args.output, table_console(160), progress)
+        show_checkpoints(run, config, own_trials, args.output, table_console(160), progress)
     return 0
 
 

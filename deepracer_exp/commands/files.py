@@ -168,20 +168,20 @@ def _export(args: argparse.Namespace) -> int:
     config, _ = compose_export([*overrides, override_line("run", run)])
     args.debug = config.debug
     if config.format in ("onnx", "car", "aws-model"):
-        experiment = check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
+        stored = check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
         if config.format == "car":
             from deepracer_exp.export.car_archive import check_car
 
-            check_car(experiment)
+            check_car(stored.experiment)
     else:
-        resolve(config.run, Path(config.runs_dir), config.tracking.uri)
+        stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
 
     from rich.console import Console
 
     from deepracer_exp.export.export import export
 
     with warnings_on_stderr():
-        export(config, args.output, Console(highlight=False, markup=False))
+        export(stored, config, args.output, Console(highlight=False, markup=False))
     return 0
 
 

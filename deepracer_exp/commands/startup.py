@@ -56,8 +56,8 @@ def check_policy(
     tracking_uri: str | None,
     checkpoint: str | None,
     evaluation: "EvaluationConfig | None" = None,
-) -> "Experiment":
-    """Return the experiment of a run that `check_run` finds; import the classes of the user's own its policy needs.
+) -> "StoredRun":
+    """Return a run as `check_run` does; import the classes of the user's own that its policy needs.
 
     Raises:
         BadInput: as `check_run`, or a class is not named again or cannot be imported, or `evaluation` is that of the
@@ -66,13 +66,13 @@ def check_policy(
     from deepracer_exp.config.own_class import OF_POLICY
     from deepracer_exp.config.parse import import_own_classes
 
-    experiment = check_run(run, runs_dir, tracking_uri, checkpoint).experiment
-    import_own_classes(experiment, OF_POLICY)
+    stored = check_run(run, runs_dir, tracking_uri, checkpoint)
+    import_own_classes(stored.experiment, OF_POLICY)
     if evaluation is not None and evaluation.real_car is not None:
         from deepracer_exp.env.real_car import require_car
 
-        require_car(experiment)
-    return experiment
+        require_car(stored.experiment)
+    return stored
 
 
 def check_run(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str | None) -> "StoredRun":

@@ -18,7 +18,7 @@ from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.checkpoints import check, read_policy
-from deepracer_exp.runs.resolve import StoredRun, resolve
+from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.runs.result import CRITERIA
 
 from .evaluate import fit
@@ -217,17 +217,16 @@ _LEGEND = (
 
 
 def show_checkpoints(
-    config: EvaluateConfig, own_trials: bool, picture: str | None, out: Console, err: Console
+    run: StoredRun, config: EvaluateConfig, own_trials: bool, picture: str | None, out: Console, err: Console
 ) -> None:
     """Evaluate a run's checkpoints, print the comparison, recommend one, and draw them on the page `picture`.
 
     The trials are those of the training (`own_trials`) or of `config`.
 
     Raises:
-        BadInput: the run, all its checkpoints, a track or a condition cannot be used, or a file cannot be written.
+        BadInput: all its checkpoints, a track or a condition cannot be used, or a file cannot be written.
         RunFailed: a car's state became NaN.
     """
-    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     kept = kept_checkpoints(run.checkpoints)
     if not kept:
         raise BadInput(f"{run.checkpoints}: contains no checkpoint")

@@ -20,7 +20,7 @@ from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
-from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 
@@ -145,15 +145,14 @@ def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:
 
 
 def evaluate_run(
-    config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, err: Console
+    run: StoredRun, config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, err: Console
 ) -> Evaluation:
     """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.
 
     Raises:
-        BadInput: the run, the checkpoint, a track or a condition cannot be used, or the machine cannot render.
+        BadInput: the checkpoint, a track or a condition cannot be used, or the machine cannot render.
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
-    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, config.evaluation)

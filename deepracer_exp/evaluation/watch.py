@@ -21,7 +21,7 @@ from deepracer_exp.env.lidar import reach_of_rays
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import FILMS
-from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 
 from .evaluator import Evaluator
@@ -259,16 +259,15 @@ class _Distribution:
         return image
 
 
-def film_run(config: EvaluateConfig, file: Path | None, out: Console, err: Console) -> None:
+def film_run(run: StoredRun, config: EvaluateConfig, file: Path | None, out: Console, err: Console) -> None:
     """Race a run's checkpoint under a protocol and film its best lap on the usual conditions.
 
     `file` is the .mp4 to write; None: named after the checkpoint, in the run's folder.
 
     Raises:
-        BadInput: the run, the checkpoint, a track or a condition cannot be used.
+        BadInput: the checkpoint, a track or a condition cannot be used.
         RunFailed: a car's state became NaN, or the file cannot be written.
     """
-    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, replace(config.evaluation, held_out=None))

@@ -22,7 +22,7 @@ from deepracer_exp.files import atomic_write, read_text
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
-from deepracer_exp.runs.resolve import StoredRun, resolve
+from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.runs.result import read_result
 from deepracer_exp.validation.console import console_findings
 
@@ -38,14 +38,13 @@ TOLERANCE = 1e-4
 """Largest accepted difference, with a margin over single-precision rounding."""
 
 
-def export(config: ExportConfig, output: str | None, out: Console) -> Path:
+def export(run: StoredRun, config: ExportConfig, output: str | None, out: Console) -> Path:
     """Export a run in the chosen format and print what was written.
 
     Raises:
-        BadInput: the run, the checkpoint or the output cannot be used, or a package is missing.
+        BadInput: the checkpoint or the output cannot be used, or a package is missing.
         RunFailed: the written file differs from the network.
     """
-    run = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     names = {"onnx": "policy.onnx", "car": name_on_car(run.path.name) + ENDING}
     path = Path(output or run.path / EXPORTS / names.get(config.format, config.format))
     write = {"onnx": _onnx, "car": _car, "aws": _aws, "aws-model": _aws_model, "aws-logs": _aws_logs}
