@@ -27,12 +27,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from deepracer_exp.collectors.base import cores, worker_count
+from deepracer_exp.collectors.base import worker_count
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, MLPConfig
 from deepracer_exp.env.gym_env import DeepRacerVectorEnv
 from deepracer_exp.env.setup import build_setup
+from deepracer_exp.sim.batch import cores
 
 from .report import benchmark_parser
 

@@ -43,7 +43,6 @@ import numpy as np
 import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.collectors.base import cores
 from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.commands.startup import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
@@ -54,7 +53,7 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.rewards.source import load_reward_source, source_with_constants
-from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.sim.batch import CarBatch, cores
 
 from .all_tracks import TRACKS
 from .command import read_metrics, train

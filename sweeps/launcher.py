@@ -10,6 +10,7 @@ from pathlib import Path
 from deepracer_exp.addresses import take_over
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import end_with_owner
+from deepracer_exp.sim.batch import cores
 from deepracer_exp.training.signals import Interruption
 
 from .worker_config import WorkerConfig, owner_name
@@ -21,9 +22,8 @@ class LocalLauncher:
     """Starts workers as processes of this machine, one per core by default."""
 
     def __init__(self, workers: int | None):
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.workers = workers or cores
-        self.cores = max(1, cores // self.workers)
+        self.workers = workers or cores()
+        self.cores = max(1, cores() // self.workers)
         """Per worker."""
         # A fork server has imported once what all workers need; see `start_workers_early`.
         forks = sys.platform.startswith("linux")

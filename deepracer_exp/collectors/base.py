@@ -1,6 +1,5 @@
 """The interface of every collector, and what all of them need."""
 
-import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
@@ -12,6 +11,7 @@ from tensordict import TensorDictBase
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.sim.batch import cores
 
 
 class Collector(ABC):
@@ -74,11 +74,6 @@ class Collector(ABC):
     @abstractmethod
     def close(self) -> None:
         """End every worker."""
-
-
-def cores() -> int:
-    """Return the number of cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_count(config: CollectorConfig) -> int:

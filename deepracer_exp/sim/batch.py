@@ -33,6 +33,12 @@ class CarState(NamedTuple):
     yaw_rate_radps: Floats
 
 
+def cores() -> int:
+    """Return the number of cores this process may use."""
+    # macOS does not say which these are.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class CarBatch:
     """N cars, each on its own infinite floor, advanced by one control period at a time.
 
@@ -54,7 +60,7 @@ class CarBatch:
         self._tyre_friction = np.full(n_cars, car.tyre_friction)
         self._floor_friction = np.full(n_cars, floor_friction, np.float64)
         self._cars["friction"] = self._tyre_friction * self._floor_friction
-        self._batch = mujoco.batch.Batch(self.model, n_cars, threads or len(os.sched_getaffinity(0)))
+        self._batch = mujoco.batch.Batch(self.model, n_cars, threads or cores())
         self._rows: Floats = self._batch.state
         self._qpos: Floats = self._batch.bind("qpos")
         self._qvel: Floats = self._batch.bind("qvel")

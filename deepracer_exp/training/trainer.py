@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
-from deepracer_exp.collectors.base import Collector, cores, worker_count
+from deepracer_exp.collectors.base import Collector, worker_count
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.trace import to_table
@@ -30,6 +30,7 @@ from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED
 from deepracer_exp.runs.trace import TraceWriter
+from deepracer_exp.sim.batch import cores
 
 from .budget import Budget
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names

@@ -7,7 +7,7 @@ import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.collectors import watchdog
-from deepracer_exp.collectors.base import cores, worker_count
+from deepracer_exp.collectors.base import worker_count
 from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.collectors.worker import EnvFactory
 from deepracer_exp.config.compose import compose_experiment
@@ -15,6 +15,7 @@ from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import RunFailed
+from deepracer_exp.sim.batch import cores
 
 pytestmark = pytest.mark.usefixtures("workers_start_early")
 

@@ -25,6 +25,11 @@ def _log_elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+def test_all_cores_are_taken_where_the_system_does_not_say_which_are_allowed(monkeypatch):
+    monkeypatch.delattr("os.sched_getaffinity")  # as on macOS
+    assert CarBatch(CAR, 1, threads=0).n_cars == 1
+
+
 def random_commands(n_cars: int, steps: int):
     rng = np.random.default_rng(3)
     return rng.uniform(0.1, 4.0, (steps, n_cars)), np.deg2rad(rng.uniform(-30, 30, (steps, n_cars)))
