@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.runs.files import run_folders
+from deepracer_exp.runs.files import RUN, run_folders
 
-RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
 STORES = ("runs_dir", "tracking.uri")
 """Where runs are, and the MLflow store in which ids and aliases are looked up."""
 

@@ -17,15 +17,12 @@ from deepracer_exp.tracking.registry import Registered, is_alias, look_up
 from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
 from .checkpoint_files import LINKS, checkpoint_sha256, verify
-from .files import BEST_OF_SWEEP, CHECKPOINTS, CONFIG, is_run, read_config, run_folders
+from .files import BEST_OF_SWEEP, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
 from .result import RunResult, read_result
 
 logger = logging.getLogger("deepracer_exp")
 
 BEST = "best:"
-ACCEPTED = (
-    "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
-)
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     """
     if run.startswith(BEST):
         return StoredRun(best_of(run.removeprefix(BEST), runs_dir))
-    with reading(run, ACCEPTED):
+    with reading(run, RUN):
         for folder in (Path(run).expanduser(), runs_dir / run):
             if is_run(folder):
                 return StoredRun(folder)
@@ -110,7 +107,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     if any(folder.parent.name == run for folder in folders):
         unknown += f"; {BEST}{run} is the best run of that experiment"
     if not is_alias(run) or not has_store(tracking_uri, runs_dir):
-        raise BadInput(f"{unknown}; accepted: {ACCEPTED}")
+        raise BadInput(f"{unknown}; accepted: {RUN}")
     try:
         registered = look_up(run, tracking_uri, runs_dir)
     except BadInput as error:
