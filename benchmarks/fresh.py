@@ -47,7 +47,7 @@ def protocol(*overrides: str) -> EvaluationConfig:
     return compose_evaluation(["run=any", *overrides])[0].evaluation
 
 
-def fresh_trials(trials: int = TRIALS) -> EvaluationConfig:
+def fresh_trials(trials: int) -> EvaluationConfig:
     """Return trials of one lap each whose starts and conditions no training's evaluation has."""
     starts = ",".join(repr((place + _SHIFT) / trials) for place in range(trials))
     conditions = (f"evaluation.seed={_SEED}", f"evaluation.starts=[{starts}]")

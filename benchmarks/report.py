@@ -81,7 +81,7 @@ def percent(share: float | None, digits: int = 0) -> str:
     return "-" if share is None else f"{share:.{digits}%}"
 
 
-def mean_and_interval(values: Sequence[float | None], digits: int = 4) -> dict[str, Any]:
+def mean_and_interval(values: Sequence[float | None]) -> dict[str, Any]:
     """Return `mean` and `interval` of the values that are known, for JSON.
 
     Runs differ by their seeds only, and there are few of them: Student's interval of the mean. It is None with fewer
@@ -89,12 +89,12 @@ def mean_and_interval(values: Sequence[float | None], digits: int = 4) -> dict[s
     """
     known = np.array([value for value in values if value is not None])
     if len(known) < 2:
-        return {"mean": round(float(known[0]), digits) if len(known) else None, "interval": None}
+        return {"mean": round(float(known[0]), 4) if len(known) else None, "interval": None}
     mean = float(known.mean())
     if np.ptp(known) == 0:  # no interval is defined for what does not vary
-        return {"mean": round(mean, digits), "interval": [round(mean, digits)] * 2}
+        return {"mean": round(mean, 4), "interval": [round(mean, 4)] * 2}
     low, high = ttest_1samp(known, 0.0).confidence_interval(CONFIDENCE)
-    return {"mean": round(mean, digits), "interval": [round(float(low), digits), round(float(high), digits)]}
+    return {"mean": round(mean, 4), "interval": [round(float(low), 4), round(float(high), 4)]}
 
 
 def interval_text(figure: dict[str, Any], show: Callable[[float | None], str]) -> str:

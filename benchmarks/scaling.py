@@ -207,17 +207,16 @@ def fill(storage: Storage, study: str, trials: int) -> None:
         connection.execute(sa.insert(there), rows)
 
 
-def renewals_a_second(args: argparse.Namespace, folder: Path, clients: int, seconds: float = 8.0) -> float:
+def renewals_a_second(args: argparse.Namespace, folder: Path, clients: int) -> float:
     """Return how many leases a second the database renews for `clients`, with a connection for each transaction."""
     storage, study = open_storage(args.storage, folder), f"rate-{uuid.uuid4().hex[:8]}"
     claims = [TrialClaims(storage.engine, study).claim(f"bench:{n}:a", clients, 3600) for n in range(clients)]
     return rate(
-        [lambda claim=claim: TrialClaims(storage.engine, study).renew(claim, 3600.0) for claim in claims],  # type: ignore[misc]
-        seconds,
+        [lambda claim=claim: TrialClaims(storage.engine, study).renew(claim, 3600.0) for claim in claims]  # type: ignore[misc]
     )
 
 
-def batches_a_second(args: argparse.Namespace, clients: int, seconds: float = 8.0) -> float:
+def batches_a_second(args: argparse.Namespace, clients: int) -> float:
     """Return how many iterations a second, of 20 metrics each, MLflow's server takes from `clients`."""
     client = MlflowClient(tracking_uri=args.tracking)
     known = client.get_experiment_by_name("scaling-rate")
@@ -229,11 +228,12 @@ def batches_a_second(args: argparse.Namespace, clients: int, seconds: float = 8.
         step = next(steps)
         client.log_batch(run, [Metric(f"m{k}", 1.0, int(time.time() * 1000), step) for k in range(20)])
 
-    return rate([lambda run=run: log(run) for run in runs], seconds)  # type: ignore[misc]
+    return rate([lambda run=run: log(run) for run in runs])  # type: ignore[misc]
 
 
-def rate(calls: list[Callable[[], object]], seconds: float) -> float:
-    """Return how many calls a second are answered, each made repeatedly by a thread of its own."""
+def rate(calls: list[Callable[[], object]]) -> float:
+    """Return how many calls a second are answered in eight, each made repeatedly by a thread of its own."""
+    seconds = 8.0
     until = time.monotonic() + seconds
 
     def again(call: Callable[[], object]) -> int:

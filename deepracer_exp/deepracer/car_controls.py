@@ -38,18 +38,17 @@ def steering_share(steering_deg: ArrayLike, full_lock_deg: float) -> Floats:
     return steering_deg / full_lock_deg if full_lock_deg > 0 else np.zeros_like(steering_deg)
 
 
-def throttle(speed_mps: ArrayLike, full_throttle_mps: float, slider: float = 1.0) -> Floats:
+def throttle(speed_mps: ArrayLike, full_throttle_mps: float) -> Floats:
     """Return the throttle, 0 to 1: a parabola through 0, `HALF_SPEED_THROTTLE` at half speed and 1 at full speed.
 
     Args:
         speed_mps: of the actions, any shape.
         full_throttle_mps: of `full_scale`; with 0 the car stands.
-        slider: maximum speed of the car's console, 0 to 1, a factor.
     """
     speed_mps = np.asarray(speed_mps, np.float64)
     share = speed_mps / full_throttle_mps if full_throttle_mps > 0 else np.zeros_like(speed_mps)
     a, b = 2.0 - 4.0 * HALF_SPEED_THROTTLE, 4.0 * HALF_SPEED_THROTTLE - 1.0
-    curve: Floats = slider * np.clip((a * share + b) * share, -1.0, 1.0)
+    curve: Floats = np.clip((a * share + b) * share, -1.0, 1.0)
     return curve
 
 

@@ -45,9 +45,7 @@ class StoredModel(NamedTuple):
 
     tensors: Tensors
     source: str
-    """The file of the weights, for messages."""
-    name: str
-    """Of the checkpoint, `11_Step-38428.ckpt`, or of the frozen graph, which has only the policy."""
+    """The file of the weights, for messages; a frozen graph has only the policy."""
     files: Mapping[str, bytes]
     """Contents by their names in SMALL_FILES."""
     has_logs: bool
@@ -123,7 +121,7 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
         lacking = f": {min(weights)} has no {DATA} beside it" if weights else ""
         raise BadInput(f"{files.path}: holds no model{lacking}; accepted: {_ACCEPTED}")
     chosen, note = _choose(files, whole or graphs, checkpoint)
-    where, stem = f"{files.path}/{chosen}", PurePosixPath(chosen).name.removesuffix(INDEX)
+    where = f"{files.path}/{chosen}"
     tensors: Tensors
     if whole:
         entries = read_index(files.read(chosen, INDEX_BYTES), where)
@@ -134,7 +132,7 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
     found = {name: _nearest(files.sizes, name) for name in SMALL_FILES}
     small = {name: files.read(at, SETTINGS_BYTES) for name, at in found.items() if at is not None}
     has_logs = any(map(_LOGS.search, files.sizes))
-    return StoredModel(tensors, where, stem, small, has_logs, (note,) if note else ())
+    return StoredModel(tensors, where, small, has_logs, (note,) if note else ())
 
 
 def _nearest(names: Mapping[str, int], wanted: str) -> str | None:

@@ -487,9 +487,9 @@ def _entropy_stopping(stopping: Mapping[str, Any] | None) -> EntropyStopping | N
     return config if isinstance(config, EntropyStopping) else None
 
 
-def moving_average(values: NDArray[np.float64], over: int = 3) -> NDArray[np.float64]:
-    """Return for each value the mean of the known ones among the last `over`; NaN where the value itself is NaN."""
+def moving_average(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return for each value the mean of the known ones among the last three; NaN where the value itself is NaN."""
     import pandas as pd  # takes half a second, and only reports need it
 
     series = pd.Series(values, dtype=np.float64)
-    return series.rolling(over, min_periods=1).mean().where(series.notna()).to_numpy()
+    return series.rolling(3, min_periods=1).mean().where(series.notna()).to_numpy()

@@ -129,7 +129,8 @@ def test_an_archive_holds_what_the_folder_does(tmp_path, pack):
     assert {name: value.tolist() for name, value in model.tensors.items()} == {
         name: value.tolist() for name, value in tensors.items()
     }
-    assert (model.name, model.has_logs) == (NAME, True)
+    assert model.source.endswith(f"/{NAME}.index")
+    assert model.has_logs
     assert model.files["hyperparameters.json"] == SMALL["ip/hyperparameters.json"]
 
 
