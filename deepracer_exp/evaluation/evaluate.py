@@ -178,7 +178,7 @@ def evaluate_run(
     if video is not None:
         from .video import write_video  # imports MuJoCo's renderer
 
-        write_video(*video, recorder.lap(best_attempt(evaluation)), run.experiment.car, err)
+        write_video(*video, recorder.lap(best_attempt(evaluation)), evaluator.race.setup.car, err)
         out.print(f"  video    {video[0]}", soft_wrap=True, highlight=False)
         files[video[0]] = FILMS
     tracking = run.experiment.tracking

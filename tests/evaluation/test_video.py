@@ -13,21 +13,29 @@ drawable = os.environ.get("MUJOCO_GL") or any(map(ctypes.util.find_library, ("EG
 
 @pytest.mark.slow
 @pytest.mark.skipif(not drawable, reason="this machine has neither EGL nor OSMesa")
-@pytest.mark.parametrize("view", ["chase", "top"])
-def test_a_film_shows_the_car_on_its_way(trained, start, tmp_path, view):
-    folder = shutil.copytree(trained().folder, tmp_path / "run", symlinks=True)
+@pytest.mark.parametrize(
+    ("view", "sees", "given", "rate"),
+    [
+        ("chase", (), (), 15),
+        ("top", (), (), 15),
+        ("chase", ("observation=camera", "budget.env_steps=256"), ("evaluation=real_car",), 30),
+    ],
+)
+def test_a_film_shows_the_car_on_its_way(trained, start, tmp_path, view, sees, given, rate):
+    """As fast as it drove, also where it acts more often than in the simulator."""
+    folder = shutil.copytree(trained(*sees).folder, tmp_path / "run", symlinks=True)
     ended = start(
-        *("evaluate", str(folder), "evaluation.trials=1", "evaluation.time_s=2"),
+        *("evaluate", str(folder), *given, "evaluation.trials=1", "evaluation.time_s=2"),
         *("evaluation.held_out=null", "--video", "lap.mp4", "--view", view),
     ).end(300)
     assert ended.code == 0, ended.stderr
     frames = read_frames(str(tmp_path / "lap.mp4"))
     about = next(frames)
-    assert about["fps"] == 15
+    assert about["fps"] == rate
     width, height = about["size"]
     pictures = [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in frames]
     # Two seconds, or less where the car leaves the road, and the last picture a second more.
-    assert 16 <= len(pictures) <= 47
+    assert rate < len(pictures) <= 3 * rate + 2
     road = np.array(list(bytes.fromhex(read_config(folder)["track"]["floor"]["road_color"][1:])))
     seen = (np.abs(pictures[0] - road).max(axis=2) < 12).mean()
     assert seen > 0.02, "no road to be seen"
