@@ -227,25 +227,25 @@ Distortion = Annotated[float, Field(ge=-0.3, le=0.3, allow_inf_nan=False)]
 class PictureRandomizationConfig:
     """What pictures differ in: the lowest and highest value of each quantity, drawn for each episode of each car."""
 
-    brightness_scale: Range[Scale]
+    brightness_scale: Range[Scale] = (1.0, 1.0)
     """Factor on all values."""
-    contrast_scale: Range[Scale]
+    contrast_scale: Range[Scale] = (1.0, 1.0)
     """Factor on the distance of all values from the middle grey."""
-    gamma_scale: Range[Scale]
+    gamma_scale: Range[Scale] = (1.0, 1.0)
     """Exponent of all values, where white is 1: above 1 dark colours become darker."""
-    color_noise: Range[Fraction]
+    color_noise: Range[Fraction] = (0.0, 0.0)
     """Standard deviation of the factor on red, green and blue of each material."""
-    light: Range[Fraction]
+    light: Range[Fraction] = (0.0, 0.0)
     """How much darker a shadow in the picture is at its middle, or a spot of light brighter."""
-    blur: Range[Fraction]
+    blur: Range[Fraction] = (0.0, 0.0)
     """Share of a pixel that comes from its four neighbours."""
-    pixel_noise: Range[Fraction]
+    pixel_noise: Range[Fraction] = (0.0, 0.0)
     """Standard deviation of the Gaussian noise on each pixel at each step, as a fraction of white."""
-    height_m: Range[Height]
+    height_m: Range[Height] = (0.0, 0.0)
     """Added to the height of the camera."""
-    pitch_deg: Range[Offset]
+    pitch_deg: Range[Offset] = (0.0, 0.0)
     """Added to the pitch of the camera, downwards."""
-    field_of_view_scale: Range[Scale]
+    field_of_view_scale: Range[Scale] = (1.0, 1.0)
     """Factor on the tangent of half the field of view."""
     dirt: Range[Fraction] = (0.0, 0.0)
     """How much darker spots of dirt on the lens are at their middle."""
