@@ -1,6 +1,8 @@
 """The server of a live page: one page and its version, for this machine only."""
 
+import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 from deepracer_exp.errors import BadInput
 
@@ -30,6 +32,11 @@ class LiveServer(ThreadingHTTPServer):
             raise BadInput(
                 f"--port {port}: {reason} on {HOST}; accepted: a free port, or no --port for any"
             ) from None
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Show the traceback of a bug, but nothing where a browser left before it had the page."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:

@@ -4,6 +4,8 @@ import http.client
 import io
 import itertools
 import shutil
+import socket
+import struct
 import threading
 
 import numpy as np
@@ -185,6 +187,16 @@ def test_the_live_page_is_served_to_this_machine_alone():
         with pytest.raises(BadInput, match=f"--port {server.server_port}: .*in use"):
             LiveServer(server.server_port)
         server.shutdown()
+
+
+def test_a_browser_that_leaves_before_it_has_the_page_is_no_error(capfd):
+    with LiveServer(0) as server:
+        server.shown = ("1", "laps " * 2_000_000)
+        with socket.create_connection(server.server_address) as browser:
+            browser.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset at once
+        server.process_request_thread(*server.get_request())
+    assert capfd.readouterr().err == ""
 
 
 def test_the_film_is_put_into_the_folder_of_the_run(run_dir, call):
