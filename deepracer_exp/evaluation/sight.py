@@ -84,7 +84,7 @@ def _decision(out: TensorDict, acted: TensorDict) -> Tensor:
 @cache
 def _masks(height: int, width: int) -> NDArray[np.float32]:
     """Return a bump at each place of a grid over the picture, (places, height, width)."""
-    sizes = (round(SPACING * height / width), SPACING)
+    sizes = (max(1, round(SPACING * height / width)), SPACING)
     y, x = (
         (np.arange(count) + 0.5) / count * size for count, size in zip(sizes, (height, width), strict=True)
     )

@@ -7,6 +7,7 @@ import shutil
 import socket
 import struct
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +78,14 @@ def test_a_network_that_reads_the_left_half_of_any_picture_looks_there(frame):
     assert heat[:, 54:].max() < 0.01
     other = Reader(frame, slice(None), slice(40, 80))
     assert saliency(other, step(MONO, other), MONO)[:, :26].max() < 0.01
+
+
+def test_of_a_picture_much_wider_than_high_some_place_counts_most():
+    camera = replace(MONO, width=640, height=16)
+    policy = Reader(1, slice(None), slice(None))
+    heat = saliency(policy, step(camera, policy), camera)
+    assert heat.shape == (16, 640)
+    assert heat.max() == 1
 
 
 def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
