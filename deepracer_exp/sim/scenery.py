@@ -113,10 +113,12 @@ def build_scenery(track: Track) -> Scenery:
                 drawing.add([some], inside, outside, far_m=CURVES_UNTIL_M)
                 coarse = shapely.get_coordinates(shapely.LineString(some).simplify(COARSE_M))
                 drawing.add([coarse], inside, outside, near_m=CURVES_UNTIL_M)
-    dashes = list(_dashes(track.waypoints, DASH_WIDTH_M, floor.dash_length_m, floor.dash_gap_m))
+    # In the published direction: what lies on the floor does not depend on how the track is driven.
+    center = track.waypoints[::-1] if track.reversed else track.waypoints
+    dashes = list(_dashes(center, DASH_WIDTH_M, floor.dash_length_m, floor.dash_gap_m))
     runs = [dashes]
     if floor.start_line_color is not None:
-        start, dark = _start_line(track, plain)
+        start, dark = _start_line(center, plain)
         drawing.add(list(_rings(start)), LINE, ROAD, far_m=CURVES_UNTIL_M)
         drawing.add(list(_rings(dark)), START, LINE, far_m=CURVES_UNTIL_M)
         drawing.add(list(_rings(start)), FAR_START, ROAD, near_m=CURVES_UNTIL_M)
@@ -258,9 +260,8 @@ def _dashes(
         )
 
 
-def _start_line(track: Track, road: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
+def _start_line(center: NDArray[np.float64], road: BaseGeometry) -> tuple[BaseGeometry, BaseGeometry]:
     """Return the area of the start line and of its dark fields, as far as they lie on `road`."""
-    center = track.waypoints[::-1] if track.reversed else track.waypoints
     ahead = (center[1] - center[0]) / np.linalg.norm(center[1] - center[0])
     left = np.array([-ahead[1], ahead[0]])
     along, across = START_CHECKS

@@ -213,6 +213,24 @@ def test_curves_lose_points_only_where_pixels_are_large():
     assert CURVES_UNTIL_M > DASHES_UNTIL_M
 
 
+def test_a_track_looks_the_same_to_cars_that_drive_it_the_other_way():
+    tracks = [replace(world_track("Spain_track", reversed=way), floor=RACEWAY) for way in (False, True)]
+    poses = np.concatenate([pose_on(tracks[0], ndist, 0.1, (0.2, 0.0, 0.0)) for ndist in (0.985, 0.3)])
+    colors = np.broadcast_to(SHARES, (2, *SHARES.shape))
+    forward, backward = (
+        take_pictures(
+            LENS,
+            build_scenery(track),
+            poses,
+            np.zeros(2, np.intp),
+            colors,
+            np.empty((2, len(MATERIALS), LENS.height, LENS.width), np.uint8),
+        ).astype(int)
+        for track in tracks
+    )
+    assert np.abs(forward - backward).max() <= 1
+
+
 @pytest.mark.parametrize(("ndist", "angle"), [(0.985, 0.0), (0.3, 0.4)])
 def test_a_raceway_has_lines_outside_its_border_kerbs_a_start_line_and_a_barrier(ndist, angle):
     track = replace(world_track("Spain_track"), floor=RACEWAY)
