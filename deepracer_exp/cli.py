@@ -66,7 +66,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     refuse_old_spellings(given)
     args, rest = parser.parse_known_args(runs.with_default_action(given))
     if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+        raise BadInput(f"unrecognized arguments: {' '.join(rest)}; see `{args.prog} --help`")
     if rest:  # argparse accepts no positional arguments after an option between them
         args.overrides += rest
     return args

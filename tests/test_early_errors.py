@@ -17,7 +17,8 @@ from deepracer_exp.tracking.tracking_file import TrackedRun
 HEAVY = ("torch", "mujoco", "mlflow", "optuna", "pandas")
 CASES = {
     ("tarin",): "did you mean train?",
-    ("train", "--fats"): "unrecognized arguments: --fats",
+    ("train", "--fats"): "unrecognized arguments: --fats; see `deepracer-exp train --help`",
+    ("runs", "clean", "--aply"): "see `deepracer-exp runs clean --help`",
     ("train", "seed=now"): "seed",
     ("train", "track=../../x"): "track=../../x",
     ("train", "reward.file=pipe"): "pipe: is a pipe",

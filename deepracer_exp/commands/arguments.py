@@ -61,7 +61,7 @@ def add_command(
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter if epilog else argparse.HelpFormatter,
     )
-    parser.set_defaults(command=call, **defaults)
+    parser.set_defaults(command=call, prog=parser.prog, **defaults)
     return parser
 
 
@@ -70,7 +70,6 @@ def add_run(parser: argparse.ArgumentParser, overrides: str | None = "KEY=VALUE"
     run = parser.add_argument("runs", nargs="*" if many else "?", metavar="RUN", help=RUN)
     run.completer = complete_runs  # type: ignore[attr-defined]
     add_overrides(parser, overrides, complete_runs)
-    parser.set_defaults(prog=parser.prog)
 
 
 def add_overrides(
