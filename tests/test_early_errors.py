@@ -51,7 +51,7 @@ CASES = {
     ): "--output nowhere/lap.mp4: accepted: an .mp4 in an existing",
     ("watch", "runs/a/run", "--port", "8000"): "--port 8000: accepted: only with --live",
     ("watch", "runs/a/run", "--live", "checkpoint=best"): "checkpoint=best: --live",
-    ("watch", "runs/a/run", "--live", "--port", "70000"): "--port 70000: ",
+    ("watch", "runs/a/run", "--live", "--port", "70000"): "--port: 70000: accepted: 1 to 65535",
     ("watch", "runs/a/own", "--live"): "network.target=my_network:Net: named by a stored run",
     ("resume", "unknown"): "unknown: no such run",
     ("resume", "~no_such_user"): "~no_such_user",
@@ -125,7 +125,8 @@ CASES = {
     ("sweep", "best", "unknown"): "sweeps.db",
     ("sweep", "best", "unknown", "seed=1"): "seed=1: no such key",
     ("sweep", "best", "../x"): "../x",
-    ("ui", "--port", "http"): "--port",
+    ("ui", "--port", "http"): "--port: http: accepted: 1 to 65535",
+    ("ui", "--port", "65536"): "--port: 65536: accepted: 1 to 65535",
     # Spellings of before.
     ("evaluate", "run=x"): "run=x: write deepracer-exp evaluate x",
     ("evaluate", "run=x", "--video", "lap.mp4"): "run=x: write deepracer-exp evaluate x",

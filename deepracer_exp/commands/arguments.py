@@ -82,6 +82,17 @@ def add_overrides(
     action.completer = completer or complete_overrides  # type: ignore[attr-defined]
 
 
+def port(given: str) -> int:
+    """Return the value of `--port`.
+
+    Raises:
+        ArgumentTypeError: it is no port.
+    """
+    if not given.isdecimal() or not 0 < int(given) < 65536:
+        raise argparse.ArgumentTypeError(f"{given}: accepted: 1 to 65535")
+    return int(given)
+
+
 def runs_and_overrides(args: argparse.Namespace) -> tuple[list[str], list[str]]:
     """Return the runs of a command line and its overrides, in whatever order they were given.
 

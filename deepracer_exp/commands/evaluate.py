@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
 
-from .arguments import add_command, add_run, run_and_overrides, runs_and_overrides, split_stores
+from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides, split_stores
 from .output import table_console, warnings_on_stderr
 from .startup import check_policy
 
@@ -71,7 +71,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         *("-o", "--output"), metavar="FILE", help="film to write (.mp4; default: films/ in the run's folder)"
     )
     parser.add_argument("--live", action="store_true", help="serve a page that follows the training")
-    parser.add_argument("--port", type=int, help="port of the page (default: a free one)")
+    parser.add_argument("--port", type=port, help="port of the page (default: a free one)")
 
     parser = add_command(
         commands,

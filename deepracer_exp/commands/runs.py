@@ -19,6 +19,7 @@ from .arguments import (
     add_overrides,
     add_run,
     is_override,
+    port,
     read_stores,
     run_and_overrides,
     runs_and_overrides,
@@ -142,7 +143,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Serve the MLflow pages of the project's runs on 127.0.0.1 until Ctrl-C.",
     )
     add_overrides(ui, "runs_dir=DIR | tracking.uri=URI")
-    ui.add_argument("--port", type=int, default=5000)
+    ui.add_argument("--port", type=port, default=5000)
 
 
 def with_default_action(arguments: list[str]) -> list[str]:

@@ -22,13 +22,13 @@ class LiveServer(ThreadingHTTPServer):
         """Open a port, 0: a free one.
 
         Raises:
-            BadInput: the port is in use or invalid.
+            BadInput: the port is in use.
         """
         self.shown = ("0", "")
         try:
             super().__init__((HOST, port), _Answer)
-        except (OSError, OverflowError) as error:
-            reason = str(getattr(error, "strerror", None) or error).lower()
+        except OSError as error:
+            reason = str(error.strerror or error).lower()
             raise BadInput(
                 f"--port {port}: {reason} on {HOST}; accepted: a free port, or no --port for any"
             ) from None
