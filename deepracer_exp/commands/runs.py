@@ -10,7 +10,7 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import TYPE_CHECKING, Any
 
-from deepracer_exp.errors import BadInput, reading, writing
+from deepracer_exp.errors import BadInput, count, reading, writing
 from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY, run_folders
 
 from .arguments import (
@@ -234,7 +234,9 @@ def _compare(args: argparse.Namespace) -> int:
             others = "deepracer-exp compare RUN LOGS compares a run with logs of the service"
             raise BadInput(f"{run}: is no run; accepted: runs; {others}") from None
     if not 2 <= len(folders) <= len(ascii_uppercase):
-        raise BadInput(f"{len(folders)} runs given; accepted: 2 to {len(ascii_uppercase)} different ones")
+        raise BadInput(
+            f"{count(len(folders), 'run')} given; accepted: 2 to {len(ascii_uppercase)} different ones"
+        )
     records = [read_record(folder) for folder in folders]
     for record in records:
         if not record.rows:

@@ -153,8 +153,8 @@ def test_the_command_shows_differences_and_results_and_writes_the_page_it_is_ask
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["first"], "1 runs given; accepted: 2 to 26"),
-        (["first", "runs/e/first"], "1 runs given"),
+        (["first"], "1 run given; accepted: 2 to 26"),
+        (["first", "runs/e/first"], "1 run given"),
         (["first", "third"], "third: no such run"),
         (["first", "second", "-o", "nowhere/out.html"], "--output nowhere/out.html: cannot be written"),
     ],
