@@ -62,6 +62,12 @@ CASES = {
     ("resume", "recorded/a/stopped"): "has ended (stopped early: converged); stopping=none resumes it anyway",
     ("clone", "unknown"): "unknown: no such run",
     ("clone", "runs/a/run", "checkpoint=120"): "checkpoint=120",
+    (
+        "clone",
+        "alone",
+        "network=mlp",
+    ): "network: cannot be changed in a clone: hidden: [64, 64] -> [128, 128]",
+    ("clone", "alone", "action_space=continuous"): "action_space: cannot be changed in a clone",
     ("clone", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
     ("checkpoints", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
     ("checkpoints", "unknown"): "unknown: no such run",

@@ -226,17 +226,19 @@ cannot be changed. `deepracer-exp runs lineage RUN` draws the family tree.
 
 def _clone(args: argparse.Namespace) -> int:
     from deepracer_exp.config.parse import import_own_classes
+    from deepracer_exp.runs.lineage import refuse_other_networks
 
     run, given = run_and_overrides(args)
     checkpoints = [one.partition("=")[2] for one in given if one.startswith("checkpoint=")]
     changes = [one for one in given if not one.startswith("checkpoint=")]
     stores, _ = split_stores(given)
-    parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None).path
-    experiment = check_changes(parent, changes)
+    parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None)
+    experiment = check_changes(parent.path, changes)
     import_own_classes(experiment)
     check_files(experiment)
+    refuse_other_networks(parent.experiment, experiment)
     print_start()
-    start_workers_early(has_workers(parent))
+    start_workers_early(has_workers(parent.path))
 
     from rich.console import Console
 

@@ -7,7 +7,9 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, TypeAdapter
 
-from deepracer_exp.config.stored import ABSENT, config_differences
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.stored import ABSENT, config_differences, describe_differences
+from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_json_as
 
@@ -50,6 +52,38 @@ def read_lineage(run: Path) -> Lineage | None:
         BadInput: the file cannot be read or holds something else.
     """
     return read_json_as(run / LINEAGE, _ADAPTER, "a clone")
+
+
+def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
+    """Refuse a clone for which the parent's networks were not made.
+
+    Raises:
+        BadInput: networks, sensors, features or actions differ.
+    """
+    why = "the parent's networks were made for it; train a new run for another"
+    if clone.network != parent.network:
+        changed = "; ".join(
+            describe_differences(config_differences([vars(parent.network), vars(clone.network)]))
+        )
+        raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
+    before, after = (
+        {name: sensor and vars(sensor) for name, sensor in (("camera", seen.camera), ("lidar", seen.lidar))}
+        for seen in (parent.observation, clone.observation)
+    )
+    if before != after:
+        changed = "; ".join(describe_differences(config_differences([before, after])))
+        raise BadInput(f"observation: cannot be changed in a clone: {changed}; {why}")
+    if clone.observation != parent.observation:
+        from deepracer_exp.env.observation import feature_names  # imports MuJoCo
+
+        ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
+        odd = ", ".join(sorted(set(ours) ^ set(theirs))) or "the order, or what is looked ahead"
+        raise BadInput(
+            f"observation: cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}"
+        )
+    acted, acts = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
+    if acted != acts:
+        raise BadInput(f"action_space: cannot be changed in a clone: {acted} -> {acts}; {why}")
 
 
 @dataclass

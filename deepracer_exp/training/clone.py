@@ -10,14 +10,12 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.evaluation import checked_checkpoint_name
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.config.stored import config_differences, describe_differences, with_overrides
-from deepracer_exp.env.action_space import build_action_space, describe_actions
-from deepracer_exp.env.observation import feature_names
+from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, read_config, read_object, read_run_id
-from deepracer_exp.runs.lineage import Lineage, read_lineage
+from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
 from deepracer_exp.runs.resolve import StoredRun, resolve
 
 SLOWER = 0.1
@@ -63,7 +61,7 @@ def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | 
     stored = read_checkpoint(parent.experiment, parent.path / CHECKPOINTS, name)
     composition = _changed(parent, changes)
     experiment = parse_experiment(composition.mapping)
-    _refuse_other_networks(parent.experiment, experiment)
+    refuse_other_networks(parent.experiment, experiment)
     above = read_lineage(parent.path)
     lineage = Lineage(
         parent=parent.path.name,
@@ -96,32 +94,6 @@ def _changed(parent: StoredRun, changes: Sequence[str]) -> Composition:
         composition.mapping["teacher"] = None
         composition.mapping["algorithm"]["teacher_iterations"] = 0
     return composition
-
-
-def _refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
-    """Refuse what the parent's networks were not made for."""
-    why = "the parent's networks were made for it; train a new run for another"
-    if clone.network != parent.network:
-        changed = "; ".join(
-            describe_differences(config_differences([vars(parent.network), vars(clone.network)]))
-        )
-        raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
-    ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
-    before, after = (
-        {name: sensor and vars(sensor) for name, sensor in (("camera", seen.camera), ("lidar", seen.lidar))}
-        for seen in (parent.observation, clone.observation)
-    )
-    if before != after:
-        changed = "; ".join(describe_differences(config_differences([before, after])))
-        raise BadInput(f"observation: cannot be changed in a clone: {changed}; {why}")
-    if clone.observation != parent.observation:
-        odd = ", ".join(sorted(set(ours) ^ set(theirs))) or "the order, or what is looked ahead"
-        raise BadInput(
-            f"observation: cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}"
-        )
-    acted, acts = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
-    if acted != acts:
-        raise BadInput(f"action_space: cannot be changed in a clone: {acted} -> {acts}; {why}")
 
 
 def _notes(parent: StoredRun, clone: Experiment, checkpoint: str) -> list[str]:
