@@ -294,11 +294,14 @@ def _sweep(args: argparse.Namespace) -> int:
     request = compose_sweep(args.overrides)
     args.debug = request.entry.debug
     check_sweep(request)
-    if args.cfg:
-        if not request.space:  # an existing study has its own
-            from sweeps.study import load_request
+    if not request.space:  # an existing study has its own
+        from sweeps.space import SearchSpace
+        from sweeps.study import load_request
 
-            _, request, _ = load_request(args.overrides)
+        _, request, study = load_request(args.overrides)
+        if study is None and not args.cfg:
+            SearchSpace.from_request(request)  # refuses a sweep with nothing to search
+    if args.cfg:
         # The overrides of the training are shown where a ready-made sweep has them.
         request.composition.mapping["sweep"] |= {"train": list(request.base), "space": dict(request.space)}
         print(request.composition.yaml(), end="")

@@ -47,6 +47,12 @@ def test_an_impossible_sweep_is_refused_before_anything_is_created(call, overrid
     assert not list(ended.cwd.glob("runs/**/*")), "something was made"
 
 
+def test_a_study_that_is_not_there_is_refused_before_the_sweep_starts(call):
+    ended = call("sweep", "study=unknown")
+    ended.assert_bad_input("nothing to search")
+    assert "starting" not in ended.stderr
+
+
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory, run_at):
     """Return a folder in which a study of two trials was made."""
