@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from deepracer_exp.config.running import TrackingConfig
     from deepracer_exp.training.trainer import TrainResult
 
-_FILES = {REPORT: "findings and figures", BEST_LAP: "the fastest lap", LEARNING: "the learning curves"}
+_FILES = {
+    REPORT: "findings and figures",
+    BEST_LAP: "the fastest lap, or the longest attempt",
+    LEARNING: "the learning curves",
+}
 
 
 def table_console(piped_width: int = 200) -> "Console":
