@@ -7,6 +7,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from deepracer_exp.commands.arguments import runs_and_overrides
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment, compose_export, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.validation.check import read
+from deepracer_exp.validation.pitfalls import action_space_laps, pays_for_slowness
 from tests.test_own_classes import write_examples
 
 ROOT = Path(__file__).parents[1]
@@ -155,6 +158,21 @@ def test_the_example_of_a_batched_reward_pays_what_the_scalar_one_pays(folder):
         module["reward_function"]({key: column[car] for key, column in batch.items()}) for car in range(2)
     ]
     assert module["reward_batch"](batch).tolist() == each
+
+
+def test_the_tutorial_quotes_what_validate_says_of_its_reward_function(tmp_path):
+    page = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    code = re.search(r"^Save this as `my_reward.py`.*\n\n((?:    .*\n|\n)+)", page, re.MULTILINE)
+    file = tmp_path / "my_reward.py"
+    file.write_text(textwrap.dedent(code.group(1)), encoding="utf-8")
+    mended = re.search(r"validate reward\.file=my_reward\.py (reward\.constants\.\S+)", page).group(1)
+    setup, better = (
+        read(compose_experiment([f"reward.file={file}", *more])[0]).setup for more in ((), (mended,))
+    )
+    laps = action_space_laps(setup)
+    (warning,) = pays_for_slowness(setup, laps)
+    assert warning.partition(": ")[2] in page
+    assert not list(pays_for_slowness(better, laps))
 
 
 def _imports():
