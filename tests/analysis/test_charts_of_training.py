@@ -152,9 +152,12 @@ def test_bars_of_rewards_count_every_episode_once_and_every_step_by_its_share(vi
     assert [layer.y.sum() for layer in bars] == [(~complete).sum(), complete.sum()]
     steps = view.recording.steps.copy()
     steps["reward"] = np.where(np.arange(len(steps)) % 4, 1.0, 0.25)
+    steps.loc[steps["episode_status"] == "prepare", "reward"] = 0.0  # not paid by the reward function
     chart = common_rewards(prepare(replace(view.recording, steps=steps)))
     assert chart.rows[0][0].x_names == ["0.25", "1"]
     np.testing.assert_allclose(layers(chart, "bars")[0].y, [25.0, 75.0], atol=0.1)
+    caption = reward_distribution(prepare(replace(view.recording, steps=steps))).caption
+    assert caption.startswith("Half of the steps earn at least 1, one in ten at least 1.")
 
 
 def test_the_weight_of_a_reward_halves_where_the_caption_says() -> None:

@@ -167,7 +167,7 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
 
 def reward_distribution(view: LogView) -> Chart | None:
     """Draw how rewards are distributed over steps and over episodes."""
-    rewards = view.steps["reward"].dropna().to_numpy(np.float64)
+    rewards = view.driven("reward")["reward"].dropna().to_numpy(np.float64)
     episodes = view.episodes[view.episodes["ended"]]
     if not len(rewards) or not len(episodes):
         return None
@@ -188,7 +188,7 @@ def reward_distribution(view: LogView) -> Chart | None:
     return Chart(
         name="reward_distribution",
         title="Rewards of steps and of episodes",
-        caption=f"Half of the steps earn more than {np.median(rewards):.3g}, one in ten more than "
+        caption=f"Half of the steps earn at least {np.median(rewards):.3g}, one in ten at least "
         f"{np.percentile(rewards, 90):.3g}. If complete laps do not clearly earn more than other episodes, the reward "
         f"does not ask for laps.{left_out}",
         rows=[
@@ -202,7 +202,7 @@ def reward_distribution(view: LogView) -> Chart | None:
 
 def common_rewards(view: LogView) -> Chart | None:
     """Draw the rewards that steps earn most often."""
-    counts = view.steps["reward"].dropna().round(4).value_counts()
+    counts = view.driven("reward")["reward"].dropna().round(4).value_counts()
     if not len(counts):
         return None
     common = counts.head(_COMMON).sort_index()
