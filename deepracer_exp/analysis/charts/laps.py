@@ -130,7 +130,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     # The laps of an iteration may be in metrics files only.
     times_s = np.concatenate([shown["lap_time_s"], y])
     low, high = float(times_s.min()), max(float(np.percentile(times_s, 99)), float(y.max()))
-    rim = 0.06 * max(high - low, 0.1)
+    rim = max(0.06 * (high - low), 0.1)
     y_range = (low - rim, high + rim)
     return Chart(
         name="lap_time_percentile",
