@@ -199,7 +199,7 @@ def _submit(view: LogView) -> Finding:
         farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
         sentence = (
             f"Nothing to submit yet: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
-            f"all); the farthest episode drove {farthest['progress']:.0f} % of the lap in iteration "
+            f"all); the farthest episode drove {math.floor(farthest['progress'])} % of the lap in iteration "
             f"{farthest['iteration']}."
         )
         values = {"laps": laps, "progress": float(farthest["progress"])}
@@ -296,10 +296,7 @@ def _crashes(view: LogView) -> Finding | None:
     x_m, y_m = here[["X", "Y"]].median()
     where = ", at no place often."
     if len(here) >= off_track.LEAST:
-        where = (
-            f", {len(here)} times at one place: waypoint {waypoint} (x {x_m:.2f} m, y {y_m:.2f} m), where an "
-            "object is."
-        )
+        where = f", {len(here)} times at one place: waypoint {waypoint} (x {x_m:.2f} m, y {y_m:.2f} m)."
     return Finding(
         "crashes",
         f"The car crashed in {crashed} of {count(len(episodes), 'episode')}{view.traced}{where}",

@@ -119,6 +119,11 @@ def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_su
     )
 
 
+def test_an_episode_just_short_of_the_lap_has_not_driven_all_of_it() -> None:
+    view = prepare(made_up_recording([Drive(until=0.998)]))
+    assert "(0 laps in all); the farthest episode drove 99 % of the lap" in of(view, "submit").sentence
+
+
 def test_laps_that_are_in_metrics_files_only_can_be_submitted() -> None:
     recording = laps_of((0, 5, 2.0)).recording
     known = {
@@ -241,6 +246,7 @@ def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
     view = prepare(replace(recording, steps=recording.steps.assign(episode_status=status.astype("category"))))
     found = of(view, "crashes")
     assert found.sentence.startswith("The car crashed in 8 of 14 episodes, 6 times at one place: waypoint 3")
+    assert found.sentence.endswith(" m).")
     assert headline(view).split("; ")[0].endswith("14 finished episodes and 1 iteration")
     assert of(view, "chance").values["complete"] == 6 / 14
     assert "crashes" not in [one.rule for one in findings(off_at((35, 6, False)))]
