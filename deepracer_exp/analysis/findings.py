@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.spatial import KDTree
 from scipy.stats import norm
 
@@ -15,16 +14,12 @@ from deepracer_exp.runs.convergence import POOR, convergence, convergence_rule, 
 from deepracer_exp.runs.result import RunResult
 
 from . import off_track
-from .log_view import LogView
+from .log_view import LEAST_LAPS, LogView
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
-from .sectors import Sector, sector_at, sectors_of, times_by_sector
+from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .statistics import wilson
 from .tables import CANDIDATE_LAPS, DENSE, evaluated_candidates
 
-LATE_SHARE = 1 / 3
-"""Share of the iterations, the last ones, that show how the car drives now."""
-LEAST_LAPS = 5
-"""Complete laps in them below which all laps of the log are used, and below which no chances are given."""
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""
 MOST_LOST = 3
@@ -68,19 +63,6 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
         found += [_converged(view), _submit(view)]
     found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view), _overfits(view)]
     return [one for one in found if one is not None]
-
-
-def _now(view: LogView, least_laps: int = 0) -> tuple[pd.DataFrame, str]:
-    """Return the finished episodes that show how the car drives now, and which they are."""
-    ended = view.episodes[view.episodes["ended"]]
-    if not view.trained:
-        return ended, "in the evaluations"
-    iterations = np.unique(view.episodes["iteration"])
-    begin = iterations[-math.ceil(LATE_SHARE * len(iterations))]
-    late = ended[ended["iteration"] >= begin]
-    if late["lap_time_s"].notna().sum() < least_laps:
-        return ended, "in the traces" if view.untraced else "in the training"
-    return late, f"since iteration {begin}{' of the traces' if view.untraced else ''}"
 
 
 def _converged(view: LogView) -> Finding:
@@ -217,7 +199,7 @@ def _checkpoint(name: str, did: str) -> str:
 
 def _chance(view: LogView, target_s: float | None) -> Finding | None:
     """Say how likely a lap within a target is: measured, and by a normal distribution of the same laps."""
-    episodes, when = _now(view, LEAST_LAPS)
+    episodes, when = view.now(LEAST_LAPS)
     laps_s = episodes["lap_time_s"].dropna().to_numpy(np.float64)
     laps = len(laps_s)
     if not laps:
@@ -251,11 +233,10 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
 def _time_lost(view: LogView) -> Finding | None:
     if view.course is None:
         return None
-    episodes, when = _now(view, LEAST_LAPS)
-    sectors = {part.name: part for part in sectors_of(view.course)}
-    times = times_by_sector(view.steps[view.steps["episode"].isin(episodes["episode"])], [*sectors.values()])
-    if len(times) < 2 or len(sectors) < 2:
+    parts, times, when = sectors_now(view, view.course)
+    if len(times) < 2 or len(parts) < 2:
         return None
+    sectors = {part.name: part for part in parts}
     lost = (times.median() - times.min()).sort_values(ascending=False, kind="stable").head(MOST_LOST)
     lost = lost[lost >= WORTH_S]
     best_s, possible_s = float(times.sum(axis=1).min()), float(times.min().sum())
@@ -268,9 +249,13 @@ def _time_lost(view: LogView) -> Finding | None:
         if places
         else "No sector loses time to its best"
     )
+    starts = view.episodes.loc[times.index, "start_at"]
+    begun = np.searchsorted([part.first_waypoint for part in parts], starts, side="right")
+    # Where laps begin in different sectors, the best time of each is that of a car at speed.
+    standing = " without a standing start" if len(set(begun)) > 1 else ""
     sentence = (
-        f"The best sectors of {count(len(times), 'lap')} {when} add up to {possible_s:.2f} s; the fastest lap took "
-        f"{best_s:.2f} s. {where}."
+        f"The best sectors of {count(len(times), 'lap')} {when} add up to {possible_s:.2f} s{standing}; the fastest "
+        f"of them took {best_s:.2f} s. {where}."
     )
     if len(times) < LEAST_LAPS:
         sentence += f" From {len(times)} laps this is a hint at most."
@@ -306,7 +291,7 @@ def _crashes(view: LogView) -> Finding | None:
 
 
 def _runs_off(view: LogView) -> list[Finding]:
-    late, when = _now(view)
+    late, when = view.now()
     steps = view.steps[view.steps["episode"].isin(late["episode"])]
     thresholds = {"least": off_track.LEAST, "place_m": off_track.PLACE_M}
     places = off_track_places(steps)

@@ -19,6 +19,8 @@ DISCOUNT = Hyperparameters().discount_factor
 """For logs without hyperparameters: the service's default."""
 PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
+LEAST_LAPS = 5
+"""Complete laps in the last third of the iterations below which those of the whole log show how the car drives."""
 STARTING_STEPS = 10
 """First control steps of an episode, in which the car pulls away from standing."""
 
@@ -98,6 +100,21 @@ class LogView:
     def recent(self, *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the last third of the iterations: of the policy as it is now."""
         return self._select(self.is_driven & (thirds(self.steps["iteration"].to_numpy()) == 2), columns)
+
+    def now(self, least_laps: int = 0) -> tuple[pd.DataFrame, str]:
+        """Return the finished episodes that show how the car drives now, and which they are.
+
+        They are those of the last third of the iterations, or of all if that has fewer than `least_laps` complete laps.
+        """
+        ended = self.episodes["ended"].to_numpy(bool)
+        if not self.trained:
+            return self.episodes[ended], "in the evaluations"
+        third = thirds(self.episodes["iteration"].to_numpy()) == 2
+        late = self.episodes[ended & third]
+        if late["lap_time_s"].notna().sum() < least_laps:
+            return self.episodes[ended], "in the traces" if self.untraced else "in the training"
+        begin = self.episodes["iteration"][third].min()
+        return late, f"since iteration {begin}{' of the traces' * bool(self.untraced)}"
 
     def of_episodes(self, wanted: NDArray[np.bool_], *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the wanted episodes, (n,) in the order of `episodes`."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from deepracer_exp.tracks.track import Track
 
 from .log_course import waypoint_positions
+from .log_view import LEAST_LAPS, LogView
 from .statistics import Values
 from .tables import first_rows, whole_from_start
 
@@ -139,6 +140,14 @@ def times_by_sector(steps: pd.DataFrame, sectors: Sequence[Sector]) -> pd.DataFr
     bounds = np.array([0.0, *(part.end for part in sectors)])
     times = interval_times(steps, bounds).set_axis([part.name for part in sectors], axis=1)
     return times[np.isfinite(times).all(axis=1)]
+
+
+def sectors_now(view: LogView, course: Track) -> tuple[list[Sector], pd.DataFrame, str]:
+    """Return the sectors, `times_by_sector` of the laps that show how the car drives now, and which laps they are."""
+    episodes, when = view.now(LEAST_LAPS)
+    sectors = sectors_of(course)
+    times = times_by_sector(view.steps, sectors)
+    return sectors, times[times.index.isin(episodes.index)], when
 
 
 def time_lost(steps: pd.DataFrame, lap: int, other: int) -> pd.DataFrame:

@@ -27,6 +27,7 @@ from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.charts.maps import Grid
 from deepracer_exp.analysis.charts.mistakes import episode_ends_map, off_track_risk, visits_map
 from deepracer_exp.analysis.charts.rewards import reward_by_waypoint, reward_map, reward_terms, value_map
+from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import risk_counts
 from deepracer_exp.analysis.racing_line import MARGIN_M, center_line, minimum_curvature_line
@@ -117,6 +118,29 @@ def test_risk_counts_add_up_to_the_episodes_that_left_the_road(view: LogView) ->
         assert (left <= passes).all()
 
 
+def test_the_figures_show_the_risk_and_the_sectors_of_the_findings() -> None:
+    early = [Drive(speed_mps=2.0, iteration=k) for k in range(4)]
+    late = [Drive(speed_mps=1.4 + 0.1 * k, iteration=5, start=0.3 * (k % 2)) for k in range(6)]
+    view = prepare(made_up_recording([*early, *late, *[Drive(off_at=34 + k, iteration=5) for k in range(4)]]))
+    found = {one.rule: one for one in findings(view)}
+    high = next(one.y for one in layers(off_track_risk(view), "line") if one.name.startswith("last third"))
+    assert high.max() == pytest.approx(40.0)
+    assert "(4 of 10 passes" in found["runs_off"].sentence
+    best_s = view.episodes["lap_time_s"][4:].min()
+    assert (
+        f"s without a standing start; the fastest of them took {best_s:.2f} s" in found["time_lost"].sentence
+    )
+    chart = sector_times(view)
+    assert "6 complete laps since iteration 5." in chart.caption
+    assert f"add up to {found['time_lost'].values['theoretical_best_s']:.3f} s" in chart.title
+
+
+def test_tyres_that_hardly_slip_are_dark(view: LogView) -> None:
+    (cells,) = layers(slide_map(view), "cells")
+    assert np.nanpercentile(cells.z, 90) < 2.0
+    assert cells.zmax >= 5.0
+
+
 def test_an_episode_passes_the_waypoints_from_its_start_to_its_end(view: LogView) -> None:
     n = view.waypoint_count
     far = view.episodes["last_waypoint"].between(78, 82) & ~view.episodes["complete"]
@@ -166,7 +190,7 @@ def test_the_fastest_lap_is_drawn_and_its_sectors_make_its_time(view: LogView) -
     assert f"{best_s:.3f} s" in chart.title
     assert len(layers(chart, "points")[0].x) == pytest.approx(15 * best_s, abs=2)
     chart = sector_times(view)
-    assert chart.title.endswith(f"the fastest lap took {best_s:.3f} s")
+    assert chart.title.endswith(f"the fastest of these laps took {best_s:.3f} s")
     assert (layers(chart, "bars")[0].y >= -1e-6).all()
 
 

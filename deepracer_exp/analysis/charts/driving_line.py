@@ -6,17 +6,19 @@ import pandas as pd
 from deepracer_exp.analysis.log_course import waypoint_positions
 from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_waypoints
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
-from deepracer_exp.analysis.sectors import sectors_of, times_by_sector
+from deepracer_exp.analysis.sectors import sectors_now
 from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
 from deepracer_exp.errors import count
 
-from .figure import Chart, Layer, Panel, band, bars, colored_points, line, note, points
+from .figure import Chart, Layer, Panel, band, bars, color_range, colored_points, line, note, points
 from .maps import LEAST_STEPS, Grid, beside, map_panel, waypoint_panel
 from .style import BLUE, CATEGORIES, INK, ORANGE, PALE, VERMILION
 
 GRIP_SHARE = 0.95
 """Quantile of the lateral acceleration in complete laps that counts as the grip of the car."""
 LEAST_GRIP_MPS2 = 0.5
+SLIDE_BRIGHT_DEG = 5.0
+"""The brightest colour stands for at least this slide."""
 SLIDE_LEAST_MPS = 0.3
 """Below this speed the direction of travel is mostly noise."""
 
@@ -53,8 +55,7 @@ def sector_times(view: LogView) -> Chart | None:
     """Draw the time lost in each sector: by the fastest lap and by the median lap, to the best time of the sector."""
     if view.course is None or not len(view.steps):
         return None
-    sectors = sectors_of(view.course)
-    times = times_by_sector(view.steps, sectors)
+    sectors, times, when = sectors_now(view, view.course)
     if not len(times):
         return None
     best_s, fastest_s = times.min(), times.loc[times.sum(axis=1).idxmin()]
@@ -62,7 +63,7 @@ def sector_times(view: LogView) -> Chart | None:
     panel = Panel(
         layers=[
             bars(x, times.median() - best_s, PALE, f"median of {count(len(times), 'complete lap')}"),
-            points(x, fastest_s - best_s, VERMILION, "fastest lap", size=12.0, symbol="diamond"),
+            points(x, fastest_s - best_s, VERMILION, "fastest of them", size=12.0, symbol="diamond"),
         ],
         x_names=list(times),
         x_label="sector, in driving direction",
@@ -76,11 +77,11 @@ def sector_times(view: LogView) -> Chart | None:
         notes.append(note(places[30].tolist(), f"{sector.name}\n{best_s[sector.name]:.2f} s"))
     return Chart(
         name="sector_times",
-        title=f"Sectors: the best times of all add up to {best_s.sum():.3f} s, the fastest lap took "
+        title=f"Sectors: the best times add up to {best_s.sum():.3f} s, the fastest of these laps took "
         f"{fastest_s.sum():.3f} s",
-        caption="Sectors begin and end where the curvature of the centre line changes; the map shows the best "
-        "time driven in each of them, in any complete lap. The height of a bar is what the median lap loses there, "
-        "the diamond what even the fastest lap lost.",
+        caption="Sectors begin and end where the curvature of the centre line changes; the map shows the best time "
+        f"of each, of {count(len(times), 'complete lap')} {when}. The height of a bar is what the median lap loses "
+        "there, the diamond what even the fastest of them lost.",
         rows=[[map_panel(view.course, [*lines, *notes], numbers=False)], [panel]],
     )
 
@@ -203,15 +204,19 @@ def slide_map(view: LogView) -> Chart | None:
     if view.course is None or not len(rows):
         return None
     slide = rows["slide_deg"].abs().where(rows["track_speed_mps"] >= SLIDE_LEAST_MPS)
-    cells = Grid.over(view.course, 8_000).means(rows, slide, "slide, degrees", LEAST_STEPS)
-    if not np.isfinite(cells.z).any():
+    grid = Grid.over(view.course, 8_000)
+    mean = means(grid.of(rows["X"], rows["Y"]), slide, grid.count, LEAST_STEPS)
+    if not np.isfinite(mean).any():
         return None
+    # Tyres that hardly slip must not look as if they did.
+    colors = 0.0, max(color_range(mean)[1], SLIDE_BRIGHT_DEG)
+    cells = grid.cells(mean, "slide, degrees", value_range=colors)
     return Chart(
         name="slide_map",
         title="Where the car slides",
         caption="Mean angle between the direction in which the rear axle moved and the heading of the car, in the "
-        "last third of the iterations; 0 is rolling without slip. Bright cells are bends taken at the limit of grip: "
-        "only another line can be faster there.",
+        "last third of the iterations; 0 is rolling without slip. Bright cells are bends taken at the limit of grip, "
+        "where only another line can be faster; where all is dark, the tyres hold more than is asked of them.",
         rows=[[map_panel(view.course, [cells])]],
     )
 

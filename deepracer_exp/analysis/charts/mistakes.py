@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.analysis.log_view import LogView, thirds
-from deepracer_exp.analysis.off_track import risk_counts
+from deepracer_exp.analysis.off_track import PLACE_M, risk_counts
 from deepracer_exp.analysis.statistics import subsample, totals, wilson
 from deepracer_exp.errors import count
 from deepracer_exp.tracks.track import Track
@@ -21,8 +21,6 @@ OUTCOMES = {
     "time_up": ("time or steps up", ORANGE, "circle"),
 }
 """Ways in which an episode ends without a lap: words, colour and symbol."""
-REACH = 2
-"""Waypoints to either side that count for the risk at a waypoint: accidents at a single one are too rare."""
 _WORST = 5
 
 
@@ -122,7 +120,9 @@ def off_track_risk(view: LogView) -> Chart | None:
     off, late_off = (risk_counts(part, n)[1] for part in parts)
     if not off.any():
         return None
-    (near_passes, near_off), (late_passes, late_near_off) = (risk_counts(part, n, REACH) for part in parts)
+    # As far as the finding's places: accidents at a single waypoint are too rare.
+    reach = max(1, round(PLACE_M / 2 * n / float(view.steps["track_len"].median())))
+    (near_passes, near_off), (late_passes, late_near_off) = (risk_counts(part, n, reach) for part in parts)
     low, high = (100.0 * end for end in wilson(late_near_off, late_passes))
     share = 100.0 * near_off / np.where(near_passes > 0, near_passes, np.nan)
     late_share = 100.0 * late_near_off / np.where(late_passes > 0, late_passes, np.nan)
@@ -136,7 +136,7 @@ def off_track_risk(view: LogView) -> Chart | None:
         bars(at, before, PALE, f"off the road before ({before.sum():.0f})", width=1.0),
         bars(at, late_off, VERMILION, f"in the last third ({late_off.sum():.0f})", base=before, width=1.0),
     ]
-    label = f"risk within {REACH} waypoints, %"
+    label = f"risk within {PLACE_M / 2:g} m, %"
     rows = [[waypoint_panel(risk, label, n)], [waypoint_panel(counts, "episodes", n)]]
     if view.course is not None:
         hover = [
@@ -150,7 +150,7 @@ def off_track_risk(view: LogView) -> Chart | None:
     return Chart(
         name="off_track_risk",
         title="The risk of leaving the road",
-        caption=f"Of all passes of a waypoint, the share that left the road within {REACH} waypoints of it; the shade "
+        caption=f"Of all passes of a waypoint, the share that left the road within {PLACE_M / 2:g} m of it; the shade "
         "is the range that contains the true share with 95 per cent confidence. A high risk with a narrow shade is a "
         "place to work on; a wide shade only means that few passes came this far.",
         rows=rows,
