@@ -1,5 +1,6 @@
 """Policy and value networks."""
 
+import copy
 import math
 
 import torch
@@ -16,6 +17,7 @@ from torchrl.modules import MLP, ActorValueOperator, IndependentNormal, Probabil
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import CNNConfig, NetworkConfig
 from deepracer_exp.config.own_class import OwnClass, build_own
+from deepracer_exp.errors import BadInput, reading
 
 CONTINUOUS_ACTION_SIZE = 2
 """Steering and speed."""
@@ -101,14 +103,11 @@ def build_actor_critic(
     outputs = CONTINUOUS_ACTION_SIZE if action_count is None else action_count
     if isinstance(network, OwnClass):
         keys = list(observed.seen)
-        # The number itself where an input has only one axis.
-        inputs = [shape if len(shape) > 1 else shape[0] for shape in observed.seen.values()]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-            own, value = (
-                build_own(network, "network.target", nn.Module, *inputs, size) for size in (outputs, 1)
-            )
-        initial_std = float(getattr(own, "initial_std", _INITIAL_STD))
+            own, value = (_own_network(network, observed, size) for size in (outputs, 1))
+        with reading(f"network.target={network.target}: initial_std"):
+            initial_std = float(getattr(own, "initial_std", _INITIAL_STD))
         return ActorCritic(_policy(keys, own, continuous, initial_std), ValueOperator(value, in_keys=keys))
     keys = list(observed.seen) if isinstance(network, CNNConfig) else ["observation"]
 
@@ -136,6 +135,26 @@ def build_actor_critic(
     return ActorCritic(
         policy, ValueOperator(_initialize(critic, _VALUE_GAIN, generator), in_keys=["observation"])
     )
+
+
+def _own_network(network: OwnClass, observed: ObservationShape, outputs: int) -> nn.Module:
+    """Build a network of the user's own and call a copy of it, with two observations."""
+    # The number itself where an input has only one axis.
+    inputs = [shape if len(shape) > 1 else shape[0] for shape in observed.seen.values()]
+    own = build_own(network, "network.target", nn.Module, *inputs, outputs)
+    seen = [
+        torch.zeros(2, *shape, dtype=torch.uint8 if key == "pixels" else torch.float32)
+        for key, shape in observed.seen.items()
+    ]
+    what = f"network.target={network.target}"
+    with reading(what), torch.no_grad():
+        found = copy.deepcopy(own).eval()(*seen)
+    shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+    if shape != (2, outputs):
+        raise BadInput(
+            f"{what}: returns {shape} for two observations; accepted: a tensor of shape (2, {outputs})"
+        )
+    return own
 
 
 def _dense(inputs: int, hidden: tuple[int, ...], activation: str, outputs: int | None = None) -> MLP:

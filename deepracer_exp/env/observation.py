@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from deepracer_exp.config.driving import ObservationConfig, ObservationShape
-from deepracer_exp.config.own_class import build_own
+from deepracer_exp.config.own_class import OwnClass, build_own
+from deepracer_exp.errors import BadInput, reading
 from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures
@@ -37,7 +38,23 @@ def build_parts(config: ObservationConfig) -> tuple[ObservationPart, ...]:
     Raises:
         BadInput: a class cannot be used.
     """
-    return tuple(build_own(part, "observation.target", ObservationPart) for part in config.parts)
+    return tuple(map(_build_part, config.parts))
+
+
+def _build_part(own: OwnClass) -> ObservationPart:
+    """Build a part and compute the features of two cars: numpy would stretch a column to those that are missing."""
+    part, what = build_own(own, "observation.target", ObservationPart), f"observation.target={own.target}"
+    names = part.names
+    if not isinstance(names, tuple | list) or not names or not all(isinstance(name, str) for name in names):
+        raise BadInput(f'{what}: names={names!r}; accepted: a tuple of text, as in names = ("side_force",)')
+    with reading(what):
+        shape = np.shape(part.compute(Measures.example(2), np.zeros(2), np.zeros(2)))
+    if shape != (2, len(names)):
+        raise BadInput(
+            f"{what}: compute returns the shape {shape} for two cars; accepted: (2, {len(names)}), as many columns as "
+            "names"
+        )
+    return part
 
 
 def feature_names(config: ObservationConfig) -> tuple[str, ...]:

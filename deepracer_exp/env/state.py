@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 _PAIRS = ("front", "closest_waypoints")
 """Arrays with two numbers per car."""
+_TYPES = {"closest_waypoints": np.int64, "is_left": np.bool_}
+"""Of the arrays that are not float64."""
 
 
 def checked_array(state: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -86,6 +88,16 @@ class Measures:
             heading_error_rad=np.mod(error + np.pi, 2 * np.pi) - np.pi,
             track_width_m=track_width_m,
             is_left=is_left,
+        )
+
+    @classmethod
+    def example(cls, n_cars: int) -> "Measures":
+        """Return measures that fit together in shape only, all 1."""
+        return cls(
+            **{
+                field.name: np.ones((n_cars, 2) if field.name in _PAIRS else n_cars, _TYPES.get(field.name))
+                for field in fields(cls)
+            }
         )
 
     def state_dict(self) -> dict[str, Any]:
