@@ -178,6 +178,84 @@ def test_a_class_that_cannot_be_used_is_refused_in_one_line(override, words, tmp
     ended.assert_bad_input(words)
 
 
+BROKEN = """
+import torch
+from deepracer_exp import Algorithm, ObservationPart, StoppingRule
+
+class WrongSize(torch.nn.Linear):
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, outputs + 1)
+
+class NoForward(torch.nn.Module):
+    def __init__(self, inputs, outputs):
+        super().__init__()
+
+class NoComma(ObservationPart):
+    names = ("side_force")
+    def compute(self, now, steering_deg, commanded_mps):
+        return now.speed_mps[:, None]
+
+class OneOfTwo(NoComma):
+    names = ("side_force", "lift")
+
+class NoNetworks(Algorithm):
+    def __init__(self, *arguments):
+        pass
+
+class Divides(Algorithm):
+    def update(self, batch, iteration, fraction):
+        return 1 / 0
+
+class Raises(StoppingRule):
+    def observe(self, row):
+        return row["no_such_column"]
+
+class SaysYes(StoppingRule):
+    def observe(self, row):
+        return True
+"""
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("network=my_broken:WrongSize", "(2, 16) for two observations; accepted: a tensor of shape (2, 15)"),
+        ("network=my_broken:NoForward", "network.target=my_broken:NoForward: Module [NoForward] is missing"),
+        ("observation=my_broken:NoComma", "names='side_force'; accepted: a tuple of text"),
+        ("observation=my_broken:OneOfTwo", "compute returns the shape (2, 1) for two cars; accepted: (2, 2)"),
+        ("algorithm=my_broken:NoNetworks", "AttributeError: 'NoNetworks' object has no attribute 'networks'"),
+    ],
+)
+def test_a_class_that_would_fail_or_mislead_the_training_is_refused_before_it(override, words, tmp_path):
+    (tmp_path / "my_broken.py").write_text(BROKEN)
+    ended = call_in(tmp_path, "train", *IN_PROCESS, "tracking=off", override)
+    assert ended.code == 2, ended.stderr
+    assert words in ended.complaint
+    assert not ended.folders
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        (
+            "algorithm=my_broken:Divides",
+            "ZeroDivisionError: division by zero (my_broken.py, line 27; with algorithm.target=my_broken:Divides)",
+        ),
+        (
+            "stopping=my_broken:Raises",
+            "KeyError: 'no_such_column' (my_broken.py, line 31; with stopping.target=",
+        ),
+        (
+            "stopping=my_broken:SaysYes",
+            "SaysYes.observe returned True: 'bool' object has no attribute 'as_dict'",
+        ),
+    ],
+)
+def test_an_error_of_a_class_ends_the_run_in_one_line_that_names_it(override, words, tmp_path):
+    (tmp_path / "my_broken.py").write_text(BROKEN)
+    call_in(tmp_path, "train", *IN_PROCESS, "tracking=off", override).assert_run_failed(words)
+
+
 def test_a_file_of_the_working_folder_replaces_no_installed_module(tmp_path):
     (tmp_path / "colorsys.py").write_text("class Net: ...\n")
     sys.modules.pop("colorsys", None)

@@ -1,5 +1,6 @@
 """The callbacks of every training, in their order: one concern each."""
 
+import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from rich.console import Console
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import Course, RaceSetup
+from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
 from deepracer_exp.runs.checkpoint_files import LINKS
@@ -164,7 +166,12 @@ class StoppingCallback(Callback):
         return {"stopping": self._decision and self._decision.as_dict(), "reliable": self._reliable}
 
     def _observe(self, trainer: Trainer) -> None:
-        self._decision = self._rule.observe(trainer.row)
+        found = self._rule.observe(trainer.row)
+        try:  # before it is part of the summary, which is written even of a run that fails
+            json.dumps(found and found.as_dict())
+        except (AttributeError, TypeError) as error:
+            raise RunFailed(f"{self._rule.__class__.__name__}.observe returned {found!r}: {error}") from error
+        self._decision = found
         if self._decision is not None:
             status = STOPPED_EARLY if self._decision.stopped_early else FINISHED
             trainer.request_stop(str(self._decision), status)

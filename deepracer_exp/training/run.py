@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +21,7 @@ from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.collectors.ray_cluster import check_collector
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.own_class import own_classes
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
@@ -243,8 +245,10 @@ def _begin(
             f"cannot write {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
         )
         raise BadInput(f"runs_dir={experiment.runs_dir}: {what}; give a folder with room") from error
-    except BaseException:
+    except BaseException as error:
         folder.remove()
+        if isinstance(error, Exception) and (reason := _own_error(error, experiment)):
+            raise BadInput(reason) from error
         raise
     for note in composition.notes:
         logger.info(note)
@@ -365,9 +369,20 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
             )
             what = f"collector.cars={cars}, algorithm.frames_per_iteration={frames}: {NO_MEMORY}"
             return trainer.fail(what, error, RunFailed.exit_code if trainer.row else BadInput.exit_code)
+        if own := _own_error(error, trainer.experiment):
+            return trainer.fail(own, error)
         # A bug: its traceback is shown, but the run must not look as if it were running.
         trainer.fail(f"{type(error).__name__}: {error}", error)
         raise
+
+
+def _own_error(error: Exception, experiment: Experiment) -> str | None:
+    """Return a line for an error of a run with classes of the user's own, which are to blame; None: it has none."""
+    own = ", ".join(f"{group}.target={target}" for group, target in own_classes(asdict(experiment)))
+    if not own or isinstance(error, BadInput):
+        return None
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(at.filename).name}, line {at.lineno}; with {own})"
 
 
 def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:
