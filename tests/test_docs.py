@@ -19,8 +19,8 @@ from deepracer_exp.commands.arguments import runs_and_overrides
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment, compose_export, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.validation.check import read
 from deepracer_exp.validation.pitfalls import action_space_laps, pays_for_slowness
+from deepracer_exp.validation.validate import read
 from tests.test_own_classes import write_examples
 
 ROOT = Path(__file__).parents[1]
