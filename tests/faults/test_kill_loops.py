@@ -52,6 +52,12 @@ def ended(cwd):
         return study.execute("SELECT count(*) FROM deepracer_slots WHERE outcome IS NOT NULL").fetchone()[0]
 
 
+def on_last_try(cwd):
+    """Return whether a trial would count as failed if its worker were lost once more before the next checkpoint."""
+    under_way = [claim for claim in claims(cwd) if claim.state == "claimed"]
+    return any(run.get("tries", 1) >= 3 for claim in under_way for run in claim.runs)
+
+
 def rest(start, cwd):
     """Finish the trials that have begun, in a sweep without kills."""
     # Workers that claim at the same moment spread out, so that a trial before the last may not have begun.
@@ -87,6 +93,7 @@ def test_a_sweep_survives_a_killed(what, start, tmp_path, kill):
         before = ended(tmp_path) if number else 0
         sweep.wait_for(lambda: sweep.workers() and sweep.rows() and ended(tmp_path) > before, "trials")  # noqa: B023
         time.sleep(random.Random(number).uniform(0.0, 1.0))
+        sweep.wait_for(lambda: sweep.workers() and not on_last_try(tmp_path), "trial with more tries")
         workers = sweep.workers()
         victim = random.Random(number).choice(workers)
         server = victim.parent()

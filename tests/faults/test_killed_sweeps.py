@@ -7,6 +7,7 @@ import contextlib
 import os
 import random
 import signal
+import sqlite3
 import time
 from pathlib import Path
 
@@ -230,14 +231,26 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
     assert not (Path(held.runs[0]["run_dir"]) / "summary.json").exists()
 
 
+def is_locked(cwd):
+    with contextlib.closing(sqlite3.connect(cwd / "runs" / "sweeps.db", timeout=2.0)) as study:
+        try:
+            study.execute("BEGIN IMMEDIATE")
+        except sqlite3.OperationalError:
+            return True
+    return False
+
+
 def suspended(running):
-    """Suspend the worker of a trial whose run is under way; return claim and worker, or None if there is none now."""
+    """Suspend the worker of a trial whose run is under way; return claim and worker, or None if there is none now.
+
+    Not while it writes to the study: others wait for the lock on the file, however long its owner sleeps.
+    """
     for claim in claims(running.cwd):
         if claim.state == "claimed" and claim.runs:
             worker = psutil.Process(int(claim.owner.rsplit(":", 2)[1]))
             worker.suspend()
             (now,) = [one for one in claims(running.cwd) if one.index == claim.index]
-            if now.state == "claimed" and now.owner == claim.owner:
+            if now.state == "claimed" and now.owner == claim.owner and not is_locked(running.cwd):
                 return now, worker
             worker.resume()
     return None
