@@ -21,6 +21,8 @@ _OFF = np.array([1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES]
 _FIRST_QUANTITIES, _FIRST_MATERIALS = 10, 8
 """Quantities and materials added later are drawn after everything else, so that they change no earlier draw. The lens
 was added after the objects, which draw a varying number of values, and so has streams of its own."""
+_FACTOR_OF = [MATERIALS.index(name.removeprefix("far_")) for name in MATERIALS]
+"""Whose colour factor a material has: farther ahead a line keeps its colour."""
 _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""
@@ -97,7 +99,7 @@ class PictureRandomization:
             draws[_LENS] = self._lens_streams.at(car, episode).random()
             values = self._low[car] + self._span[car] * draws
             self._values[car] = values
-            self._color_factor[car] = 1.0 + values[_COLUMN["color_noise"]] * normal
+            self._color_factor[car] = 1.0 + values[_COLUMN["color_noise"]] * normal[_FACTOR_OF]
             depth = values[_COLUMN["light"]] * (1.0 if sign < 0.5 else -1.0)
             self._spot[car] = depth, x, y, _SPOT_SIZE[0] + (_SPOT_SIZE[1] - _SPOT_SIZE[0]) * size
             self._dirt[car] = stream.random((_DIRT_SPOTS, 3))

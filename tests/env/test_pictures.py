@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import shapely
 
+from deepracer_exp.config.driving import PictureRandomizationConfig
 from deepracer_exp.config.track import FloorConfig
-from deepracer_exp.env.picture_randomization import QUANTITIES
+from deepracer_exp.env.picture_randomization import QUANTITIES, PictureRandomization
 from deepracer_exp.env.pictures import GREY, floor_colors
 from deepracer_exp.env.race import Race
 from deepracer_exp.sim.scenery import MATERIALS, box_corners, paved_area, wall_ring
@@ -147,6 +148,17 @@ def test_each_quantity_does_what_it_says(race_of, quantity, low, high, law):
         alone = written({quantity: [value, value]})
         pictures.append(race_of(SMALL, f"randomization.pictures={alone}").pixels[0, 0].astype(float))
     assert law(*pictures)
+
+
+def test_a_line_keeps_its_colour_where_it_is_drawn_for_the_distance():
+    varied = PictureRandomization([PictureRandomizationConfig(color_noise=(0.3, 0.3))] * 4, range(4), [])
+    varied.seed(0)
+    cars = np.arange(4)
+    varied.begin(cars, np.zeros(4, np.int64), np.zeros(4, np.intp))
+    seen = varied.colors(cars, np.full((4, len(MATERIALS), 3), 100, np.float32))
+    assert len(np.unique(seen[:, [MATERIALS.index(name) for name in ("dash", "kerb", "start")]])) == 36
+    for name in ("dash", "kerb", "start"):
+        assert (seen[:, MATERIALS.index(f"far_{name}")] == seen[:, MATERIALS.index(name)]).all()
 
 
 def by_lens(k1: float, width: int = 160, height: int = 120) -> tuple[np.ndarray, np.ndarray]:
