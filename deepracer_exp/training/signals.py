@@ -4,6 +4,8 @@ import signal
 from collections.abc import Callable
 from types import FrameType
 
+from deepracer_exp.rewards.guard import CtrlC
+
 
 class Interruption:
     """Records a request to end and answers it; a second signal ends at once.
@@ -41,7 +43,7 @@ class Interruption:
 
     def _hear(self, signum: int, _: FrameType | None) -> None:
         if self.signum is not None:
-            raise KeyboardInterrupt
+            raise CtrlC
         self.signum = signum
         if self._outer is not None:
             self._outer.signum = signum

@@ -18,6 +18,7 @@ from deepracer_exp.rewards.params import COLUMNS, TrackParams, batch_params, row
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
 from deepracer_exp.rewards.source import RewardSource
+from deepracer_exp.training.signals import Interruption
 
 WAYPOINTS = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 0.0)]
 ROAD = [TrackParams(WAYPOINTS, 3.4, False)]
@@ -154,6 +155,14 @@ CTRL_C = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
 def test_ctrl_c_is_the_users_even_if_the_reward_swallows_it(body: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         function(body)(columns(3), ROAD)
+
+
+def test_a_second_sigterm_while_the_reward_runs_is_not_its_fault() -> None:
+    reward = function(f"{CTRL_C.replace('SIGINT', 'SIGTERM')}; return 1.0")
+    with Interruption():
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            reward(columns(3), ROAD)
 
 
 def test_a_keyboard_interrupt_that_the_reward_raises_is_its_fault() -> None:
