@@ -50,7 +50,6 @@ def limits(name: str) -> tuple[float, float]:
 def conditions(trained: PictureRandomizationConfig) -> dict[str, PictureRandomizationConfig | None]:
     """Return the conditions by name."""
     ranges = {name: tuple(ends) for name, ends in vars(trained).items()}
-    at_rest = {name: (1.0, 1.0) if name.endswith("_scale") else (0.0, 0.0) for name in ranges}
     found: dict[str, PictureRandomizationConfig | None] = {"usual": None, "trained on": trained}
     wide = {}
     for name, (low, high) in ranges.items():
@@ -60,8 +59,7 @@ def conditions(trained: PictureRandomizationConfig) -> dict[str, PictureRandomiz
         wide[name] = beyond
         for end, value in zip((low, high), beyond, strict=True):
             if value != end:
-                alone = at_rest | {name: (value, value)}
-                found[f"{name} {value:g}"] = PictureRandomizationConfig(**alone)
+                found[f"{name} {value:g}"] = PictureRandomizationConfig(**{name: (value, value)})
     found["all beyond"] = PictureRandomizationConfig(**wide)
     return found
 
