@@ -4,11 +4,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .agents.ppo import PPO, Algorithm
+    from .agents.ppo import PPO, Algorithm, UpdateMetrics
     from .agents.schedules import Schedule
-    from .api import ComposedExperiment, RunTables, compose, evaluate, load_policy, make_env, read_run, train
+    from .api import (
+        ComposedExperiment,
+        RunTables,
+        compose,
+        evaluate,
+        load_policy,
+        make_env,
+        read_run,
+        resume,
+        train,
+    )
     from .env.observation import ObservationPart
     from .env.race_env import RaceEnv
+    from .errors import BadInput, RunFailed
     from .evaluation.result import Evaluation
     from .runs.convergence import Decision, StoppingRule
     from .tracking.tracker import Tracker
@@ -18,31 +29,36 @@ __version__ = "0.1.0"
 __all__ = [
     "PPO",
     "Algorithm",
+    "BadInput",
     "Callback",
     "ComposedExperiment",
     "Decision",
     "Evaluation",
     "ObservationPart",
     "RaceEnv",
+    "RunFailed",
     "RunTables",
     "Schedule",
     "StoppingRule",
     "Tracker",
     "TrainResult",
     "Trainer",
+    "UpdateMetrics",
     "__version__",
     "compose",
     "evaluate",
     "load_policy",
     "make_env",
     "read_run",
+    "resume",
     "train",
 ]
 _MODULES = {
-    "agents.ppo": ("PPO", "Algorithm"),
+    "agents.ppo": ("PPO", "Algorithm", "UpdateMetrics"),
     "agents.schedules": ("Schedule",),
     "env.observation": ("ObservationPart",),
     "env.race_env": ("RaceEnv",),
+    "errors": ("BadInput", "RunFailed"),
     "evaluation.result": ("Evaluation",),
     "runs.convergence": ("Decision", "StoppingRule"),
     "tracking.tracker": ("Tracker",),

@@ -22,6 +22,7 @@ from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.resolve import resolve
+from deepracer_exp.training.run import resume as resume_run
 from deepracer_exp.training.run import run_training
 from deepracer_exp.training.trainer import Callback, TrainResult
 
@@ -82,6 +83,28 @@ def train(
         BadInput: before anything was started; no folder is left.
     """
     return run_training(experiment.config, experiment.composition, console, callbacks=callbacks)
+
+
+def resume(
+    run: str | Path,
+    *overrides: str,
+    callbacks: Sequence[Callback] = (),
+    console: Console | None = None,
+    runs_dir: str | Path = "runs",
+) -> TrainResult:
+    """Resume a run that was killed, interrupted or failed, as `deepracer-exp resume` does.
+
+    Args:
+        run: as for `evaluate`.
+        overrides: as on the command line, e.g. ``budget.env_steps=5000000``.
+        callbacks: as for `train`; those that it was trained with, to call them again.
+        console: as for `train`.
+        runs_dir: where to look for runs.
+
+    Raises:
+        BadInput: it has ended, is being trained, or was started with other values.
+    """
+    return resume_run(resolve(str(run), Path(runs_dir), None).path, overrides, console, callbacks)
 
 
 def evaluate(run: str | Path, *overrides: str) -> Evaluation:

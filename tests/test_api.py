@@ -4,11 +4,22 @@ import inspect
 import subprocess
 import sys
 
+import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 import deepracer_exp
-from deepracer_exp import Callback, compose, evaluate, load_policy, make_env, read_run, train
+from deepracer_exp import (
+    BadInput,
+    Callback,
+    compose,
+    evaluate,
+    load_policy,
+    make_env,
+    read_run,
+    resume,
+    train,
+)
 
 TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
 
@@ -39,6 +50,16 @@ def test_an_experiment_is_trained_with_an_own_callback_raced_and_read(tmp_path):
     assert list(result.folder.glob("evaluations/*.json"))
 
 
+def test_a_run_is_resumed_with_the_callbacks_it_was_trained_with(tmp_path):
+    run = train(compose(*TINY, f"runs_dir={tmp_path}", "budget.env_steps=1024"), callbacks=[StopsAfterTwo()])
+    assert read_run(run.folder).metrics["twice"].tolist() == [2]
+    with pytest.raises(BadInput, match="has ended"):
+        resume(run.folder.name, runs_dir=tmp_path)
+    result = resume(run.folder, "budget.env_steps=4096", callbacks=[StopsAfterTwo()])
+    assert (result.folder, result.reason) == (run.folder, "two are enough")
+    assert read_run(result.folder).metrics["twice"].tolist() == [2, 4]
+
+
 def test_a_stored_policy_drives_the_environment(trained):
     run = trained()
     env = make_env(compose(*TINY), n_cars=3)
@@ -51,7 +72,7 @@ def test_a_stored_policy_drives_the_environment(trained):
 
 
 def test_what_a_public_function_returns_is_public():
-    for call in (compose, evaluate, make_env, read_run, train):
+    for call in (compose, evaluate, make_env, read_run, resume, train):
         returned = inspect.signature(call, eval_str=True).return_annotation
         assert getattr(deepracer_exp, returned.__name__) is returned
 

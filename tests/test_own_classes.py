@@ -206,6 +206,10 @@ class Divides(Algorithm):
     def update(self, batch, iteration, fraction):
         return 1 / 0
 
+class Multiplies(Algorithm):
+    def update(self, batch, iteration, fraction):
+        return torch.nn.Linear(3, 1)(batch["observation"])
+
 class Raises(StoppingRule):
     def observe(self, row):
         return row["no_such_column"]
@@ -241,9 +245,14 @@ def test_a_class_that_would_fail_or_mislead_the_training_is_refused_before_it(ov
             "algorithm=my_broken:Divides",
             "ZeroDivisionError: division by zero (my_broken.py, line 27; with algorithm.target=my_broken:Divides)",
         ),
+        # Raised in torch: the line is the last one of the class's own module.
+        (
+            "algorithm=my_broken:Multiplies",
+            "(my_broken.py, line 31; with algorithm.target=my_broken:Multiplies)",
+        ),
         (
             "stopping=my_broken:Raises",
-            "KeyError: 'no_such_column' (my_broken.py, line 31; with stopping.target=",
+            "KeyError: 'no_such_column' (my_broken.py, line 35; with stopping.target=",
         ),
         (
             "stopping=my_broken:SaysYes",

@@ -378,11 +378,15 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
 
 def _own_error(error: Exception, experiment: Experiment) -> str | None:
     """Return a line for an error of a run with classes of the user's own, which are to blame; None: it has none."""
-    own = ", ".join(f"{group}.target={target}" for group, target in own_classes(asdict(experiment)))
-    if not own or isinstance(error, BadInput):
+    classes = list(own_classes(asdict(experiment)))
+    if not classes or isinstance(error, BadInput):
         return None
-    at = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {error} ({Path(at.filename).name}, line {at.lineno}; with {own})"
+    modules = [target.partition(":")[0] for _, target in classes]
+    frames = list(traceback.walk_tb(error.__traceback__))
+    theirs = [at for at in frames if at[0].f_globals.get("__name__") in modules]
+    frame, line = (theirs or frames)[-1]
+    own = ", ".join(f"{group}.target={target}" for group, target in classes)
+    return f"{type(error).__name__}: {error} ({Path(frame.f_code.co_filename).name}, line {line}; with {own})"
 
 
 def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:
