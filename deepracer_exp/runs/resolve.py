@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from pydantic import Field, TypeAdapter
 
 from deepracer_exp.config.experiment import Experiment, safe_name
+from deepracer_exp.config.stored import config_differences
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import atomic_write, read_json_as
 from deepracer_exp.tracking.registry import Registered, is_alias, look_up
@@ -210,12 +211,15 @@ def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:
     terms = {run: _terms(read_config(run), result) for run, result in results.items()}
     for run in others:
         for key, value in terms[first].items():
-            if terms[run][key] != value:
-                raise BadInput(
-                    f"{what}: its runs cannot be ranked: {key} is {_short(value)} in {first.name} and "
-                    f"{_short(terms[run][key])} in {run.name}; name one of them, and train what differs under another "
-                    "name="
-                )
+            one, other = value, terms[run][key]
+            if one == other:
+                continue
+            if _short(one) == _short(other):  # of one name
+                key, (one, other) = next(iter(config_differences([{key: one}, {key: other}]).items()))
+            raise BadInput(
+                f"{what}: its runs cannot be ranked: {key} is {_short(one)} in {first.name} and {_short(other)} in "
+                f"{run.name}; name one of them, and train what differs under another name="
+            )
 
 
 def _terms(config: Mapping[str, Any], result: RunResult) -> dict[str, Any]:
