@@ -67,7 +67,7 @@ def measure(option: str, track: Track, overrides: Sequence[str]) -> dict[str, An
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
     """Return the table."""
-    head = ("track", "name", "length (m)", "steps to 90 %", "seconds to 90 %", "best lap (s)")
+    head = ("track", "name", "length (m)", "steps to 90%", "seconds to 90%", "best lap (s)")
     lines = []
     for row in rows:
         unreached = f"not in {row['env_steps']:,} ({row['lap_share'] or 0.0:.0%})"

@@ -272,7 +272,7 @@ def error_table(before: Fit, after: Fit, parts: dict[str, Windows]) -> str:
             count = off[0][band].windows
             if count:
                 rows.append((f"{part}, {band}", str(count), *(interval(one[band]) for one in off)))
-    return table(("median error (m) and 95 % interval", "windows", "before", "after"), rows)
+    return table(("median error (m) and 95% interval", "windows", "before", "after"), rows)
 
 
 def _starting_car(name: str | None, recorded: Sequence[Recorded]) -> str:

@@ -8,7 +8,7 @@ optimizer, for `--more` steps: by `deepracer-exp clone RUN`, which lowers the le
 algorithm.lr as it was. The best checkpoint of each of the three drives 64 laps on usual and 64 on held-out conditions,
 with starts and draws that no evaluation of the training had.
 
-Figures are means over seeds with Student's 95 % interval. Both clones have the same parent, so that their differences
+Figures are means over seeds with Student's 95% interval. Both clones have the same parent, so that their differences
 within a seed say more than those of the means: `tenth_minus_same`, and how much faster than the parent each is.
 """
 

@@ -13,7 +13,7 @@ taking the most probable action, under each of these conditions:
   that end make sense. Neither has ever seen these.
 - `all beyond`: every quantity drawn from a range of twice the width.
 
-Completion is the mean share of the lap that was driven, 0 to 1. Intervals are those of the mean over seeds (95 %, t).
+Completion is the mean share of the lap that was driven, 0 to 1. Intervals are those of the mean over seeds (95%, t).
 """
 
 import dataclasses

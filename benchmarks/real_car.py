@@ -9,7 +9,7 @@ from STARTS starts spread evenly over the lap under `evaluation=real_car`: as in
 differences from it alone, and with all of them.
 
 `lap_share` is the share of complete laps, `completion` the mean share of the lap that was driven, `lap_time_s` the mean
-of the complete laps. Intervals are those of the mean over seeds (95 %, t); `gain` is with minus without, seed by seed.
+of the complete laps. Intervals are those of the mean over seeds (95%, t); `gain` is with minus without, seed by seed.
 
 FOLDER keeps runs and results, so that a second call continues the first; overrides are those of the two policies.
 """

@@ -57,7 +57,7 @@ class Recorded:
 
 
 class Median(NamedTuple):
-    """Median error in metres with a 95 % interval that resamples episodes; None without windows."""
+    """Median error in metres with a 95% interval that resamples episodes; None without windows."""
 
     windows: int
     episodes: int

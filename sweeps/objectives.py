@@ -111,7 +111,7 @@ def intermediate_value(row: Mapping[str, Any], objective: str, trial_time_s: flo
 
 
 def shown(objective: str, value: float) -> str:
-    """Return a value with its unit: ``9.84 s``, ``97.3 %``."""
+    """Return a value with its unit: ``9.84 s``, ``97.3%``."""
     digits = 2 if MEASURES[objective].minimize else 1
     return f"{value:.{digits}f} {MEASURES[objective].unit}"
 
@@ -122,6 +122,6 @@ def shown_or_dash(objective: str, value: float | None) -> str:
 
 
 def shown_values(objectives: Sequence[str], values: Sequence[float]) -> str:
-    """Return all values of a trial: ``lap time 9.84 s, completion 97.3 %``."""
+    """Return all values of a trial: ``lap time 9.84 s, completion 97.3%``."""
     pairs = zip(objectives, values, strict=True)
     return ", ".join(f"{MEASURES[name].words} {shown(name, value)}" for name, value in pairs)

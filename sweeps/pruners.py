@@ -76,7 +76,7 @@ def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf
         "median": (MedianPruner(startup, n_warmup_steps=first), "better half"),
         "percentile": (
             PercentilePruner(config.percentile, startup, n_warmup_steps=first),
-            f"best {config.percentile:g} %",
+            f"best {config.percentile:g}%",
         ),
         "hyperband": (HyperbandPruner(first, longest, reduction_factor=3), "best third"),
     }

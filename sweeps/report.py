@@ -87,7 +87,7 @@ def study_summary(study: optuna.Study) -> list[str]:
     else:
         sentences.append("No trial is complete, so there is no best one.")
     spent, wasted = _spent(ended), _spent([t for t in ended if t.state != TrialState.COMPLETE])
-    share = f", {100 * wasted / spent:.0f} % of them in trials that were pruned or failed" if spent else ""
+    share = f", {100 * wasted / spent:.0f}% of them in trials that were pruned or failed" if spent else ""
     return [
         *sentences,
         f"{len(ended)} of {count(total, 'trial')} ended, {len(complete)} of them complete; they drove {steps(spent)} "

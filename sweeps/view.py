@@ -129,11 +129,11 @@ class SweepView:
         lap_s, evaluated = row.get("eval_lap_time_s"), row.get("eval_completion")
         if evaluated is not None:
             lap = "no lap" if lap_s is None else f"{lap_s:.2f} s"
-            self._evaluated[claim.index] = f"{lap}, {evaluated:.0f} %"
+            self._evaluated[claim.index] = f"{lap}, {evaluated:.0f}%"
         return (
             name,
             f"{row['env_steps']:,}",
-            NONE if row["completion"] is None else f"{row['completion']:.0f} %",
+            NONE if row["completion"] is None else f"{row['completion']:.0f}%",
             sparkline(list(self._completions.get(claim.index, ())), _POINTS),
             f"{row['entropy']:.2f}",
             self._evaluated.get(claim.index, NONE),
@@ -171,7 +171,7 @@ def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
 def _values(result: TrialResult, objectives: Sequence[str]) -> str:
     lap_s, completion = result.attrs.get("lap_time_s"), result.attrs.get("completion")
     lap = "no lap" if lap_s is None else f"lap {lap_s:.2f} s"
-    return f"{shown_values(objectives, result.values or ())} ({lap}, {completion:.0f} % driven)"
+    return f"{shown_values(objectives, result.values or ())} ({lap}, {completion:.0f}% driven)"
 
 
 def _sentence(claim: Claim, result: TrialResult, objectives: Sequence[str]) -> str:

@@ -295,7 +295,7 @@ class AgainstLog:
         return [
             *found,
             f"The lines are {np.nanmean(offset_m):.2f} m apart on average, the speeds {np.nanmean(speed_mps):.2f} m/s.",
-            f"They differ most from {one.begin} to {one.end} % of the track (waypoints {one.first_waypoint} to "
+            f"They differ most from {one.begin} to {one.end}% of the track (waypoints {one.first_waypoint} to "
             f"{one.last_waypoint}, sector {one.sector}): there the simulated car is {abs(one.offset_m):.2f} m further "
             f"{'left' if one.offset_m > 0 else 'right'} and {abs(one.speed_mps):.2f} m/s "
             f"{'faster' if one.speed_mps > 0 else 'slower'}.",

@@ -89,7 +89,7 @@ def _converged(view: LogView) -> Finding:
     if found.iteration is not None:
         values["iteration"] = found.iteration
         sentence = (
-            f"Converged at iteration {found.iteration}: since then completion ({found.completion:.0f} %), reward and "
+            f"Converged at iteration {found.iteration}: since then completion ({found.completion:.0f}%), reward and "
             "complete laps have not grown."
         )
         if found.completion < POOR:
@@ -98,17 +98,17 @@ def _converged(view: LogView) -> Finding:
             )
     elif found.completion < found.completion_best - rule.completion_near:
         sentence = (
-            f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f} %. "
+            f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f}%. "
             f"A lower learning rate or {_instead(view, 'an earlier checkpoint')} may hold it."
         )
     elif found.completion > found.completion_before + rule.completion_gain:
         sentence = (
-            f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f} % in "
+            f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f}% in "
             f"the last {count(found.patience, 'iteration')}. Keep training."
         )
     else:
         what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still changes"
-        sentence = f"Not converged yet: completion is {found.completion:.0f} %, but {what}. Keep training."
+        sentence = f"Not converged yet: completion is {found.completion:.0f}%, but {what}. Keep training."
     thresholds = {
         "completion_gain": rule.completion_gain,
         "reward_gain": rule.return_gain,
@@ -152,7 +152,7 @@ def _submit(view: LogView) -> Finding:
             f"Submit {_checkpoint(first['checkpoint'], 'drove')} iteration {first['iteration']:.0f}: a quarter of "
             f"its laps are below {first['lap_time_p25_s']:.2f} s, and "
             f"{first['complete']:.0f} of its {first['episodes']:.0f} episodes are complete laps ({_share(low)} to "
-            f"{_share(high)} with 95 % confidence)."
+            f"{_share(high)} with 95% confidence)."
         )
         others = [
             f"{row.checkpoint or row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
@@ -181,7 +181,7 @@ def _submit(view: LogView) -> Finding:
         farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
         sentence = (
             f"Nothing to submit yet: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
-            f"all); the farthest episode drove {math.floor(farthest['progress'])} % of the lap in iteration "
+            f"all); the farthest episode drove {math.floor(farthest['progress'])}% of the lap in iteration "
             f"{farthest['iteration']}."
         )
         values = {"laps": laps, "progress": float(farthest["progress"])}
@@ -341,12 +341,12 @@ def _overfits(view: LogView) -> Finding | None:
     if found is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
     values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
-    sentence = f"No sign of overfitting: completion in the {found.evaluated} is {found.now:.0f} % "
-    sentence += f"(best {found.best:.0f} %)."
+    sentence = f"No sign of overfitting: completion in the {found.evaluated} is {found.now:.0f}% "
+    sentence += f"(best {found.best:.0f}%)."
     if found.decision is not None:
         sentence = (
-            f"It overfits: completion in the {found.evaluated} fell from {found.best:.0f} % around iteration "
-            f"{found.best_iteration} to {found.now:.0f} % while the reward of the training holds. Take "
+            f"It overfits: completion in the {found.evaluated} fell from {found.best:.0f}% around iteration "
+            f"{found.best_iteration} to {found.now:.0f}% while the reward of the training holds. Take "
             f"{_instead(view, f'a checkpoint from about iteration {found.best_iteration}')}."
         )
         values |= found.decision.values

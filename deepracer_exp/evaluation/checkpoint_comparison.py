@@ -157,7 +157,7 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
 
 def _words(found: LapStatistics) -> str:
     score = "no complete lap" if found.race_score_s is None else f"race score {found.race_score_s:.2f} s"
-    return f"{score}, completion {found.completion:.1f} %"
+    return f"{score}, completion {found.completion:.1f}%"
 
 
 def comparison_table(results: Sequence[CheckpointResult], chosen: str, console: Console) -> Table:

@@ -135,7 +135,7 @@ def glimpses(
             Glimpse(
                 seen=png_uri(png(picture)),
                 looked=png_uri(png(looked)),
-                where=f"{100 * lap.share(step):.0f} % of the lap",
+                where=f"{100 * lap.share(step):.0f}% of the lap",
                 decision=f"{degrees(steering_deg[step])}, {speed_mps[step]:.1f} m/s",
             )
         )

@@ -122,7 +122,7 @@ def _board(lap: Lap, at: int, width: int) -> Image.Image:
     share, end = lap.share(at), width - 24
     draw.text((24, 16), lap.title, font=_font(18), fill=_INK)
     # Right-aligned, so that the numbers do not jump.
-    words = (f"{lap.time_s[at]:.2f} s", f"{max(lap.speed_mps[at], 0.0):.2f} m/s", f"{100 * share:.0f} %")
+    words = (f"{lap.time_s[at]:.2f} s", f"{max(lap.speed_mps[at], 0.0):.2f} m/s", f"{100 * share:.0f}%")
     for right, text in zip((end - 240, end - 90, end), words, strict=True):
         draw.text((right, 12), text, font=_font(26), fill=_INK, anchor="ra")
     draw.rounded_rectangle((24, 56, end, 64), 4, fill=_RULE)

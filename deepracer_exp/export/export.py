@@ -115,7 +115,7 @@ def _car(run: StoredRun, config: ExportConfig, path: Path) -> _Written:
         f"model        {name_on_car(path.name)} on the car, {len(archive.content) / 1e6:.1f} MB",
         f"reads        {', '.join(archive.metadata.sensor)}",
         *archive.notes,
-        "What the car makes of the actions, with its maximum speed at 100 %:",
+        "What the car makes of the actions, with its maximum speed at 100%:",
         *describe_commands(archive.metadata),
     ]
 

@@ -285,14 +285,14 @@ class TrendRule(StoppingRule):
         ):
             return None
         idle = count(rule.patience, "iteration")
-        return f"{completion.now:.1f} % completion, entropy {entropy.now:.1%}, no growth for {idle}", values
+        return f"{completion.now:.1f}% completion, entropy {entropy.now:.1%}, no growth for {idle}", values
 
 
 def _collapsed(rule: CollapsedRule, entropy: _Average, completion: _Average) -> _Found | None:
     highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
     if highest >= rule.entropy_floor or best >= rule.completion_poor:
         return None
-    why = f"entropy at {highest:.1%} with {best:.0f} % completion"
+    why = f"entropy at {highest:.1%} with {best:.0f}% completion"
     return why, {"entropy": highest, "completion": best}
 
 
@@ -301,7 +301,7 @@ def _not_learning(rule: NotLearningRule, entropy: _Average, completion: _Average
     start = completion.first
     if lowest <= rule.entropy_near or best - start > rule.completion_gain or best >= rule.completion_poor:
         return None
-    why = f"entropy still at {lowest:.1%}, completion {start:.1f} % at the start and {best:.1f} % since"
+    why = f"entropy still at {lowest:.1%}, completion {start:.1f}% at the start and {best:.1f}% since"
     return why, {"entropy": lowest, "completion_start": start, "completion": best}
 
 
@@ -310,7 +310,7 @@ def _overfitting(rule: OverfittingRule, held_out: _Average, returns: _Average) -
     lowest_return = returns.best - rule.return_drop * returns.range
     if since > before - rule.held_out_drop or returns.now < lowest_return:
         return None
-    why = f"held-out completion fell from {before:.0f} % to {since:.0f} % while the return holds"
+    why = f"held-out completion fell from {before:.0f}% to {since:.0f}% while the return holds"
     completions = {"held_out_completion_before": before, "held_out_completion_since": since}
     return why, completions | {"return": returns.now, "return_best": returns.best}
 

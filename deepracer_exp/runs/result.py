@@ -66,7 +66,7 @@ class RunResult:
         return CRITERIA.get(self.measure, self.measure)
 
     def words(self) -> str:
-        """Return the figures that are known: ``race score 8.02 s, completion 100.0 %, mean lap 7.97 s``."""
+        """Return the figures that are known: ``race score 8.02 s, completion 100.0%, mean lap 7.97 s``."""
         if not self.evaluated:
             known = [("completion, %", self.completion, "{:.1f}"), ("best lap, s", self.lap_time_s, "{:.2f}")]
         else:

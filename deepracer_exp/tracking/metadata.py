@@ -179,13 +179,13 @@ OURS = "Trainings of `deepracer-exp`."
 _RACE = {
     "score_s": "race score {:.2f} s",
     "lap_time_s": "lap {:.2f} s",
-    "completion": "{:.1f} % of the lap",
-    "held_out_completion": "{:.1f} % on conditions not trained on",
+    "completion": "{:.1f}% of the lap",
+    "held_out_completion": "{:.1f}% on conditions not trained on",
 }
 
 
 def race_result(metrics: Mapping[str, float | None]) -> str:
-    """Return an evaluation, by MLflow's names, in words: ``race score 8.34 s, lap 8.21 s, 99.1 % of the lap``."""
+    """Return an evaluation, by MLflow's names, in words: ``race score 8.34 s, lap 8.21 s, 99.1% of the lap``."""
     values = {name.rpartition("/")[2]: value for name, value in metrics.items()}
     parts = [words.format(values[name]) for name, words in _RACE.items() if values.get(name) is not None]
     return ", ".join(parts) or "no complete lap"

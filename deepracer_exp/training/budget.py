@@ -77,7 +77,7 @@ class Budget:
             percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
             if not first and percent > self._alerted[limit]:
                 words = _WORDS[limit.removeprefix(_EXPERIMENT)]
-                message = f"{percent} % of budget.{limit} used: {words(spent)} of {words(most)}"
+                message = f"{percent}% of budget.{limit} used: {words(spent)} of {words(most)}"
                 passed.append(Alert(limit=limit, percent=percent, message=message))
             self._alerted[limit] = max(percent, self._alerted.get(limit, 0))
         return passed

@@ -193,7 +193,7 @@ class BudgetCallback(Callback):
         self._check(trainer)
         for alert in trainer.budget.alerts(*trainer.usage):
             logger.info(alert.message)
-            self._tracker.set_tag(f"budget.{alert.limit}", f"{alert.percent} %")
+            self._tracker.set_tag(f"budget.{alert.limit}", f"{alert.percent}%")
             self._alerts.send(alert.message, trainer.folder.path)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:

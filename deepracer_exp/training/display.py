@@ -165,7 +165,7 @@ class ProgressDisplay:
     def _line(self) -> str:
         share = self._figure(_SHARE)
         parts = [
-            f"{100 * self._fraction:3.0f} %",
+            f"{100 * self._fraction:3.0f}%",
             f"iteration {self._figure('iteration')}",
             f"{self._figure('env steps')} steps",
             self._figure("speed").replace(" steps/s", "/s"),
@@ -211,7 +211,7 @@ class ProgressDisplay:
         )
 
     def _bar(self, width: int) -> Table:
-        spent = Text.assemble((f"{100 * self._fraction:.0f} %", "bold"))
+        spent = Text.assemble((f"{100 * self._fraction:.0f}%", "bold"))
         left = _left(self._eta_s)
         if width >= _HALVES - 6:
             limit = self._header.budget if width >= _WIDE - 6 else "budget"
@@ -252,7 +252,7 @@ class ProgressDisplay:
     def _figure(self, label: str) -> str:
         if label == _SHARE:
             share = _value(self._row, "lap_share")
-            return NOTHING if share is None else f"{100 * share:.0f} %"
+            return NOTHING if share is None else f"{100 * share:.0f}%"
         key, spec, unit = _FIGURES[label]
         value = _value(self._row, key)
         return NOTHING if value is None else format(value, spec) + unit
@@ -287,7 +287,7 @@ class TrackTable:
         if not self._completion:
             return f"least {NOTHING}"
         label = min(self._completion, key=self._completion.__getitem__)
-        return f"least {self._completion[label]:.1f} % on {label}"
+        return f"least {self._completion[label]:.1f}% on {label}"
 
     def lines(self, width: int, room: int) -> list[Text]:
         """Return the table, tracks running down its columns.

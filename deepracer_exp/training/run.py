@@ -96,9 +96,7 @@ def run_training(
         setup = read_files(experiment)
         memory = memory_of_pictures(experiment)
         trainer = _begin(experiment, composition, setup, console, start, callbacks, run_name, tags)
-        if memory is not None:
-            logger.info(memory)
-            _printing(console)(memory)
+        _print_memory(memory, console)
         return _run(trainer, interruption)
 
 
@@ -302,6 +300,7 @@ def _reopen(
     experiment = parse_experiment(composition.mapping)
     refuse_ended(run_dir, experiment.budget, overrides)
     setup = read_files(experiment)
+    memory = memory_of_pictures(experiment)
     checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
     state = read_training(checkpoint)
     refuse_changes(run_dir, state, composition.mapping, setup)
@@ -335,9 +334,16 @@ def _reopen(
     where = f"resumes after iteration {iteration}" if iteration else "had no checkpoint yet: begins again"
     logger.info(where)
     _printing(console)(f"{run_dir.name}: {where}")
+    _print_memory(memory, console)
     for why in _differences_to_uninterrupted(experiment, setup):
         logger.warning("the result will not be that of an uninterrupted run: %s", why)
     return trainer
+
+
+def _print_memory(memory: str | None, console: Console) -> None:
+    if memory is not None:
+        logger.info(memory)
+        _printing(console)(memory)
 
 
 def _printing(console: Console) -> Callable[[str], None]:

@@ -37,7 +37,7 @@ def test_they_differ_where_the_speed_differs_and_the_time_is_lost_there():
     waypoints = len(both.course.waypoints) - 1
     assert abs(one.first_waypoint - 0.4 * waypoints) < 4
     assert one.sector in both.sentences[-1]
-    assert f"from {one.begin} to {one.end} % of the track" in both.sentences[-1]
+    assert f"from {one.begin} to {one.end}% of the track" in both.sentences[-1]
     slower_s = both.course.length_m * 0.1 * (1 / 1.0 - 1 / 1.5)
     table = both.table.set_index("name")
     assert table.loc["median lap, s", "difference"] == pytest.approx(slower_s, abs=0.02)

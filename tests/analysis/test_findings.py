@@ -93,7 +93,7 @@ def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
     assert view.candidates["iteration"].tolist() == [2, 1]
     found = of(view, "submit")
     assert found.sentence.startswith("Submit the checkpoint (its name is not logged")
-    assert "8 of its 10 episodes are complete laps (49% to 94% with 95 % confidence)" in found.sentence
+    assert "8 of its 10 episodes are complete laps (49% to 94% with 95% confidence)" in found.sentence
     named = replace(view.recording, checkpoints={2: "2_Step-4711"})
     assert of(prepare(named), "submit").sentence.startswith("Submit the checkpoint 2_Step-4711, which drove")
     assert found.values["p25_s"] == pytest.approx(COURSE.length_m / 2.5)
@@ -121,7 +121,7 @@ def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_su
 
 def test_an_episode_just_short_of_the_lap_has_not_driven_all_of_it() -> None:
     view = prepare(made_up_recording([Drive(until=0.998)]))
-    assert "(0 laps in all); the farthest episode drove 99 % of the lap" in of(view, "submit").sentence
+    assert "(0 laps in all); the farthest episode drove 99% of the lap" in of(view, "submit").sentence
 
 
 def test_laps_that_are_in_metrics_files_only_can_be_submitted() -> None:
@@ -269,7 +269,7 @@ def test_evaluations_that_fall_while_the_training_holds_are_overfitting(
 ) -> None:
     found = of(training(completions, evaluated=evaluated), "overfits")
     words = (
-        "It overfits: completion in the evaluation fell from 90 %" if overfits else "No sign of overfitting"
+        "It overfits: completion in the evaluation fell from 90%" if overfits else "No sign of overfitting"
     )
     assert found.sentence.startswith(words)
     assert not overfits or found.values["best_iteration"] in range(10, 19)

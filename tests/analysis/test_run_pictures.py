@@ -127,7 +127,7 @@ def test_each_track_has_its_own_best_episode_and_one_scale_of_speed_holds_for_al
         ]
     )
     figure = driven_lines(trace, {"a": circle_track(), "b": circle_track(), "c": circle_track()})
-    assert words(figure)[1::2] == ["lap in 10.00 s", "30.0 % of the lap, off track", "not driven"]
+    assert words(figure)[1::2] == ["lap in 10.00 s", "30.0% of the lap, off track", "not driven"]
     lines = driven(figure)
     assert [len(line.get_segments()) for line in lines] == [150, 59]
     assert {line.get_clim() for line in lines} == {lines[0].get_clim()}

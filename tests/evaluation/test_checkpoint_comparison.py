@@ -60,14 +60,14 @@ def result(name: str, found: LapStatistics | None, **changes: object) -> Checkpo
         (
             {"000010": figures(95, 9.0), "000020": figures(50, 8.5)},
             "000020",
-            "best by race score: race score 8.50 s, completion 90.0 %; "
-            "next is 000010: race score 9.00 s, completion 90.0 %",
+            "best by race score: race score 8.50 s, completion 90.0%; "
+            "next is 000010: race score 9.00 s, completion 90.0%",
         ),
         ({"000010": figures(100, 8.5), "000020": figures(90, 8.5)}, "000010", "next is 000020"),
         (
             {"000010": figures(0, math.nan, done=62.0), "000020": figures(0, math.nan, done=41.0)},
             "000010",
-            "no complete lap, completion 62.0 %",
+            "no complete lap, completion 62.0%",
         ),
         ({"000010": figures(50, 9.0), "000020": None}, "000010", "race score 9.00 s"),
     ],

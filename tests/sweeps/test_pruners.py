@@ -53,7 +53,7 @@ SIX = [[90 - level - 5 * step for step in range(6)] for level in range(0, 30, 5)
         ("median", [99, 98, 97, 96], "98 at evaluation 2 is not in the better half"),
         ("median", [64, 59, 54, 49], None),
         ("median", SIX[3], None),
-        ("percentile", SIX[3], "70 at evaluation 2 is not in the best 25 %"),
+        ("percentile", SIX[3], "70 at evaluation 2 is not in the best 25%"),
     ],
 )
 def test_the_worse_ones_of_the_same_evaluation_are_pruned_after_the_warmup(name, curve, reason):

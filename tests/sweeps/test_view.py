@@ -40,7 +40,7 @@ ENDED = [
 
 def test_it_counts_trials_by_outcome_and_names_the_best():
     view = shown([*ENDED, claim(2)])
-    for words in ("2 of 4: 1 done, 1 pruned, 0 failed", "trial 0, race score 8.25 s", "8,192", "51 %"):
+    for words in ("2 of 4: 1 done, 1 pruned, 0 failed", "trial 0, race score 8.25 s", "8,192", "51%"):
         assert words in view
 
 

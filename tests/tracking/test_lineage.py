@@ -43,9 +43,9 @@ def test_the_best_of_each_generation_stands_at_the_end(clan, call):
     assert ended.code == 0, ended.stderr
     last = [" ".join(line.split()) for line in ended.stdout.splitlines()[-3:]]
     assert last == [
-        "generation 0 completion 90.0 %, mean lap 11.00 s 1-root",
-        "generation 1 completion 90.0 %, mean lap 9.50 s 2-child",
-        "generation 2 completion 90.0 %, mean lap 10.00 s 4-grandchild",
+        "generation 0 completion 90.0%, mean lap 11.00 s 1-root",
+        "generation 1 completion 90.0%, mean lap 9.50 s 2-child",
+        "generation 2 completion 90.0%, mean lap 10.00 s 4-grandchild",
     ]
 
 
@@ -54,7 +54,7 @@ def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
     assert rows(ended.stdout, "4-grandchild", "<- this run")
     assert rows(ended.stdout, "2-child", "* best by mean lap")
     assert len(rows(ended.stdout, "<- this run")) == len(rows(ended.stdout, "* best")) == 1
-    assert rows(ended.stdout, "generation 2, from 000030, completion 90.0 %, mean lap 10.00 s")
+    assert rows(ended.stdout, "generation 2, from 000030, completion 90.0%, mean lap 10.00 s")
     assert rows(ended.stdout, "algorithm.lr 0.0001 -> 1e-05")
     assert "\x1b" not in ended.stdout
     assert all(line == line.rstrip() for line in ended.stdout.splitlines())
@@ -109,7 +109,7 @@ def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
     season.result(root, lap_share=0.5, best_lap_time_s=12.0, last={"completion": 61.0})
     season.result(season.clone("2", root), lap_share=0.9, best_lap_time_s=13.0)
     ended = call("runs", "lineage", "1")
-    assert rows(ended.stdout, "in training completion 61.0 %, best lap 12.00 s")
+    assert rows(ended.stdout, "in training completion 61.0%, best lap 12.00 s")
     assert rows(ended.stdout, "2", "* best by laps in training")
 
 

@@ -68,12 +68,12 @@ def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, r
 
 def test_points_wait_for_a_checkpoint_and_block_nothing_else(tracker, mlflow, wait_until, caplog):
     log(tracker, rows_until(10), safe=False)
-    tracker.set_tag("budget", "50 %")
+    tracker.set_tag("budget", "50%")
     wait_until(lambda: bool(tracker.run_id) and "budget" in mlflow.get_run(tracker.run_id).data.tags)
     assert points(mlflow, tracker.run_id) == []
     tracker.safe_until(400)
     wait_until(lambda: len(points(mlflow, tracker.run_id)) == 4)
-    tracker.set_tag("budget", "80 %")
+    tracker.set_tag("budget", "80%")
     assert tracker.finish("KILLED") == 0
     assert points(mlflow, tracker.run_id) == logged_until(4)
     assert not caplog.records
@@ -204,7 +204,7 @@ def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(st
     fast = train("fast", 8.7654321)
     of_run = mlflow.get_run(fast).data.tags["mlflow.note.content"]
     assert of_run.startswith("**finished**: converged: all")
-    assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0 % of the lap" in of_run
+    assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0% of the lap" in of_run
     assert f"(get-artifact?path=best_lap.png&run_uuid={fast})" in of_run
     assert of_run.endswith("as it began")
     assert "[fast]" in note_of_experiment()

@@ -61,13 +61,13 @@ def script(folder: Path, line: str) -> Path:
 
 def test_a_command_gets_the_message_and_the_runs_folder(tmp_path):
     command = script(tmp_path, f'printf "%s: %s in %s" "$@" > {tmp_path}/sent')
-    send(tmp_path, "80 % of budget.minutes used", f"budget.alert_command='{command} alert'")
-    assert (tmp_path / "sent").read_text() == f"alert: 80 % of budget.minutes used in {tmp_path}"
+    send(tmp_path, "80% of budget.minutes used", f"budget.alert_command='{command} alert'")
+    assert (tmp_path / "sent").read_text() == f"alert: 80% of budget.minutes used in {tmp_path}"
 
 
 def test_a_webhook_gets_the_message(tmp_path, webhook):
-    send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
-    assert webhook.posted == [{"text": "50 % used", "content": "50 % used"}]
+    send(tmp_path, "50% used", f"budget.alert_webhook={VARIABLE}")
+    assert webhook.posted == [{"text": "50% used", "content": "50% used"}]
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_webhook_that_fails_is_logged_without_its_address(tmp_path, webhook, c
     if is_down:
         webhook.server.shutdown()
         webhook.server.server_close()
-    send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
+    send(tmp_path, "50% used", f"budget.alert_webhook={VARIABLE}")
     assert words in caplog.text
     assert "secret-path" not in caplog.text
 
@@ -99,13 +99,13 @@ def test_a_command_that_fails_is_logged_with_its_last_line(tmp_path, monkeypatch
     caplog.set_level(logging.INFO)
     monkeypatch.chdir(tmp_path)
     script(tmp_path, "echo no such phone >&2; exit 7")
-    send(tmp_path, "50 % used", f"budget.alert_command={command}")
+    send(tmp_path, "50% used", f"budget.alert_command={command}")
     assert words in caplog.text
 
 
 def test_a_command_whose_quotes_do_not_close_is_refused(tmp_path):
     with pytest.raises(BadInput, match=r"budget\.alert_command=say 'it: No closing quotation"):
-        send(tmp_path, "50 % used", 'budget.alert_command="say \'it"')
+        send(tmp_path, "50% used", 'budget.alert_command="say \'it"')
 
 
 @pytest.mark.parametrize("address", [None, "hooks.example.com/x", "file:///etc/passwd"])
@@ -113,5 +113,5 @@ def test_a_webhook_whose_variable_holds_no_address_is_refused(tmp_path, monkeypa
     if address is not None:
         monkeypatch.setenv(VARIABLE, address)
     with pytest.raises(BadInput, match=f"budget.alert_webhook={VARIABLE}: ") as refusal:
-        send(tmp_path, "50 % used", f"budget.alert_webhook={VARIABLE}")
+        send(tmp_path, "50% used", f"budget.alert_webhook={VARIABLE}")
     assert address is None or address not in str(refusal.value)

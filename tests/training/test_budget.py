@@ -137,7 +137,7 @@ def test_shares_that_are_passed_together_are_one_alert():
     assert budget.alerts(0, 0, 0.0) == []
     (steps,) = budget.alerts(950, 0, 60.0)
     assert (steps.limit, steps.percent) == ("env_steps", 80)
-    assert steps.message == "80 % of budget.env_steps used: 950 steps of 1,000 steps"
+    assert steps.message == "80% of budget.env_steps used: 950 steps of 1,000 steps"
 
 
 def test_what_was_passed_before_a_run_began_is_not_reported_by_it(run):
@@ -146,7 +146,7 @@ def test_what_was_passed_before_a_run_began_is_not_reported_by_it(run):
     assert budget.alerts(0, 0, 0.0) == []
     assert budget.alerts(100, 0, 0.0) == []
     (alert,) = budget.alerts(200, 0, 0.0)
-    assert alert.message == "80 % of budget.experiment_env_steps used: 800 steps of 1,000 steps"
+    assert alert.message == "80% of budget.experiment_env_steps used: 800 steps of 1,000 steps"
 
 
 def test_it_reports_the_limits_that_are_set():

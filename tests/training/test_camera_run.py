@@ -72,10 +72,11 @@ def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_pat
     assert np.abs(theirs[0] - theirs[-1]).max() > 0
 
 
-def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(trained, call):
-    said = trained(*CAMERA).stderr.splitlines()
-    (line,) = (line for line in said if line.startswith("pictures: "))
-    assert "0.0 GB of memory for the 512 steps" in line
+def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(trained, copied, call):
+    started, resumed = trained(*CAMERA), call("resume", copied(*CAMERA).name, "budget.env_steps=1536")
+    for ended in (started, resumed):
+        (line,) = (line for line in ended.stderr.splitlines() if line.startswith("pictures: "))
+        assert "0.0 GB of memory for the 512 steps" in line
     big = "algorithm.frames_per_iteration=10000000"
     refused = call("train", *IN_PROCESS, "observation=camera", "name=big", big)
     assert refused.code == 2

@@ -31,7 +31,7 @@ ROW = {
     **{"lap_share": 0.96, "laps": 525, "best_lap_time_s": 9.33, "mean_lap_time_s": 10.65, "entropy": 1.538},
     **{"kl": 0.0123, "policy_loss": -0.01, "value_loss": 0.2, "lr": 3e-4, "env_steps_per_s": 15_096.4},
 }
-SHOWN = ["655,360", "99.5 %", "96 %", "of last 20", "525", "82.58", "1.538", "0.0003", "15,096", "2,489"]
+SHOWN = ["655,360", "99.5%", "96%", "of last 20", "525", "82.58", "1.538", "0.0003", "15,096", "2,489"]
 LAPS = ["9.33 s", "10.65 s"]
 TRACKS = tuple(f"track_{letter}" for letter in "abcdefghijklmnopqr")
 SEVERAL = dataclasses.replace(HEADER, track="18 tracks", track_labels=TRACKS)
@@ -83,9 +83,9 @@ def test_the_panel_fits_the_terminal_and_shows_every_figure_that_has_room(width,
     text = "\n".join(panel)
     assert len(panel) < height
     assert {len(line) for line in panel} == {min(width, 100)}
-    assert "67 %" in text
+    assert "67%" in text
     if width < 60:  # those that matter most
-        for word in ["iteration   40", "completion  99.5 %", "laps        525"]:
+        for word in ["iteration   40", "completion  99.5%", "laps        525"]:
             assert word in text, word
         return
     laps = LAPS if header is HEADER else []
@@ -112,7 +112,7 @@ def test_a_figure_that_is_not_known_yet_is_a_dash(missing, keys):
 
 
 def test_a_share_beyond_the_budget_is_shown_as_all_of_it():
-    assert "100 %" in "\n".join(screen(80, 24, HEADER, (ROW, 1.02, 0.0)))
+    assert "100%" in "\n".join(screen(80, 24, HEADER, (ROW, 1.02, 0.0)))
 
 
 def test_without_a_terminal_there_are_single_plain_lines():
@@ -121,7 +121,7 @@ def test_without_a_terminal_there_are_single_plain_lines():
     assert HEADER.actions in written[0]  # square brackets are text, not markup
     assert HEADER.folder in written[1]
     assert "\x1b" not in "".join(written)
-    words = ["67 %", "655,360 steps", "15,096/s", "82.58", "99.5 %", "525", "96 %", "9.33 s", "0:23 left"]
+    words = ["67%", "655,360 steps", "15,096/s", "82.58", "99.5%", "525", "96%", "9.33 s", "0:23 left"]
     assert not [word for word in words if word not in written[2]]
 
 
@@ -157,7 +157,7 @@ def test_a_plain_line_names_the_track_on_which_the_car_comes_least_far():
         # Nothing ended there in this iteration: what was known of it holds.
         display.update({**ROW_OF_TRACKS, "completion/track_h": None}, 0.6, 20.0)
 
-    assert "least 12.3 % on track_h" in lines(act, SEVERAL)[-1]
+    assert "least 12.3% on track_h" in lines(act, SEVERAL)[-1]
     assert "best lap" not in lines(act, SEVERAL)[-1]
 
 

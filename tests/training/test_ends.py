@@ -55,8 +55,8 @@ def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
     # Commands run beside the training and each other.
     sent = sorted((ended.cwd / "alerts.txt").read_text().splitlines())
     assert sent == [
-        "100 % of budget.env_steps used: 4,096 steps of 4,096 steps",
-        "50 % of budget.env_steps used: 2,048 steps of 4,096 steps",
+        "100% of budget.env_steps used: 4,096 steps of 4,096 steps",
+        "50% of budget.env_steps used: 2,048 steps of 4,096 steps",
     ]
     log = (ended.folder / "log.txt").read_text()
     assert all(message in log for message in sent)
@@ -108,7 +108,7 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
     name = f"{best['iteration']:06d}"
     assert str((ended.folder / "checkpoints" / "best").readlink()) == name
     assert f"checkpoint {name}, evaluated: " in ended.stdout
-    assert f"completion {best['eval_completion']:.1f} %" in ended.stdout
+    assert f"completion {best['eval_completion']:.1f}%" in ended.stdout
     found = findings(prepare(read_own_recording(ended.folder)))
     (submit,) = [one.sentence for one in found if one.rule == "submit"]
     assert submit.startswith(f"Race with checkpoint {name}, the best by race score: ")

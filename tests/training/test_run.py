@@ -56,7 +56,7 @@ def test_a_finished_run_says_so_and_names_its_folder(trained):
     assert ended.summary["reason"] == "budget reached: env_steps"
     assert ended.stdout.startswith("\nfinished: budget reached: env_steps\n")
     assert str(ended.folder.relative_to(ended.cwd)) in ended.stdout
-    assert "100 % · iteration 4 · 4,096 steps" in ended.stderr
+    assert "100% · iteration 4 · 4,096 steps" in ended.stderr
     assert "\x1b" not in ended.stderr + ended.stdout
 
 

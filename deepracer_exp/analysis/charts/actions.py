@@ -152,7 +152,7 @@ def zero_steering_top_speed(view: LogView) -> Chart | None:
         known = share[np.isfinite(share)]
         highest = max(float(np.percentile(known, 98)), 1.0) if len(known) else 100.0
         cells = grid.cells(share, "% of steps", value_range=(0.0, highest))
-        title = f"{name}: {100.0 * flag.mean():.0f} % of all"
+        title = f"{name}: {100.0 * flag.mean():.0f}% of all"
         panels.append(map_panel(view.course, [cells], title, numbers=False))
     return Chart(
         name="zero_steering_top_speed",

@@ -32,7 +32,7 @@ def lap_line(view: LogView) -> Chart | None:
     row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()]
     known = lap[lap["track_speed_mps"].notna()]
     hover = [
-        f"step {step.steps:.0f}, waypoint {step.closest_waypoint}, {step.progress:.1f} %\n"
+        f"step {step.steps:.0f}, waypoint {step.closest_waypoint}, {step.progress:.1f}%\n"
         f"driven {step.track_speed_mps:.2f} m/s, commanded {step.throttle:.2f} m/s, steering {step.steer:.1f}°"
         for step in known.itertuples()
     ]

@@ -75,7 +75,7 @@ def _histogram_panel(title: str, times_s: Values) -> Panel:
         layers.append(line(span, expected, FAINT, "normal distribution", width=1.5))
         for times, color in ((-2, ORANGE), (-3, VERMILION)):
             at = mean + times * deviation
-            marks.append((at, f"{times} sd {at:.2f} s: {100 * CHANCES[times]:.3f} %", color))
+            marks.append((at, f"{times} sd {at:.2f} s: {100 * CHANCES[times]:.3f}%", color))
     layers += [mark(at, label, color, in_legend=True) for at, label, color in marks]
     return Panel(title=f"{title} ({len(times_s)})", x_label="lap time, s", y_label="laps", layers=layers)
 

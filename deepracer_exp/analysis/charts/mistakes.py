@@ -72,7 +72,7 @@ def episode_ends_map(view: LogView) -> Chart | None:
         shown = here.iloc[subsample(len(here), 1500)]
         hover = [
             f"episode {row.episode}, iteration {row.iteration}\n"
-            f"waypoint {row.waypoint}, {row.progress:.1f} % of the lap"
+            f"waypoint {row.waypoint}, {row.progress:.1f}% of the lap"
             for row in shown.itertuples()
         ]
         placed.append(points(shown["X"], shown["Y"], color, symbol=symbol, size=6.0, hover=hover))
@@ -128,7 +128,7 @@ def off_track_risk(view: LogView) -> Chart | None:
     late_share = 100.0 * late_near_off / np.where(late_passes > 0, late_passes, np.nan)
     at, before = np.arange(n), off - late_off
     risk: list[Layer] = [
-        band(at, low, high, VERMILION, "95 % interval (Wilson)"),
+        band(at, low, high, VERMILION, "95% interval (Wilson)"),
         line(at, share, PALE, "all iterations"),
         line(at, late_share, VERMILION, "last third of the iterations"),
     ]
@@ -141,7 +141,7 @@ def off_track_risk(view: LogView) -> Chart | None:
     if view.course is not None:
         hover = [
             f"waypoint {k}: {late_near_off[k]:.0f} of {late_passes[k]:.0f} passes left the road near it\n"
-            f"{late_share[k]:.2f} %, 95 % interval {low[k]:.2f} to {high[k]:.2f} %"
+            f"{late_share[k]:.2f}%, 95% interval {low[k]:.2f} to {high[k]:.2f}%"
             for k in range(n)
         ]
         colors = (0.0, max(float(np.nanmax(late_share, initial=0.0)), 0.1))

@@ -56,7 +56,7 @@ def reward_map(view: LogView) -> Chart | None:
     if actions is not None:
         used = np.bincount(actions.number[actions.number >= 0], minlength=len(actions.names))
         titles = {
-            int(k): f"{actions.names[k]} ({100 * used[k] / used.sum():.0f} % of steps)"
+            int(k): f"{actions.names[k]} ({100 * used[k] / used.sum():.0f}% of steps)"
             for k in np.argsort(-used, kind="stable")[:_ACTIONS]
         }
         charts.append([panel(actions.number == k, title, coarse) for k, title in titles.items()])

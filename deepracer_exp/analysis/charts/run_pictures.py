@@ -208,7 +208,7 @@ def _result(episode: pd.Series) -> str:
     lap_s = float(episode["lap_time_s"])
     if math.isfinite(lap_s):
         return f"lap in {lap_s:.2f} s"
-    return f"{episode['progress']:.1f} % of the lap, {str(episode['status']).replace('_', ' ')}"
+    return f"{episode['progress']:.1f}% of the lap, {str(episode['status']).replace('_', ' ')}"
 
 
 def _draw_line(axes: Axes, rows: NDArray[np.float64], width: float, arrow: float) -> LineCollection:
