@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import optuna
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.result import with_unit
 
 if TYPE_CHECKING:
     from deepracer_exp.evaluation.result import Evaluation
@@ -113,7 +114,7 @@ def intermediate_value(row: Mapping[str, Any], objective: str, trial_time_s: flo
 def shown(objective: str, value: float) -> str:
     """Return a value with its unit: ``9.84 s``, ``97.3%``."""
     digits = 2 if MEASURES[objective].minimize else 1
-    return f"{value:.{digits}f} {MEASURES[objective].unit}"
+    return with_unit(f"{value:.{digits}f}", MEASURES[objective].unit)
 
 
 def shown_or_dash(objective: str, value: float | None) -> str:

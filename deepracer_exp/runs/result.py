@@ -33,6 +33,11 @@ FIGURES: tuple[tuple[str, str, str, int], ...] = (
 higher value is better (1) or a lower one (-1)."""
 
 
+def with_unit(number: str, unit: str) -> str:
+    """Return a number and its unit as English writes them: ``8.02 s``, ``97.3%``."""
+    return f"{number}%" if unit == "%" else f"{number} {unit}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunResult:
     """How good a run's best policy is."""
@@ -72,7 +77,7 @@ class RunResult:
         else:
             known = [(name, getattr(self, key), form) for name, key, form, _ in FIGURES]
         parts = [(*name.split(", "), form.format(value)) for name, value, form in known if value is not None]
-        text = ", ".join(f"{name} {value} {unit}" for name, unit, value in parts)
+        text = ", ".join(f"{name} {with_unit(value, unit)}" for name, unit, value in parts)
         if self.lap_time_s is None:
             text += ", no complete lap"
         return text if self.evaluated else f"in training {text}"

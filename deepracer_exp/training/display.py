@@ -39,7 +39,7 @@ _PERCENT, _LAP = 4, 7  # columns of per cent and lap time in it
 
 # What is shown of a row by its label: key, format and unit.
 _FIGURES = {
-    "completion": ("completion", ".1f", " %"),
+    "completion": ("completion", ".1f", "%"),
     "return": ("mean_return", ",.2f", ""),
     "entropy": ("entropy", ".3f", ""),
     "learn rate": ("lr", ".2g", ""),

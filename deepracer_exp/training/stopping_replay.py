@@ -13,6 +13,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.convergence import Decision, Row, StoppingRule, build_rule
 from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
+from deepracer_exp.runs.result import with_unit
 
 from .display import NOTHING
 
@@ -120,7 +121,7 @@ def table(replays: Sequence[Replay]) -> Table:
 def _of(value: float | None, whole: float | None, number: str, unit: str) -> str:
     if whole is None:
         return NOTHING
-    return f"{NOTHING if value is None else number.format(value)} of {number.format(whole)} {unit}"
+    return f"{NOTHING if value is None else number.format(value)} of {with_unit(number.format(whole), unit)}"
 
 
 def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) -> Decision | None:
