@@ -121,7 +121,7 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
 
     Of a sweep it is the run of its best trial, whatever else was trained under the same name. Otherwise runs whose
     best checkpoint was evaluated are ranked by that; where none was, by the share of complete laps and the fastest lap
-    of their training. The newest of equals is taken.
+    of their training. The newest of equals is taken, and a single run without results, such as an imported model.
 
     Raises:
         BadInput: there is no such experiment, none of its runs has a result, they cannot be ranked (another car,
@@ -144,6 +144,8 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
     results = {run: result for run in runs if (result := _result(run)) is not None}
     results = {run: one for run, one in results.items() if one.evaluated} or results
     if not results:
+        if len(runs) == 1 and (runs[0] / CHECKPOINTS / "best").is_dir():
+            return runs[0]
         raise BadInput(
             f"{what}: none of its {len(runs)} runs has a result and a checkpoint `best`; give a run"
         )

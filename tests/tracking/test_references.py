@@ -86,7 +86,15 @@ def test_an_experiment_is_a_name_and_no_path(season, name):
 
 def test_what_there_is_no_best_of_is_refused(season):
     season.run("1")
+    season.run("2")
     assert "(did you mean season?)" in refusal("best:seeson", season)
+    assert "none of its 2 runs has a result" in refusal("best:season", season)
+
+
+def test_a_single_run_with_a_checkpoint_needs_no_result(season):
+    run = season.run("1")  # as of an imported model
+    assert best(season) == "1"
+    (run / "checkpoints" / "best").unlink()
     assert "none of its 1 runs has a result" in refusal("best:season", season)
 
 
