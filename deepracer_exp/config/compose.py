@@ -401,6 +401,9 @@ def _unknown_key(entry: str, key: str, chosen: Composition) -> str:
     if siblings:
         option = f" with {parent}={chosen.choices[parent]}" if parent in chosen.choices else ""
         return f"{key}: no such key{option}{nearest(leaf, siblings)}; known: {', '.join(siblings)}"
+    within = [k for k in keys if k.startswith(f"{key}.")]
+    if within:
+        return f"{key}: no such group for {entry}; accepted: {', '.join(within)}"
     close = nearest(key, keys)
     if not close:
         # Perhaps the right key in the wrong group, or without one.
