@@ -217,7 +217,7 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
     low, high = map(float, wilson(faster, laps))
     complete, sd_s = laps / len(episodes), float(laps_s.std(ddof=1))
     sentence = (
-        f"{faster} of {count(laps, 'complete lap')} {when} took at most {target:.2f} s"
+        f"{faster:,} of {count(laps, 'complete lap')} {when} took at most {target:.2f} s"
         f"{', the fastest of them' if target_s is None else ''}: the chance of such a lap is {_share(low)} to "
         f"{_share(high)}"
     )
@@ -341,12 +341,15 @@ def _overfits(view: LogView) -> Finding | None:
     if found is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
     values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
-    sentence = f"No sign of overfitting: completion in the {found.evaluated} is {found.now:.0f}% "
-    sentence += f"(best {found.best:.0f}%)."
+    sentence = (
+        f"No sign of overfitting: completion in the last three {found.evaluated}s is {found.now:.0f}% on average "
+        f"(the best three in a row: {found.best:.0f}%)."
+    )
     if found.decision is not None:
         sentence = (
-            f"It overfits: completion in the {found.evaluated} fell from {found.best:.0f}% around iteration "
-            f"{found.best_iteration} to {found.now:.0f}% while the reward of the training holds. Take "
+            f"It overfits: completion in the {found.evaluated}s, three in a row on average, fell from "
+            f"{found.best:.0f}% around iteration {found.best_iteration} to {found.now:.0f}% while the reward of the "
+            "training holds. Take "
             f"{_instead(view, f'a checkpoint from about iteration {found.best_iteration}')}."
         )
         values |= found.decision.values
@@ -365,7 +368,7 @@ def _instead(view: LogView, of_the_service: str) -> str:
 
 
 def _share(share: float) -> str:
-    """Return it in per cent, with a digit more where it is small."""
-    if share >= 0.1 or share == 0:
+    """Return it in per cent, with a digit more near 0 and 100%."""
+    if 0.1 <= share <= 0.99 or share in (0, 1):
         return f"{share:.0%}"
     return f"{share:.1%}" if share >= 0.001 else "below 0.1%"

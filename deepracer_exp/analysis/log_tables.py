@@ -144,7 +144,7 @@ def headline(view: LogView) -> str:
     )
     laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
     if view.trained:
-        sentence = f"{steps} in {finished} and {count(len(view.iterations), 'iteration')}"
+        sentence = f"{steps} of training in {finished} and {count(len(view.iterations), 'iteration')}"
         if view.untraced:
             sentence += f"; {count(view.untraced, 'more episode')} known from metrics files only"
             laps = int(view.iterations["complete"].sum())

@@ -72,7 +72,9 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         resume = command_line("resume", word, config, [group for group in GROUPS if group != "stopping"])
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides
-        steps.append((f"{resume} budget.{limit}={2 * spent[limit]}", "continue it for as long again"))
+        budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}
+        again = [f"budget.{key}={2 * spent[key]}" for key, most in budget.items() if spent[key] >= most]
+        steps.append((" ".join([resume, *again]), "continue it for as long again"))
     return steps
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import logging
+import signal
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED
+from deepracer_exp.runs.result import FAILED, FINISHED
 from deepracer_exp.runs.trace import TraceWriter
 from deepracer_exp.sim.batch import cores
 
@@ -409,7 +410,7 @@ class Trainer:
 
     def _check_interruption(self) -> None:
         if self.is_interrupted:
-            self.stop_reason = INTERRUPTED
+            self.stop_reason = "by Ctrl-C" if self._interruption.signum == signal.SIGINT else "by SIGTERM"
 
     def _call(self, hook: str, *arguments: Any) -> None:
         for callback in self.callbacks:

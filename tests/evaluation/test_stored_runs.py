@@ -119,7 +119,10 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
         (("evaluate", "x", "evaluation=sumit"), ("sumit", "summit")),
         (("evaluate", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
         (("evaluate", "x", "evaluation.trials=0"), ("evaluation.trials=0",)),
-        (("evaluate", "x", "tracking=off"), ("tracking: no such group for evaluate", "accepted: tracking.uri")),
+        (
+            ("evaluate", "x", "tracking=off"),
+            ("tracking: no such group for evaluate", "accepted: tracking.uri"),
+        ),
         (("evaluate", "x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
         (("checkpoints", "nowhere"), ("nowhere: no such run",)),
         (("checkpoints", "evaluation=summit"), ("RUN: missing",)),

@@ -17,7 +17,7 @@ def _assert_whole(ended, code):
     assert (ended.folder / "best_lap.png").is_file()
     assert "Traceback" not in ended.stderr
     assert "deepracer-exp: " not in ended.stderr
-    assert ended.stdout.startswith("\ninterrupted: ")
+    assert ended.stdout.startswith(f"\ninterrupted: by {'Ctrl-C' if code == 130 else 'SIGTERM'}")
     assert not (ended.folder / ".heartbeat").exists()
 
 

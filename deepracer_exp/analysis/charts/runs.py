@@ -27,8 +27,6 @@ _CURVES = {
     "lap_time_p25_s": ("Lap time, 25th percentile", "lap time, s"),
     "entropy": ("Entropy of the policy", "nats"),
 }
-_SMOOTHED = 5
-"""Iterations in the moving average of a learning curve."""
 _PLACES = 150
 """Points of a curve of several runs."""
 _TIME = re.compile(r"^\d{8}-\d{6}-")
@@ -231,7 +229,7 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
             columns = [one for one in rows if one.startswith(f"{column}/")] or [column]
             # Not every iteration ends an episode on every track.
             values = rows[columns].astype(float).ffill().mean(axis=1, skipna=False)
-            curve = values.rolling(_SMOOTHED, min_periods=1).mean()
+            curve = moving_average(values.to_numpy())
             color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
             name = None if panels else f"{label}  {record.name}"
             layers.append(line(rows["env_steps"] / 1000, curve, color, name, dashed=dashed))
@@ -250,7 +248,7 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     return Chart(
         name="learning_curves_compared",
         title="Learning curves and lap times",
-        caption=f"Lines are moving averages of {_SMOOTHED} iterations.",
+        caption="Lines are moving averages of three iterations.",
         rows=in_rows(panels),
     )
 
