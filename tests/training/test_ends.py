@@ -118,8 +118,9 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
 
 
 def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
-    copied("budget.iterations=1")
-    ended = trained("budget.iterations=1")
+    limits = ("budget.iterations=1", "budget.env_steps=1")  # reached by the same iteration
+    copied(*limits)
+    ended = trained(*limits)
     begin = ended.stdout.index("\n  next\n")
     lines = [shlex.split(line, comments=True) for line in ended.stdout[begin:].splitlines()[2:]]
     assert [line[1] for line in lines] == ["evaluate", "evaluate", "clone", "resume"]
