@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.runs.files import RUN, run_folders
+from deepracer_exp.runs.files import BEST, RUN, run_folders
 
 STORES = ("runs_dir", "tracking.uri")
 """Where runs are, and the MLflow store in which ids and aliases are looked up."""
@@ -175,10 +175,12 @@ def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
 
 
 def complete_runs(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    """Return the names of runs that begin with what was typed."""
+    """Return the names of runs that begin with what was typed, and the best run of each experiment."""
     words = [word for word in _words(parsed_args) if is_override(word)]
-    found = run_folders(split_stores(words)[0].runs_dir, prefix)
-    return [folder.name for folder in found] + complete_overrides(prefix, parsed_args)
+    runs_dir = split_stores(words)[0].runs_dir
+    names = [folder.name for folder in run_folders(runs_dir, prefix)]
+    best = sorted({f"{BEST}{folder.parent.name}" for folder in run_folders(runs_dir)})
+    return names + best + complete_overrides(prefix, parsed_args)
 
 
 def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:

@@ -38,6 +38,8 @@ BEST_OF_SWEEP = "best_of_sweep.json"
 """Beside the runs of a sweep."""
 MLFLOW_DB = "mlflow.db"
 """In `runs_dir`."""
+BEST = "best:"
+"""Before the name of an experiment: its best run."""
 RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
 """What commands accept for a run."""
 

@@ -18,12 +18,10 @@ from deepracer_exp.tracking.registry import Registered, is_alias, look_up
 from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
 from .checkpoint_files import LINKS, checkpoint_sha256, verify
-from .files import BEST_OF_SWEEP, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
+from .files import BEST, BEST_OF_SWEEP, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
 from .result import RunResult, read_result
 
 logger = logging.getLogger("deepracer_exp")
-
-BEST = "best:"
 
 
 @dataclass(frozen=True)

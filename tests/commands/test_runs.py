@@ -93,6 +93,7 @@ def test_listing_runs_imports_neither_mlflow_nor_torch(tmp_path):
         ("evaluate 2026", "20260101-120000-mine"),
         ("evaluate evaluation=su", "summit"),
         ("runs lineage runs_dir=there 2025", "20250101-120000-theirs"),
+        ("clone best:", "a"),  # the shell takes what follows the colon for a word of its own
         ("tracks Oval", "Oval_track"),
     ],
 )
