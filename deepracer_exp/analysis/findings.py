@@ -342,14 +342,13 @@ def _overfits(view: LogView) -> Finding | None:
         return None
     values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
     sentence = (
-        f"No sign of overfitting: completion in the last three {found.evaluated}s is {found.now:.0f}% on average "
-        f"(the best three in a row: {found.best:.0f}%)."
+        f"No sign of overfitting: the mean completion of the last three {found.evaluated}s is {found.now:.0f}% "
+        f"(best three in a row: {found.best:.0f}%)."
     )
     if found.decision is not None:
         sentence = (
-            f"It overfits: completion in the {found.evaluated}s, three in a row on average, fell from "
-            f"{found.best:.0f}% around iteration {found.best_iteration} to {found.now:.0f}% while the reward of the "
-            "training holds. Take "
+            f"It overfits: the mean completion of three {found.evaluated}s in a row fell from {found.best:.0f}% "
+            f"around iteration {found.best_iteration} to {found.now:.0f}% while the reward of the training holds. Take "
             f"{_instead(view, f'a checkpoint from about iteration {found.best_iteration}')}."
         )
         values |= found.decision.values

@@ -175,12 +175,11 @@ def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
 
 
 def complete_runs(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    """Return the names of runs that begin with what was typed, and the best run of each experiment."""
+    """Return the names of all runs, and of the best run of each experiment."""
     words = [word for word in _words(parsed_args) if is_override(word)]
-    runs_dir = split_stores(words)[0].runs_dir
-    names = [folder.name for folder in run_folders(runs_dir, prefix)]
-    best = sorted({f"{BEST}{folder.parent.name}" for folder in run_folders(runs_dir)})
-    return names + best + complete_overrides(prefix, parsed_args)
+    folders = run_folders(split_stores(words)[0].runs_dir)
+    best = sorted({f"{BEST}{folder.parent.name}" for folder in folders})
+    return [folder.name for folder in folders] + best + complete_overrides(prefix, parsed_args)
 
 
 def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:

@@ -1,6 +1,5 @@
 """The files of a run folder: their names, and what a training wrote into them."""
 
-import glob
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -49,9 +48,9 @@ def is_run(folder: Path) -> bool:
     return (folder / CONFIG).is_file()
 
 
-def run_folders(runs_dir: Path, beginning: str = "") -> list[Path]:
-    """Return the folders of the runs whose names begin so, of all experiments."""
-    return sorted(file.parent for file in runs_dir.glob(f"*/{glob.escape(beginning)}*/{CONFIG}"))
+def run_folders(runs_dir: Path) -> list[Path]:
+    """Return the folders of the runs of all experiments."""
+    return sorted(file.parent for file in runs_dir.glob(f"*/*/{CONFIG}"))
 
 
 @dataclass(frozen=True)

@@ -269,7 +269,7 @@ def test_evaluations_that_fall_while_the_training_holds_are_overfitting(
 ) -> None:
     found = of(training(completions, evaluated=evaluated), "overfits")
     words = (
-        "It overfits: completion in the evaluations, three in a row on average, fell from 90%"
+        "It overfits: the mean completion of three evaluations in a row fell from 90%"
         if overfits
         else "No sign of overfitting"
     )
