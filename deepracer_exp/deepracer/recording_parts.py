@@ -22,7 +22,7 @@ from .training_log import MARKER, TrainingLog, piece_of, read_training_logs
 
 MOST_LISTED = 20
 """Lines of one file that are listed one by one; the rest is counted."""
-_NUMBER = re.compile(r"(\d{1,9})-iteration")
+_NUMBER = re.compile(r"(?<!\d)(\d{1,6})-iteration")
 _METADATA = re.compile(r"model_metadata.*\.json")
 _HYPERPARAMETERS = re.compile(r"hyper_?parameters.*?(?:\.json)?")
 _PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")

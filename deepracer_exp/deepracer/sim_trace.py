@@ -35,12 +35,14 @@ LOG_LAYOUTS: Layouts = {
     19: (*COMMON, *LATER),
 }
 _EARLIEST_CLOCK_S = 1e8
-_WHOLE = ("episode", "steps", "closest_waypoint")
+# Figures and tables have a place for every waypoint and action up to the highest.
+_WHOLE = {"episode": 2**31 - 1, "steps": 2**31 - 1, "closest_waypoint": 99_999}
+"""Columns of whole numbers and their largest values."""
+_LARGEST_ACTION = 9_999
 _FLAGS = ("done", "all_wheels_on_track")
 _TRUE, _FALSE = ("True", "true", "1"), ("False", "false", "0")
 _STATUS = re.compile(r"[A-Za-z_ ]{0,40}")
 _CHUNK = 1024
-_LARGEST = 2**31 - 1
 _HEADER = b"episode"
 MOST_STEPS = 4_000_000
 """Control steps of a recording that are held in memory: 74 hours of driving at 15 a second. A report of so many takes
@@ -288,7 +290,9 @@ def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Tab
         elif name in _WHOLE:
             numbers = column.to_numpy()
             # A NaN makes every comparison false.
-            if not (((numbers >= 0) & (numbers <= _LARGEST)).all() and (numbers == np.floor(numbers)).all()):
+            if not (
+                ((numbers >= 0) & (numbers <= _WHOLE[name])).all() and (numbers == np.floor(numbers)).all()
+            ):
                 return None
             column = numbers.astype(np.int32)
         elif name == "action":
@@ -298,6 +302,10 @@ def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Tab
         elif name == "episode_status":
             words = {word for chunk in column.chunks for word in chunk.dictionary.to_pylist()}
             if any(word != word.strip() or not _STATUS.fullmatch(word) for word in words):
+                return None
+        elif name == "track_len":
+            numbers = column.to_numpy()
+            if not ((numbers > 0) & (numbers < math.inf)).all():
                 return None
         elif pa.types.is_floating(kind) and name not in LATER and not np.isfinite(column.to_numpy()).all():
             return None
@@ -313,7 +321,7 @@ def _actions(column: pa.ChunkedArray) -> pa.ChunkedArray | None:
     except pa.ArrowInvalid:
         return None
     discrete = numbers.to_numpy()[~continuous.to_numpy()]
-    return numbers if np.isfinite(discrete).all() else None
+    return numbers if (np.abs(discrete) <= _LARGEST_ACTION).all() else None
 
 
 def _read_slowly(lines: Sequence[bytes], layouts: Layouts) -> tuple[pa.Table, list[tuple[int, str]]]:
@@ -368,11 +376,15 @@ def _value(name: str, value: str) -> float | bool | str:
         return math.nan
     number = _number(name, value)
     if name in _WHOLE:
-        if not (0 <= number <= _LARGEST and number == math.floor(number)):
-            raise ValueError(f"{name} is {_short(value)}; accepted: a whole number from 0")
+        if not (0 <= number <= _WHOLE[name] and number == math.floor(number)):
+            raise ValueError(f"{name} is {_short(value)}; accepted: a whole number from 0 to {_WHOLE[name]}")
         return int(number)
     if name not in LATER and not math.isfinite(number):
         raise ValueError(f"{name} is {_short(value)}; accepted: a finite number")
+    if name == "track_len" and number <= 0:
+        raise ValueError(f"{name} is {_short(value)}; accepted: a length above 0")
+    if name == "action" and abs(number) > _LARGEST_ACTION:
+        raise ValueError(f"{name} is {_short(value)}; accepted: an action up to {_LARGEST_ACTION}")
     return number
 
 

@@ -153,6 +153,31 @@ def test_bad_rows_of_a_csv_are_listed_with_their_numbers(tmp_path):
     assert recording.problems[1].reason == "episode is 'x'; accepted: a number"
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "accepted"),
+    [
+        ("closest_waypoint", "2000000000", "a whole number from 0 to 99999"),
+        ("action", "2000000000", "an action up to 9999"),
+        ("track_len", "0.0", "a length above 0"),
+    ],
+)
+def test_values_that_no_track_and_no_policy_has_are_listed(tmp_path, column, value, accepted):
+    lines = made.csv_text(ROWS).splitlines()
+    values = lines[4].split(",")
+    values[lines[0].split(",").index(column)] = value
+    (tmp_path / "0-iteration.csv").write_text("\n".join([*lines[:4], ",".join(values), *lines[5:]]))
+    recording = read_recording(tmp_path)
+    assert len(recording.steps) == len(ROWS) - 1
+    assert [problem.reason for problem in recording.problems] == [
+        f"{column} is '{value}'; accepted: {accepted}"
+    ]
+
+
+def test_a_date_in_the_name_of_a_trace_is_not_its_iteration(tmp_path):
+    (tmp_path / "20220611230353-iteration.csv").write_text(made.csv_text(ROWS))
+    assert read_recording(tmp_path).steps["iteration"].max() < len(ROWS)
+
+
 def test_many_bad_lines_are_counted(tmp_path):
     (tmp_path / "a.log").write_text(made.log_text(ROWS) + "SIM_TRACE_LOG:rubbish\n" * 500)
     recording = read_recording(tmp_path)
