@@ -12,7 +12,14 @@ from deepracer_exp.deepracer.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 
-from .log_course import catalogue_track, directed, estimated_course, find_courses, numbered_as_logged
+from .log_course import (
+    catalogue_track,
+    directed,
+    estimated_course,
+    find_courses,
+    numbered_as_logged,
+    was_driven_on,
+)
 from .tables import add_derived, candidates, episode_table, first_rows, iteration_table
 
 DISCOUNT = Hyperparameters().discount_factor
@@ -171,7 +178,10 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     driven_on = steps[here]
     course = tracks.get(name)
     if track is not None and track not in logged:
-        course, problems = directed(catalogue_track(track), catalogue_track(track, True), driven_on), ()
+        known, problems = course, ()
+        course = directed(catalogue_track(track), catalogue_track(track, True), driven_on)
+        if known is not None and not was_driven_on(course, driven_on):
+            raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {known.name}")
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
     trained, episodes = _episodes(steps, here & training, course, discount)

@@ -113,6 +113,14 @@ def test_of_several_courses_the_most_driven_one_is_shown_unless_another_is_asked
         prepare(both, "Monaco")
 
 
+@pytest.mark.parametrize("name", ["reinvent_base", ""])
+def test_another_track_than_the_one_driven_on_is_refused(name: str) -> None:
+    recording = renamed(made_up_recording([Drive()]), name)
+    with pytest.raises(BadInput, match=r"track=Bowtie_track was not driven on; accepted: reinvent_base"):
+        prepare(recording, "Bowtie_track")
+    assert prepare(recording, "reinvent_base").course is not None
+
+
 def test_a_run_of_ours_has_its_courses_in_its_configuration(tmp_path: Path) -> None:
     knots = catalogue_track("Oval_track").waypoints[:-1:4].tolist()
     overrides = ["track.name=mine", f"track.knots={knots}".replace(" ", ""), "track.width_m=0.67"]
