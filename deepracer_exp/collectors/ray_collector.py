@@ -27,8 +27,6 @@ from .worker import EnvFactory
 _LOOK_EVERY_S = 0.2
 _REPORT_EVERY_S = 0.5
 _START_TIMEOUT_S = 120.0
-_LONGEST_PRINTS = 10_000_000
-"""Most bytes of the file of prints, as on one machine."""
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -63,7 +61,8 @@ class KeptPrints(RewardPrints):
         self._lines.clear()
         return text
 
-    def _write(self, text: str) -> None:
+    def write(self, text: str) -> None:
+        """Keep lines."""
         self._lines.append(text)
 
 
@@ -154,6 +153,7 @@ class RayCollector(Collector):
 
         assert config.processes is not None
         self._ray, self._policy, self._run_dir = ray, policy, run_dir
+        self._prints = RewardPrints(run_dir / REWARD_PRINTS)
         self._hang_timeout_s = config.hang_timeout_s
         self._begun_from = state or {}
         self._began = False
@@ -216,10 +216,8 @@ class RayCollector(Collector):
 
     def _joined(self, parts: Sequence[tuple[dict[Any, np.ndarray], str]]) -> TensorDictBase:
         printed = "".join(text for _, text in parts)
-        file = self._run_dir / REWARD_PRINTS
-        if printed and (not file.exists() or file.stat().st_size + len(printed) <= _LONGEST_PRINTS):
-            with file.open("a", encoding="utf-8", errors="backslashreplace") as out:
-                out.write(printed)
+        if printed:
+            self._prints.write(printed)
         batches = [batch for batch, _ in parts]
         # One copy: what Ray returns cannot be written.
         whole = {

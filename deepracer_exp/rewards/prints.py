@@ -1,10 +1,10 @@
 """The log of what reward functions print."""
 
-import os
 import time
 from collections.abc import Callable
+from os import SEEK_END
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 
 class RewardPrints:
@@ -13,20 +13,19 @@ class RewardPrints:
     Several processes may share the file: each line is one write to a file opened for appending. The rate
     (a bucket of one second's lines) is kept per process, the size per file. A print never fails a run: lines
     beyond a limit are dropped and counted in `dropped`, as are all lines after a disk error, which is kept in
-    `error`. Dropped lines are reported in the log before the next line, and by `close`.
+    `error`. Dropped lines are reported in the log before the next line.
     """
 
     def __init__(self, path: Path, lines_per_s: float = 100.0, max_bytes: int = 10_000_000) -> None:
         self.path = path
         self.lines_per_s = lines_per_s
         self.max_bytes = max_bytes
-        self.written = 0
         self.dropped = 0
         self.error: OSError | None = None
         self._reported = 0
         self._credit = lines_per_s
         self._filled_at = time.monotonic()
-        self._file: int | None = None
+        self._file: BinaryIO | None = None
         self._full = False
 
     def printer(self, car: int | None) -> Callable[..., None]:
@@ -43,19 +42,9 @@ class RewardPrints:
             # The rate is checked first: a dropped print must be cheap.
             if self._may_write():
                 text = (" " if sep is None else sep).join(map(str, values))
-                self._write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
+                self.write("".join(f"{prefix}{line}\n" for line in text.split("\n")))
 
         return reward_print
-
-    def close(self) -> None:
-        """Report what was dropped since the last line and close the file."""
-        if self._file is None:
-            return
-        self._full = False
-        self._report()
-        if self._file is not None:
-            os.close(self._file)
-        self._file = None
 
     def _may_write(self) -> bool:
         now = time.monotonic()
@@ -67,34 +56,21 @@ class RewardPrints:
         self._credit -= 1.0
         return True
 
-    def _write(self, text: str) -> None:
-        data = text.encode("utf-8", errors="backslashreplace")
+    def write(self, text: str) -> None:
+        """Append whole lines, unless the log is full or cannot be written."""
+        left_out = self.dropped - self._reported
+        note = f"[{left_out} prints left out]\n" if left_out else ""
+        data = (note + text).encode("utf-8", errors="backslashreplace")
         try:
             if self._file is None:
-                flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_CLOEXEC", 0)
-                self._file = os.open(self.path, flags, 0o644)
-            if os.fstat(self._file).st_size + len(data) > self.max_bytes:
+                # Unbuffered: each call is one write, and the file is closed with its owner.
+                self._file = self.path.open("ab", buffering=0)
+            if self._file.seek(0, SEEK_END) + len(data) > self.max_bytes:
                 self.dropped += 1
                 self._full = True
                 return
-            self._report()
-            os.write(self._file, data)
-            self.written += 1
-        except OSError as error:
-            self._give_up(error)
-
-    def _report(self) -> None:
-        left_out = self.dropped - self._reported
-        if left_out and self._file is not None:
+            self._file.write(data)
             self._reported = self.dropped
-            try:
-                os.write(self._file, f"[{left_out} prints left out]\n".encode())
-            except OSError as error:
-                self._give_up(error)
-
-    def _give_up(self, error: OSError) -> None:
-        self.error = error
-        self.dropped += 1
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
+        except OSError as error:
+            self.error, self._file = error, None
+            self.dropped += 1

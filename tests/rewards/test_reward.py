@@ -320,7 +320,6 @@ def test_prints_go_to_the_log_and_nowhere_else(tmp_path: Path, capfd: pytest.Cap
     text = "print('made')\ndef reward_function(params):\n    print('x is', params['x'])\n    return 1.0\n"
     function(text, prints=prints)(columns(3), ROAD)
     function(text)(columns(3), ROAD)
-    prints.close()
     log = prints.path.read_text().splitlines()
     assert log == [f"car {i}: made" for i in range(3)] + [f"car {i}: x is {i}.0" for i in range(3)]
     assert capfd.readouterr() == ("", "")
