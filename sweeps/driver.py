@@ -45,6 +45,8 @@ class Driver:
         self._losses = 0
         """Workers that died since a trial last ended."""
         self._ended = -1
+        self._ended_before: frozenset[int] = frozenset()
+        """Places of the trials that an earlier start has ended."""
 
     def run(self, interruption: Interruption) -> int | None:
         """Return when all trials are made: None, or the exit code when interrupted.
@@ -54,7 +56,9 @@ class Driver:
         """
         self._config.folder.mkdir(parents=True, exist_ok=True)
         # Workers killed on this machine, mostly with their driver: their trials need not wait until a lease runs out.
-        for owner in {one.owner for one in self._look() if one.result is None and is_gone(one.owner)}:
+        found = self._look()
+        self._ended_before = frozenset(one.index for one in found if one.result is not None)
+        for owner in {one.owner for one in found if one.result is None and is_gone(one.owner)}:
             self._release(owner)
         try:
             for _ in range(self._launcher.workers):
@@ -127,7 +131,10 @@ class Driver:
         return claims
 
     def _give_up_if_all_fail(self, claims: Sequence[Claim]) -> None:
-        results = [one.result for one in claims if one.result is not None]
+        # Those of an earlier start do not count: what made them fail may be mended.
+        results = [
+            one.result for one in claims if one.result is not None and one.index not in self._ended_before
+        ]
         if len(results) < min(_FEW, self._config.config.trials) or any(
             one.state != "FAIL" for one in results
         ):

@@ -135,7 +135,7 @@ def test_the_same_error_of_several_runs_is_counted_as_one(tmp_path):
     def failed(number: int) -> SimpleNamespace:
         file = tmp_path.resolve() / f"20261122-12000{number}-seed0" / "metrics.jsonl"
         attrs = {"reason": f"{file}: cannot be read"}
-        return SimpleNamespace(result=SimpleNamespace(state="FAIL", attrs=attrs))
+        return SimpleNamespace(index=number, result=SimpleNamespace(state="FAIL", attrs=attrs))
 
     config = SimpleNamespace(config=SimpleNamespace(trials=9), folder=tmp_path, study="s")
     driver = Driver(
@@ -145,3 +145,8 @@ def test_the_same_error_of_several_runs_is_counted_as_one(tmp_path):
     with pytest.raises(RunFailed, match=words) as refused:
         driver._give_up_if_all_fail([failed(number) for number in range(3)])
     assert "\n" not in str(refused.value)
+    # Started again: what made them fail may be mended.
+    driver._ended_before = frozenset(range(3))
+    driver._give_up_if_all_fail([failed(number) for number in range(5)])
+    with pytest.raises(RunFailed, match="all 3 trials so far failed"):
+        driver._give_up_if_all_fail([failed(number) for number in range(6)])
