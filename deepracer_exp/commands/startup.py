@@ -145,9 +145,3 @@ def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.wo
         del os.environ["OMP_NUM_THREADS"]
     else:
         os.environ["OMP_NUM_THREADS"] = before
-
-
-def has_workers(run_dir: Path) -> bool:
-    """Return whether a run collects in worker processes on this machine."""
-    collector = read_config(run_dir).get("collector")
-    return isinstance(collector, dict) and collector.get("mode") in ("sync", "async")

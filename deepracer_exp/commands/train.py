@@ -26,7 +26,6 @@ from .startup import (
     check_run,
     check_sweep,
     check_teacher,
-    has_workers,
     start_workers_early,
 )
 
@@ -186,7 +185,7 @@ def _resume(args: argparse.Namespace) -> int:
         return _deliver(run_dir, stores.uri, error)
     import_own_classes(experiment)
     print_start()
-    start_workers_early(has_workers(run_dir))
+    start_workers_early(experiment.collector.forks)
 
     from rich.console import Console
 
@@ -238,7 +237,7 @@ def _clone(args: argparse.Namespace) -> int:
     check_files(experiment)
     refuse_other_networks(parent.experiment, experiment)
     print_start()
-    start_workers_early(has_workers(parent.path))
+    start_workers_early(experiment.collector.forks)
 
     from rich.console import Console
 
