@@ -46,7 +46,7 @@ class Driver:
         """Workers that died since a trial last ended."""
         self._ended = -1
         self._ended_before: frozenset[int] = frozenset()
-        """Places of the trials that an earlier start has ended."""
+        """Places of the trials that ended before this start."""
 
     def run(self, interruption: Interruption) -> int | None:
         """Return when all trials are made: None, or the exit code when interrupted.
@@ -131,13 +131,12 @@ class Driver:
         return claims
 
     def _give_up_if_all_fail(self, claims: Sequence[Claim]) -> None:
-        # Those of an earlier start do not count: what made them fail may be mended.
-        results = [
-            one.result for one in claims if one.result is not None and one.index not in self._ended_before
-        ]
-        if len(results) < min(_FEW, self._config.config.trials) or any(
-            one.state != "FAIL" for one in results
-        ):
+        ended = {one.index: one.result for one in claims if one.result is not None}
+        if any(result.state != "FAIL" for result in ended.values()):
+            return
+        # Failures of an earlier start do not count: their cause may be mended.
+        results = [result for index, result in ended.items() if index not in self._ended_before]
+        if len(results) < min(_FEW, self._config.config.trials - len(self._ended_before)):
             return
         # The same error names the file of another run in each.
         folder = re.escape(str(self._config.folder.resolve())) + r"/[^/\s:]+"

@@ -145,7 +145,7 @@ def test_the_same_error_of_several_runs_is_counted_as_one(tmp_path):
     with pytest.raises(RunFailed, match=words) as refused:
         driver._give_up_if_all_fail([failed(number) for number in range(3)])
     assert "\n" not in str(refused.value)
-    # Started again: what made them fail may be mended.
+    # Started again: the cause may be mended.
     driver._ended_before = frozenset(range(3))
     driver._give_up_if_all_fail([failed(number) for number in range(5)])
     with pytest.raises(RunFailed, match="all 3 trials so far failed"):

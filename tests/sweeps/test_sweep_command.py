@@ -142,6 +142,11 @@ def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_p
     assert states.count(TrialState.FAIL) >= 3
     assert TrialState.PRUNED not in states
     assert all("ZeroDivisionError" in t.user_attrs["traceback"] for t in load(tmp_path, "f").trials[:3])
+    failed = states.count(TrialState.FAIL)
+    again = start("sweep", "study=f").end()
+    assert again.code == 3, again.stderr
+    assert "trials so far failed" in again.complaint
+    assert [trial.state for trial in load(tmp_path, "f").trials].count(TrialState.FAIL) >= failed + 3
 
 
 @pytest.mark.slow
