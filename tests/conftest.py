@@ -32,6 +32,9 @@ __all__ = ["chromium", "postgres", "postgres_server", "tab"]
 settings.register_profile("no_deadline", deadline=None)
 settings.load_profile("no_deadline")
 
+# A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 def pytest_collection_finish() -> None:
     """Leave what is imported so far out of garbage collection, which took a seventh of the time."""

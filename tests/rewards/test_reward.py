@@ -153,13 +153,8 @@ CTRL_C = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
     ],
 )
 def test_ctrl_c_is_the_users_even_if_the_reward_swallows_it(body: str) -> None:
-    # A job that a script starts in the background ignores Ctrl-C.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            function(body)(columns(3), ROAD)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt):
+        function(body)(columns(3), ROAD)
 
 
 def test_a_second_sigterm_while_the_reward_runs_is_not_its_fault() -> None:
