@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
 from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import (
     BasePruner,
@@ -14,10 +15,9 @@ from optuna.pruners import (
     MedianPruner,
     PatientPruner,
     PercentilePruner,
-    WilcoxonPruner,
 )
 from optuna.study import Study, StudyDirection
-from optuna.trial import FrozenTrial, TrialState, create_trial
+from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
@@ -106,32 +106,17 @@ def is_worse_across_seeds(study: Study, values: Sequence[float]) -> bool:
     in their user attributes.
     """
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if not complete or len(study.directions) > 1:
+    if not complete or len(study.directions) > 1 or len(values) < 2:
         return False
-    rival = [run["value"][0] for run in study.best_trial.user_attrs["runs"]]
-    level = max(_LEVEL, 1.01 * 0.5 ** (len(rival) - 1))
-    with warnings.catch_warnings():
-        # Experimental in Optuna, whose version is pinned.
-        warnings.simplefilter("ignore", ExperimentalWarning)
-        pruner = WilcoxonPruner(p_threshold=level)
-    # The best trial's same seeds only: its mean over more of them would say nothing about these.
-    return pruner.prune(_BySeed(study.direction, _by_seed(rival[: len(values)])), _by_seed(values))
+    from scipy.stats import wilcoxon  # takes a second, and few sweeps use it
 
-
-class _BySeed(Study):
-    """A study whose best trial has a value per seed instead of per evaluation; the pruner asks for nothing else."""
-
-    def __init__(self, direction: StudyDirection, best: FrozenTrial):
-        self._direction, self._best = direction, best
-
-    @property
-    def direction(self) -> StudyDirection:
-        return self._direction
-
-    @property
-    def best_trial(self) -> FrozenTrial:
-        return self._best
-
-
-def _by_seed(values: Sequence[float]) -> FrozenTrial:
-    return create_trial(value=sum(values) / len(values), intermediate_values=dict(enumerate(values)))
+    best = [run["value"][0] for run in study.best_trial.user_attrs["runs"]]
+    # Its mean over more seeds would say nothing about these.
+    behind = np.subtract(values, best[: len(values)])
+    if study.direction == StudyDirection.MAXIMIZE:
+        behind = -behind
+    level = max(_LEVEL, 1.01 * 0.5 ** (len(best) - 1))
+    # zsplit: two seeds may be equal.
+    return bool(
+        behind.mean() > 0 and wilcoxon(behind, alternative="greater", zero_method="zsplit").pvalue < level
+    )

@@ -164,7 +164,6 @@ def _analyze(args: argparse.Namespace) -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.evaluation import checked_checkpoint_name
     from deepracer_exp.config.own_class import allow_given
 
     given, overrides = runs_and_overrides(args)
@@ -176,8 +175,6 @@ def _compare(args: argparse.Namespace) -> int:
     name, logs = given
     _check_output(args.output)
     chosen = stores.values.get("checkpoint")
-    with reading(f"checkpoint={chosen}"):
-        chosen = chosen and checked_checkpoint_name(chosen)
     place = _logs(logs)
     if place is None and not is_run(Path(name)) and _logs(name) is not None:
         raise BadInput(f"{name}: is no run; write {shlex.join(['deepracer-exp', 'compare', logs, name])}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import TYPE_CHECKING, Any
 
-from deepracer_exp.errors import BadInput, count, reading, writing
+from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY, run_folders
 
 from .arguments import (
@@ -356,7 +356,6 @@ def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
 def _promote(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.next_steps import command_line
     from deepracer_exp.config.driving import ObservationConfig
-    from deepracer_exp.config.evaluation import checked_checkpoint_name
     from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
     from deepracer_exp.runs.files import read_config
@@ -368,9 +367,6 @@ def _promote(args: argparse.Namespace) -> int:
     check_alias("--alias", args.alias)
     if args.model is not None:
         check_model("--model", args.model)
-    given = stores.values.get("checkpoint")
-    with reading(f"checkpoint={given}"):
-        checkpoint = given and checked_checkpoint_name(given)
     run = resolve(name, stores.runs_dir, stores.uri)
 
     from deepracer_exp.env.observation import feature_names, observation_shape
@@ -379,7 +375,7 @@ def _promote(args: argparse.Namespace) -> int:
     observation = parse_config(config.get("observation", {}), ObservationConfig)
     registered = promote(
         run.path,
-        checkpoint or run.checkpoint or "best",
+        stores.values.get("checkpoint") or run.checkpoint or "best",
         args.model or run.path.resolve().parent.name,
         args.alias,
         feature_names(observation),

@@ -1,10 +1,9 @@
 """How a policy is evaluated (`conf/evaluation/`), and the entry points of evaluate and export."""
 
-import re
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import BeforeValidator, Field
 
 from .bounds import Natural, NonNegative, UpTo1000
 
@@ -12,13 +11,6 @@ Trials = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
 # More than an hour of driving in one trial is a mistake of units.
 Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
-
-
-def checked_checkpoint_name(name: str) -> str:
-    """Return a name that a checkpoint may have."""
-    if not re.fullmatch(r"best|last|\d{1,9}", name):
-        raise ValueError("a checkpoint is best, last or the number of an iteration")
-    return name
 
 
 def _renamed(failed_lap: object) -> object:
@@ -118,7 +110,7 @@ class StoredRunConfig:
     run: Annotated[str, Field(min_length=1)]
     """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
     of a registered model."""
-    checkpoint: Annotated[str, AfterValidator(checked_checkpoint_name)] | None
+    checkpoint: str | None
     """`best`, `last` or an iteration; null: the one of the alias that names the run, else `best`."""
     runs_dir: Annotated[str, Field(min_length=1)]
     tracking: StoreConfig

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput
@@ -42,7 +43,7 @@ def find_checkpoint(folder: Path, name: str) -> Path:
     Raises:
         BadInput: there is no such checkpoint, or it lies elsewhere.
     """
-    if not (name.isdecimal() or name in LINKS):
+    if not re.fullmatch(r"best|last|\d{1,9}", name):
         raise BadInput(f"checkpoint={name}: a checkpoint is best, last or the number of an iteration")
     path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
     kept = kept_checkpoints(folder)

@@ -7,11 +7,9 @@ from typing import Any
 
 from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config.compose import Composition
-from deepracer_exp.config.evaluation import checked_checkpoint_name
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, read_config, read_object, read_run_id
@@ -54,11 +52,8 @@ def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | 
     given = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
     changes = [override for override in overrides if override.split("=", 1)[0] not in _OWN]
     parent = resolve(given["run"], runs_dir, tracking_uri)
-    try:
-        name = checked_checkpoint_name(parent.choose_checkpoint(given.get("checkpoint")))
-    except ValueError as error:
-        raise BadInput(f"checkpoint={given['checkpoint']}: {error}") from None
-    stored = read_checkpoint(parent.experiment, parent.path / CHECKPOINTS, name)
+    name = parent.choose_checkpoint(given.get("checkpoint"))
+    stored = read_checkpoint(parent.experiment, parent.checkpoints, name)
     composition = _changed(parent, changes)
     experiment = parse_experiment(composition.mapping)
     refuse_other_networks(parent.experiment, experiment)
