@@ -24,9 +24,10 @@ from typing import Any
 import sqlalchemy as sa
 from mlflow import MlflowClient
 from mlflow.entities import Metric
+from optuna.storages import RDBStorage
 
 from sweeps.claims import TrialClaims
-from sweeps.storage import Storage, open_storage
+from sweeps.storage import open_storage
 
 from .command import command_line
 from .report import benchmark_parser, number, table, write_json
@@ -86,7 +87,7 @@ class Relay:
             self.counts[name] += amount
 
 
-def commits(storage: Storage) -> int:
+def commits(storage: RDBStorage) -> int:
     """Return how many transactions have ended in the database, whose statistics are up to a second late."""
     time.sleep(1.2)
     seen = sa.text(
@@ -96,7 +97,7 @@ def commits(storage: Storage) -> int:
         return int(connection.execute(seen).scalar_one())
 
 
-def wal_bytes(storage: Storage) -> int:
+def wal_bytes(storage: RDBStorage) -> int:
     """Return the bytes that the server has written into its log."""
     with storage.engine.connect() as connection:
         return int(connection.execute(sa.text("SELECT pg_current_wal_lsn() - '0/0'::pg_lsn")).scalar_one())
@@ -179,7 +180,7 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     return found
 
 
-def fill(storage: Storage, study: str, trials: int) -> None:
+def fill(storage: RDBStorage, study: str, trials: int) -> None:
     """Give a study `trials` finished trials, as large as those of the default experiment."""
     run = {
         "run_dir": "x" * 120,

@@ -7,13 +7,15 @@ import time
 import uuid
 from collections.abc import Callable, Sequence
 
+from optuna.storages import RDBStorage
+
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.training.signals import Interruption
 
 from .claims import Claim, TrialClaims
 from .launcher import LocalLauncher, LocalWorker
 from .ray_launcher import RayLauncher, RayWorker
-from .storage import Storage, patiently
+from .storage import patiently
 from .view import SweepView
 from .worker_config import WorkerConfig, is_gone
 
@@ -31,7 +33,7 @@ class Driver:
     def __init__(
         self,
         config: WorkerConfig,
-        storage: Storage,
+        storage: RDBStorage,
         launcher: LocalLauncher | RayLauncher,
         view: SweepView,
         on_ended: Callable[[Sequence[Claim]], None],

@@ -1,6 +1,5 @@
 """The database of studies: its address checked, opened safely by many processes at once, and waited for."""
 
-import glob
 import logging
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ from sqlalchemy.exc import (
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay
 
-from deepracer_exp.addresses import redact, with_password, without_passwords
+from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
 from deepracer_exp.tracking.store import check_database_file, one_line
 from deepracer_exp.tracking.store_thread import PAUSES
@@ -96,17 +95,16 @@ class Database:
         return {"poolclass": sa.NullPool, "connect_args": given}
 
     @contextmanager
-    def creation_lock(self, engine: sa.Engine | None) -> Iterator[None]:
+    def creation_lock(self, engine: sa.Engine) -> Iterator[None]:
         """Let one process at a time create what must exist once: the tables, the study's run in MLflow.
 
         Optuna has no lock of its own here: of processes that start together all but one fail, with "table already
-        exists" or with a version stored twice. The lock ends with the process that holds it. A file needs no engine.
+        exists" or with a version stored twice. The lock ends with the process that holds it.
         """
         if self.file is not None:
             with FileLock(f"{self.file}.lock"):
                 yield
             return
-        assert engine is not None
         with engine.connect() as connection:
             if engine.dialect.name == "postgresql":
                 connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK_NUMBER)))
@@ -163,18 +161,7 @@ def _of_file(file: Path, shown: str) -> Database:
     return Database(sa.URL.create("sqlite", database=str(file)), shown)
 
 
-@dataclass(frozen=True)
-class Storage:
-    """A connected database of studies."""
-
-    optuna: RDBStorage = field(repr=False)
-    """Optuna's view of it."""
-    engine: sa.Engine = field(repr=False)
-    url: str
-    """Without password."""
-
-
-def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> Storage:
+def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> RDBStorage:
     """Connect to a database, see `resolve_database`; create what is missing.
 
     Waits up to `patience_s` for a server that does not answer.
@@ -185,10 +172,9 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> St
     database = resolve_database(url, runs_dir)
     with reading(database.shown, "a place where files can be written, or a server"):
         try:
-            optuna = _waiting(lambda: _open(database), patience_s)
+            return _waiting(lambda: _open(database), patience_s)
         except (DBAPIError, StorageInternalError) as error:
             raise BadInput(f"{database.shown}: {_reason(error)}") from None
-    return Storage(optuna, optuna.engine, redact(str(database.url)))
 
 
 def patiently(call: Callable[[], Result], patience_s: float) -> Result:
@@ -244,36 +230,14 @@ def _reason(error: BaseException) -> str:
 
 
 def _open(database: Database) -> RDBStorage:
-    if database.file is not None:
-        return _open_file(database, database.file)
-    probe = sa.create_engine(database.url, **database.engine_options())
+    probe = sa.create_engine(database.url, **database.engine_options() | {"poolclass": sa.NullPool})
     if _is_ready(database, probe):
         return _rdb(database, create=False)
     with database.creation_lock(probe):
+        if database.file is not None:
+            _write_ahead(database.file)
+        # A process that was killed here leaves some of the tables: Optuna creates those that are missing.
         return _rdb(database, create=True)
-
-
-def _open_file(database: Database, file: Path) -> RDBStorage:
-    if not _is_ready_file(database, file):
-        with database.creation_lock(None):
-            if not file.exists() or file.stat().st_size == 0:
-                _create_file(database, file)
-            elif not _is_ready_file(database, file):
-                _rdb(database, create=True).engine.dispose()
-                _write_ahead(file)
-    return _rdb(database, create=False)
-
-
-def _create_file(database: Database, file: Path) -> None:
-    """Create the file under another name and rename it when it is complete: a killed process leaves no half of it."""
-    new = file.with_name(f"{file.name}.new")
-    for left in file.parent.glob(f"{glob.escape(new.name)}*"):
-        left.unlink()
-    rdb = _rdb(Database(sa.URL.create("sqlite", database=str(new)), database.shown), create=True)
-    rdb.remove_session()
-    rdb.engine.dispose()
-    _write_ahead(new)
-    new.replace(file)
 
 
 def _write_ahead(file: Path) -> None:
@@ -286,13 +250,6 @@ def _write_ahead(file: Path) -> None:
         _log.warning("%s: %s", file, error)
     finally:
         connection.close()
-
-
-def _is_ready_file(database: Database, file: Path) -> bool:
-    if not file.exists() or file.stat().st_size == 0:
-        return False
-    engine = sa.create_engine(database.url, poolclass=sa.NullPool, **database.engine_options())
-    return _is_ready(database, engine)
 
 
 def _is_ready(database: Database, engine: sa.Engine) -> bool:

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import optuna
 from optuna.exceptions import ExperimentalWarning
+from optuna.storages import RDBStorage
 from optuna.study import Study, StudyDirection
 
+from deepracer_exp.addresses import redact
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
@@ -15,7 +17,7 @@ from deepracer_exp.errors import BadInput, nearest
 from . import DEFAULT_FILE
 from .objectives import MEASURES
 from .space import SearchSpace
-from .storage import Storage, open_storage
+from .storage import open_storage
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
@@ -26,15 +28,15 @@ _SAME = ("objectives", "seeds", "protocol", "parent")
 """Attributes that comparable trials share, beside space and base."""
 
 
-def find_study(name: str, storage: Storage) -> Study | None:
+def find_study(name: str, storage: RDBStorage) -> Study | None:
     """Return a study, None if none has that name."""
     try:
-        return optuna.load_study(study_name=name, storage=storage.optuna)
+        return optuna.load_study(study_name=name, storage=storage)
     except KeyError:
         return None
 
 
-def load_study(name: str, storage: Storage) -> Study:
+def load_study(name: str, storage: RDBStorage) -> Study:
     """Return a study that exists.
 
     Raises:
@@ -42,9 +44,11 @@ def load_study(name: str, storage: Storage) -> Study:
     """
     study = find_study(name, storage)
     if study is None:
-        known = optuna.get_all_study_names(storage.optuna)
+        known = optuna.get_all_study_names(storage)
         there = f"studies: {', '.join(known)}" if known else "there is no study yet"
-        raise BadInput(f"study {name}: not found in {storage.url}{nearest(name, known)}; {there}")
+        raise BadInput(
+            f"study {name}: not found in {redact(str(storage.engine.url))}{nearest(name, known)}; {there}"
+        )
     return study
 
 
@@ -85,7 +89,7 @@ def open_study(
     overrides: Sequence[str],
     space: SearchSpace,
     parent: Sequence[str],
-    storage: Storage,
+    storage: RDBStorage,
     runs_dir: Path,
 ) -> Study:
     """Begin a study, or open the one of that name; `parent` as of `WorkerConfig`.
@@ -112,7 +116,7 @@ def open_study(
         for one in sweep.objectives
     ]
     try:
-        study = optuna.create_study(study_name=name, storage=storage.optuna, directions=directions)
+        study = optuna.create_study(study_name=name, storage=storage, directions=directions)
     except optuna.exceptions.DuplicatedStudyError:
         study = load_study(name, storage)
     stored = study.user_attrs

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import optuna
 import torch
+from optuna.storages import RDBStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial
 from rich.console import Console
@@ -43,7 +44,7 @@ from .pruners import build_pruner
 from .ray_launcher import RayLauncher
 from .samplers import build_sampler
 from .space import SearchSpace
-from .storage import Storage, open_storage, patiently, resolve_database
+from .storage import open_storage, patiently, resolve_database
 from .study import load_request, open_study
 from .view import SweepView
 from .worker import Interrupted
@@ -124,7 +125,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
 
 
 def begin_study_run(
-    request: SweepRequest, space: SearchSpace, store: Store | None, storage: Storage, runs_dir: Path
+    request: SweepRequest, space: SearchSpace, store: Store | None, storage: RDBStorage, runs_dir: Path
 ) -> tuple[StudyRun | None, str | None]:
     """Begin or continue the run of a study in MLflow; return it with its id, None if the store does not answer."""
     if store is None:
@@ -138,7 +139,7 @@ def begin_study_run(
 
 def _run(
     worker_config: WorkerConfig,
-    storage: Storage,
+    storage: RDBStorage,
     study: Study,
     launcher: LocalLauncher | RayLauncher,
     console: Console,
@@ -158,7 +159,7 @@ def _run(
             if code is not None:
                 return code
         for derive in (report_results, fail_unclaimed_trials):
-            patiently(partial(derive, claims, storage.optuna), patience_s)
+            patiently(partial(derive, claims, storage), patience_s)
         try:
             _conclude(worker_config, study, view, claims, interruption)
         except Interrupted:

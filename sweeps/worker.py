@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import optuna
-from optuna.storages import BaseStorage
+from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.agents.actor_critic import ActorCritic
@@ -49,7 +49,7 @@ from .labels import stored_outcome
 from .objectives import intermediate_value, values_of
 from .pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
 from .samplers import build_sampler
-from .storage import Storage, patiently
+from .storage import patiently
 from .worker_config import WorkerConfig
 
 Value = TypeVar("Value")
@@ -74,7 +74,7 @@ class Interrupted(Exception):  # noqa: N818 - reads as what it is at the raise s
 class Worker:
     """Claims and makes trials of one study, and reports their results."""
 
-    def __init__(self, config: WorkerConfig, storage: Storage, owner: str):
+    def __init__(self, config: WorkerConfig, storage: RDBStorage, owner: str):
         """Connect to the study; `owner` is this worker's name."""
         self._config, self._storage, self._owner = config, storage, owner
         self._claims = TrialClaims(storage.engine, config.study)
@@ -88,7 +88,7 @@ class Worker:
         """
         total, lease_s = self._config.config.trials, self._config.config.lease_s
         while interruption.signum is None:
-            self._patiently(lambda: report_results(self._claims, self._storage.optuna))
+            self._patiently(lambda: report_results(self._claims, self._storage))
             claim = self._patiently(lambda: self._claims.claim(self._owner, total, lease_s))
             if claim is not None:
                 self._make(claim)
@@ -108,12 +108,12 @@ class Worker:
                 return
             except Interrupted:
                 return
-        self._patiently(lambda: report_results(self._claims, self._storage.optuna))
+        self._patiently(lambda: report_results(self._claims, self._storage))
 
     def _result(self, lease: Lease) -> TrialResult:
         sampler = build_sampler(self._config.config, self._config.space)
         pruner = build_pruner(self._config.config, self._config.evaluations)
-        name, storage = self._config.study, self._storage.optuna
+        name, storage = self._config.study, self._storage
         study = self._patiently(
             lambda: optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=pruner)
         )
@@ -139,7 +139,7 @@ class Worker:
         if lease.claim.trial_id is not None:
             return lease.claim.trial_id
         lease.confirm()
-        storage, index = self._storage.optuna, lease.claim.index
+        storage, index = self._storage, lease.claim.index
         template = optuna.trial.create_trial(state=TrialState.RUNNING, user_attrs={"slot": index})
         trial_id = self._patiently(
             lambda: storage.create_new_trial(storage.get_study_id_from_name(self._config.study), template)

@@ -106,7 +106,7 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS):
     found = TrialClaims(opened.engine, "s").all()
     assert [claim.index for claim in found] == list(range(trials))
     assert {claim.state for claim in found} == {"reported"}
-    known = {one._trial_id: one for one in optuna.load_study(study_name="s", storage=opened.optuna).trials}
+    known = {one._trial_id: one for one in optuna.load_study(study_name="s", storage=opened).trials}
     assert {claim.trial_id for claim in found} == {
         key for key, one in known.items() if one.state == optuna.trial.TrialState.COMPLETE
     }
@@ -278,5 +278,5 @@ def test_while_the_database_is_away_all_wait_and_then_continue(sweep, tmp_path, 
     assert_every_trial_is_accounted_for_once(tmp_path, url)
     said = running.log() + "".join(path.read_text() for path in tmp_path.glob("std*.txt"))
     assert postgres.password not in said
-    study = optuna.load_study(study_name="s", storage=open_storage(url, tmp_path).optuna)
+    study = optuna.load_study(study_name="s", storage=open_storage(url, tmp_path))
     assert postgres.password not in str(study.user_attrs)

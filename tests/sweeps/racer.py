@@ -27,7 +27,7 @@ def make_trials(url: str, file: Path, start: Barrier, trials: int) -> None:
     start.wait()
     storage = open_storage(url, Path())
     TrialClaims(storage.engine, "study")
-    study = optuna.create_study(study_name="study", storage=storage.optuna, load_if_exists=True)
+    study = optuna.create_study(study_name="study", storage=storage, load_if_exists=True)
     with file.open("w", buffering=1) as out:
         for _ in range(trials):
             trial = study.ask()

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 from deepracer_exp.errors import BadInput, RunFailed
 from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage, patiently, resolve_database
+from sweeps.study import load_study
 
 from .racer import make_trials
 
@@ -31,7 +32,7 @@ def _refused(url: str | None, runs_dir: Path) -> str:
 @pytest.mark.parametrize("name", ["runs", "two words {0} 50%41 who?x=1 #1 läufe [a]*"])
 def test_the_default_is_a_file_in_the_folder_of_the_runs_whatever_its_name(tmp_path, name):
     storage = open_storage(None, tmp_path / name)
-    optuna.create_study(study_name="study", storage=storage.optuna)
+    optuna.create_study(study_name="study", storage=storage)
     assert sorted(path.name for path in (tmp_path / name).iterdir() if path.suffix == ".db") == ["sweeps.db"]
     with sqlite3.connect(tmp_path / name / "sweeps.db") as connection:
         assert connection.execute("SELECT study_name FROM studies").fetchall() == [("study",)]
@@ -41,7 +42,7 @@ def test_the_default_is_a_file_in_the_folder_of_the_runs_whatever_its_name(tmp_p
 def test_processes_that_start_together_share_one_study_and_number_each_trial_once(url, race):
     lines = race(make_trials, url, ("anna", "ben", "cleo"), 2).lines()
     assert sorted(int(line) for printed in lines for line in printed) == list(range(6))
-    trials = optuna.load_study(study_name="study", storage=open_storage(url, Path()).optuna).trials
+    trials = optuna.load_study(study_name="study", storage=open_storage(url, Path())).trials
     assert [trial.number for trial in trials] == list(range(6))
     assert all(trial.state.name == "COMPLETE" for trial in trials)
 
@@ -53,17 +54,32 @@ def test_a_process_killed_while_it_makes_the_tables_leaves_nothing_in_the_way(ur
         racers[number].kill()
     racers.lines()
     storage = open_storage(url, Path())
-    study = optuna.create_study(study_name="study", storage=storage.optuna, load_if_exists=True)
+    study = optuna.create_study(study_name="study", storage=storage, load_if_exists=True)
     study.tell(study.ask(), 1.0)
     assert TrialClaims(storage.engine, "study").claim("next", 1, HOUR_S).index == 0
 
 
-def test_an_incomplete_file_of_a_killed_process_is_replaced(tmp_path):
-    (tmp_path / "sweeps.db").touch()
-    (tmp_path / "sweeps.db.new").write_bytes(b"half a file")
-    (tmp_path / "sweeps.db.new-wal").write_bytes(b"and its journal")
-    open_storage(None, tmp_path)
-    assert not list(tmp_path.glob("*.new*"))
+@pytest.mark.parametrize(
+    "missing",
+    [
+        "",
+        "DELETE FROM alembic_version",
+        "DELETE FROM version_info",
+        "DROP TABLE trial_values",
+        "DROP TABLE studies",
+    ],
+)
+def test_a_file_that_a_killed_process_left_incomplete_is_completed(tmp_path, missing):
+    file = tmp_path / "sweeps.db"
+    if missing:
+        open_storage(None, tmp_path)
+        with sqlite3.connect(file) as connection:
+            connection.executescript(f"{missing}; DROP TABLE IF EXISTS alembic_version")
+    else:
+        file.touch()
+    study = optuna.create_study(study_name="study", storage=open_storage(None, tmp_path))
+    study.tell(study.ask(), 1.0)
+    assert optuna.load_study(study_name="study", storage=open_storage(None, tmp_path)).best_value == 1.0
 
 
 @pytest.mark.parametrize(
@@ -113,13 +129,14 @@ def test_a_database_of_another_program_is_refused_and_left_as_it_is(url):
 
 def test_no_password_is_shown_by_a_storage_nor_by_a_server_that_refuses(postgres_server):
     storage = open_storage(postgres_server.new_database(), Path())
-    assert "127.0.0.1" in storage.url
+    with pytest.raises(BadInput, match=r"study none: not found in .*127\.0\.0\.1") as unknown:
+        load_study("none", storage)
     wrong = _refused(postgres_server.url(password="wr0ng/{p}@ss%"), Path())
     missing = _refused(postgres_server.url("nowhere"), Path())
     assert "password authentication failed" in wrong
     assert '"nowhere" does not exist' in missing
     database = resolve_database(postgres_server.url(), Path())
-    for text in (repr(storage), str(storage), storage.url, repr(database), wrong, missing):
+    for text in (repr(storage), str(storage), str(unknown.value), repr(database), wrong, missing):
         assert "s3cr" not in text
         assert "wr0ng" not in text
 
@@ -128,7 +145,7 @@ def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
     """A thousand workers would need as many connections otherwise; PostgreSQL has a hundred."""
     url = postgres_server.new_database()
     storage = open_storage(url, Path())
-    optuna.create_study(study_name="study", storage=storage.optuna).ask()
+    optuna.create_study(study_name="study", storage=storage).ask()
     TrialClaims(storage.engine, "study").claim("one", 1, HOUR_S)
     name = sa.make_url(url).database
     count = f"SELECT count(*) FROM pg_stat_activity WHERE datname = '{name}'"
@@ -148,7 +165,7 @@ def test_a_stopped_process_holds_a_row_of_postgresql_for_a_minute_at_most(postgr
 @pytest.mark.parametrize("how", ["SIGINT", "SIGQUIT"])
 def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
     storage = open_storage(url := postgres.new_database(), Path())
-    study = optuna.create_study(study_name="study", storage=storage.optuna)
+    study = optuna.create_study(study_name="study", storage=storage)
     claims = TrialClaims(storage.engine, "study")
     claim = claims.claim("one", 2, HOUR_S)
     trial = study.ask()
@@ -157,7 +174,7 @@ def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
         lambda: claims.renew(claim, HOUR_S),
         lambda: claims.record(claim, trial_id=trial._trial_id),
         lambda: study.tell(trial, 1.0, skip_if_finished=True).state.name,
-        lambda: open_storage(url, Path(), patience_s=HOUR_S).optuna.get_n_trials(study._study_id),
+        lambda: open_storage(url, Path(), patience_s=HOUR_S).get_n_trials(study._study_id),
     ]
     with ThreadPoolExecutor(len(calls)) as threads:
         waiting = [threads.submit(patiently, call, HOUR_S) for call in calls]
@@ -181,7 +198,7 @@ def test_a_server_that_stays_away_ends_the_wait_in_one_line(postgres):
 
 def test_a_locked_file_is_waited_for(tmp_path):
     url = f"sqlite:///{tmp_path}/sweeps.db"
-    study = optuna.create_study(study_name="study", storage=open_storage(url, Path()).optuna)
+    study = optuna.create_study(study_name="study", storage=open_storage(url, Path()))
     impatient = sa.create_engine(url, connect_args={"timeout": 0.0})
     claims = TrialClaims(impatient, "study")
     other = sqlite3.connect(tmp_path / "sweeps.db", isolation_level=None, check_same_thread=False)
@@ -199,7 +216,7 @@ def test_a_locked_file_is_waited_for(tmp_path):
 def test_an_error_that_waiting_does_not_change_is_raised_at_once(tmp_path):
     storage = open_storage(None, tmp_path)
     claims = TrialClaims(storage.engine, "study")
-    study = optuna.create_study(study_name="study", storage=storage.optuna)
+    study = optuna.create_study(study_name="study", storage=storage)
     with storage.engine.begin() as connection:
         connection.execute(sa.text("DROP TABLE deepracer_slots"))
         connection.execute(sa.text("DROP TABLE trials"))

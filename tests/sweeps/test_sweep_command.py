@@ -21,7 +21,7 @@ SERVER = "postgresql+psycopg://me:secret@127.0.0.1:1/none"
 
 
 def load(cwd, name):
-    return optuna.load_study(study_name=name, storage=open_storage(None, cwd / "runs").optuna)
+    return optuna.load_study(study_name=name, storage=open_storage(None, cwd / "runs"))
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
         cores=1,
     )
     Worker(config, storage, "host:1:a").work(Interruption())
-    return optuna.load_study(study_name="s", storage=storage.optuna).trials
+    return optuna.load_study(study_name="s", storage=storage).trials
 
 
 @pytest.mark.parametrize("sampler", get_args(Sampler))
