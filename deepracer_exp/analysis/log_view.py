@@ -157,8 +157,9 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
 
     Args:
         recording: of any format.
-        track: a course of its steps; None: the one with the most training steps. If the log's own name of the course
-            is unknown, a name of the catalogue or a file (.npy route, .yaml knots) replaces it.
+        track: a course of its steps; None: the one with the most training steps (of races: with the most steps). If
+            the log's own name of the course is unknown, a name of the catalogue or a file (.npy route, .yaml knots)
+            replaces it.
 
     Raises:
         BadInput: the recording has no steps on the course.
@@ -168,8 +169,10 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         raise BadInput(f"{recording.name}: no control steps; accepted: a training or a race with its trace")
     names = steps["track"].astype("category")
     training = (steps["stream"] == TRAINING).to_numpy()
-    counts = names[training if training.any() else slice(None)].value_counts()
-    logged = [str(name) for name in counts.index if counts[name] > 0]
+    rows, of_training = names.value_counts(), names[training].value_counts()
+    logged = sorted(
+        map(str, names.cat.categories), key=lambda one: (of_training[one], rows[one]), reverse=True
+    )
     name = track if track in logged else logged[0]
     if track is not None and track not in logged and len(logged) > 1:
         raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {', '.join(logged)}")
@@ -188,12 +191,12 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     driven, raced = _episodes(steps, here & ~training, course, discount)
     raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
     iterations = iteration_table(recording, trained, episodes)
-    if not training.any():
+    if not (here & training).any():
         trained = driven.assign(episode=np.cumsum(first_rows(driven)) - 1)
         episodes = raced.assign(episode=np.arange(len(raced)))
     return LogView(
         name=recording.name,
-        trained=bool(training.any()),
+        trained=bool((here & training).any()),
         recording=recording,
         course=course,
         track_name=name or (course.name if course is not None else ""),

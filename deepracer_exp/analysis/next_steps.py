@@ -85,4 +85,4 @@ def command_line(command: str, word: str, config: Mapping[str, Any], groups: Seq
 
 def run_word(run: Path) -> str:
     """Return what a run is called on the command line: its name where commands look for runs, else its folder."""
-    return run.name if run.resolve().parents[1] == Path("runs").resolve() else str(run)
+    return run.name if run.resolve().parent.parent == Path("runs").resolve() else str(run)

@@ -184,7 +184,7 @@ def evaluate_run(
     tracking = run.experiment.tracking
     uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
     metrics = _metrics(evaluation, known)
-    runs_dir = run.path.resolve().parents[1]
+    runs_dir = run.path.resolve().parent.parent
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
     return evaluation
 

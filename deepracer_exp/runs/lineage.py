@@ -123,7 +123,7 @@ def family(run: Path, runs_dir: Path) -> Member:
     Raises:
         BadInput: a file of a relative cannot be used, or a run descends from itself.
     """
-    places = list(dict.fromkeys([runs_dir.resolve(), run.resolve().parents[1]]))
+    places = list(dict.fromkeys([runs_dir.resolve(), run.resolve().parent.parent]))
     lineages: dict[Path, Lineage | None] = {}
     children: dict[Path, set[Path]] = {}
 

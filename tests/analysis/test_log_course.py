@@ -113,6 +113,13 @@ def test_of_several_courses_the_most_driven_one_is_shown_unless_another_is_asked
         prepare(both, "Monaco")
 
 
+def test_a_track_of_races_only_can_be_asked_for() -> None:
+    one, other = made_up_recording([Drive()]), made_up_recording([Drive()] * 3, course="Oval_track")
+    raced = other.steps.assign(stream="race")
+    view = prepare(replace(one, steps=pd.concat([one.steps, raced], ignore_index=True)), "Oval_track")
+    assert (view.track_name, view.trained, len(view.episodes)) == ("Oval_track", False, 3)
+
+
 @pytest.mark.parametrize("name", ["reinvent_base", ""])
 def test_another_track_than_the_one_driven_on_is_refused(name: str) -> None:
     recording = renamed(made_up_recording([Drive()]), name)
