@@ -92,9 +92,7 @@ def test_every_figure_has_labels_and_a_caption_and_is_drawn(
 
 
 @pytest.mark.parametrize("figure", ALL)
-def test_a_short_training_or_a_race_alone_breaks_no_figure(
-    figure: Callable[[LogView], Chart | None],
-) -> None:
+def test_a_short_training_or_a_race_alone_breaks_no_figure(figure: Callable[[LogView], Chart | None]) -> None:
     short = figure(prepare(made_up_recording([Drive(until=0.02)])))
     race = figure(prepare(made_up_recording([], evaluations={"race": [Drive()]})))
     assert (race is not None) == (figure in OF_RACES)  # a race has no iterations

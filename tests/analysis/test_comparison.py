@@ -7,12 +7,7 @@ import pytest
 
 from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.charts.runs import learning_curves_compared
-from deepracer_exp.analysis.comparison import (
-    NOTHING,
-    last_value,
-    results,
-    value_text,
-)
+from deepracer_exp.analysis.comparison import NOTHING, last_value, results, value_text
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.runs.lineage import run_differences

@@ -27,10 +27,7 @@ def view() -> LogView:
     ]
     return prepare(
         made_up_recording(
-            drives,
-            entropy=[1.5, 1.2],
-            evaluated=[30.0, 60.0],
-            evaluations={"race": [Drive(speed_mps=2.0)]},
+            drives, entropy=[1.5, 1.2], evaluated=[30.0, 60.0], evaluations={"race": [Drive(speed_mps=2.0)]}
         )
     )
 

@@ -70,13 +70,7 @@ def test_what_is_printed_can_be_read_back(overrides):
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "a b,ü/c=d (alt).npy",
-        r"C:\cars\new\it's.py",
-        "http://localhost:5000/?a=b&c={d}#e",
-        "2024",
-    ],
+    "text", ["a b,ü/c=d (alt).npy", r"C:\cars\new\it's.py", "http://localhost:5000/?a=b&c={d}#e", "2024"]
 )
 def test_a_path_or_address_needs_no_quotes(text):
     for key in ("track.file", "reward.file", "action_space.file", "runs_dir", "tracking.uri"):

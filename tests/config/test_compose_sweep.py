@@ -63,10 +63,7 @@ def test_overrides_are_of_the_sweep_of_every_trial_or_searched():
     entry = request.entry
     assert (entry.study, entry.parent, entry.debug, entry.sweep.trials) == ("mine", "best:a b", True, 7)
     assert request.base == ("track=Oval_track",)
-    assert request.space == {
-        "algorithm.lr": "tag(log, interval(1e-5, 1e-3))",
-        "network": "mlp,mlp_deep",
-    }
+    assert request.space == {"algorithm.lr": "tag(log, interval(1e-5, 1e-3))", "network": "mlp,mlp_deep"}
 
 
 def test_a_study_is_named_after_the_ready_made_sweep_unless_it_has_a_name():

@@ -6,12 +6,7 @@ import pytest
 import yaml
 
 from deepracer_exp.config.compose import Composition, compose_experiment, expand_grid
-from deepracer_exp.config.custom_files import (
-    TAKEN,
-    FileOverrides,
-    file_overrides,
-    read_custom_files,
-)
+from deepracer_exp.config.custom_files import TAKEN, FileOverrides, file_overrides, read_custom_files
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line, parse_single
 from deepracer_exp.config.parse import parse_experiment

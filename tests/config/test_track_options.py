@@ -124,10 +124,7 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
             'track.Oval_track.weight="abc": input should be a valid number',
         ),
         ([TWO, "track.direction=sideways"], 'track.Oval_track.direction="sideways": input should be'),
-        (
-            [TWO, "track.Oval_track.width_m=[1,2]"],
-            "track.Oval_track.width_m without track.Oval_track.knots",
-        ),
+        ([TWO, "track.Oval_track.width_m=[1,2]"], "track.Oval_track.width_m without track.Oval_track.knots"),
         ([TWO, "+track.Oval_track.foo=2"], "track.Oval_track.foo: no such key"),
         (["track.Oval_track.weight=2"], r"accepted with several tracks .* write track.weight"),
         (["track.2022_summit_speedway.weight=2"], "accepted with several tracks"),

@@ -52,15 +52,7 @@ def test_the_text_log_reports_the_same_rows_and_the_iteration_that_was_not_finis
 ):
     finished = from_log[from_log["iteration"] < 28]
     assert (len(finished), len(from_log)) == (44_247, 44_842)
-    for name in (
-        "episode",
-        "steps",
-        "iteration",
-        "tstamp",
-        "done",
-        "closest_waypoint",
-        "action",
-    ):
+    for name in ("episode", "steps", "iteration", "tstamp", "done", "closest_waypoint", "action"):
         np.testing.assert_array_equal(finished[name], training[name])
     assert (finished["episode_status"].astype(str).to_numpy() == training["episode_status"].astype(str)).all()
     for name in ("X", "Y", "yaw", "progress"):

@@ -16,15 +16,7 @@ from deepracer_exp.sim.batch import CarState
 REFERENCE = Path(__file__).parents[2] / "../shared/reference"
 TRACES = REFERENCE / "console_training/sim-trace"
 FRONT_M = 0.14
-JUDGED = (
-    "progress",
-    "all_wheels_on_track",
-    "status",
-    "done",
-    "closest_waypoint",
-    "reward",
-    "steps",
-)
+JUDGED = ("progress", "all_wheels_on_track", "status", "done", "closest_waypoint", "reward", "steps")
 
 # The console's sample for following the centre line, in our words.
 FOLLOW = """

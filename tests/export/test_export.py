@@ -17,9 +17,8 @@ def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
     run = trained("reward.constants.SPEED_WEIGHT=2.5", "algorithm.batch_size=1000", "budget.iterations=1")
     ended = call("export", str(run.folder), "format=aws", "-o", "custom_files")
     assert ended.code == 0, ended.stderr
-    assert sorted(path.name for path in (ended.cwd / "custom_files").iterdir()) == [
-        *("hyperparameters.json", "model_metadata.json", "reward_function.py"),
-    ]
+    names = sorted(path.name for path in (ended.cwd / "custom_files").iterdir())
+    assert names == ["hyperparameters.json", "model_metadata.json", "reward_function.py"]
     assert "SPEED_WEIGHT = 2.5" in (ended.cwd / "custom_files" / "reward_function.py").read_text()
     assert "batch_size=512, the nearest to 1000 that the AWS console accepts" in ended.stdout
 
@@ -48,10 +47,7 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
         ),
         (["nowhere", "format=onnx"], "nowhere: no such run"),
         (["nowhere", "format=coreml"], 'format="coreml"'),
-        (
-            ["nowhere", "format=onnx", "chekpoint=last"],
-            "chekpoint: no such key (did you mean checkpoint?)",
-        ),
+        (["nowhere", "format=onnx", "chekpoint=last"], "chekpoint: no such key (did you mean checkpoint?)"),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(call, arguments, words):
