@@ -50,6 +50,28 @@ def refused(call: Callable[..., object], *arguments: object) -> str:
 
 
 @pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Stand in an empty folder."""
+    folder = tmp_path / "mein Ordner, (ü) = '$x'"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def own(here: Path) -> Callable[[str, str], Path]:
+    """Write an option's file of one's own: `own("budget/mine.yaml", TEXT)`."""
+
+    def write(name: str, text: str) -> Path:
+        path = here / "conf" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.fixture
 def custom_files(tmp_path: Path) -> Callable[..., Path]:
     """Write the files into a folder; a value of None leaves one out, a dict goes over the default's keys."""
 

@@ -293,11 +293,8 @@ def test_the_configuration_stays_usable_after_a_refusal(tmp_path, monkeypatch):
 # --- An option by itself
 
 
-def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
-    own = tmp_path / "conf" / "randomization"
-    own.mkdir(parents=True)
-    (own / "wet.yaml").write_text("defaults: [sim2real, _self_]\nfriction_scale: [0.3, 0.4]\n")
-    monkeypatch.chdir(tmp_path)
+def test_an_option_by_itself_may_be_ones_own(own):
+    own("randomization/wet.yaml", "defaults: [sim2real, _self_]\nfriction_scale: [0.3, 0.4]\n")
     wet, usual = (compose_option("randomization", name, RandomizationConfig) for name in ("wet", "sim2real"))
     assert wet == dataclasses.replace(usual, friction_scale=(0.3, 0.4))
     assert usual == compose_experiment(["randomization=sim2real"])[0].randomization
@@ -313,11 +310,8 @@ def test_an_option_by_itself_may_be_ones_own(tmp_path, monkeypatch):
         ("a: &a [*a]", ["conf/randomization/mine.yaml"]),
     ],
 )
-def test_an_option_by_itself_is_refused_with_its_name(text, words, tmp_path, monkeypatch):
-    own = tmp_path / "conf" / "randomization"
-    own.mkdir(parents=True)
-    (own / "mine.yaml").write_text(f"defaults: [none, _self_]\n{text}\n")
-    monkeypatch.chdir(tmp_path)
+def test_an_option_by_itself_is_refused_with_its_name(text, words, own):
+    own("randomization/mine.yaml", f"defaults: [none, _self_]\n{text}\n")
     message = refused(compose_option, "randomization", "mine", RandomizationConfig)
     for word in words:
         assert word in message

@@ -158,13 +158,10 @@ def test_what_cannot_be_used_is_named_with_what_would_do(override, parts):
         assert part in message
 
 
-def test_a_value_of_a_ready_made_space_must_be_searched(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "conf/sweep").mkdir(parents=True)
-    file = tmp_path / "conf/sweep/mine.yaml"
-    file.write_text("defaults: [own, _self_]\nspace: {algorithm.lr: '0.1'}\n")
+def test_a_value_of_a_ready_made_space_must_be_searched(own):
+    own("sweep/mine.yaml", "defaults: [own, _self_]\nspace: {algorithm.lr: '0.1'}\n")
     assert "nothing to search" in refusal("sweep=mine")
-    file.write_text("defaults: [own, _self_]\nspace: {algorithm.lr: '0.1,0.2'}\n")
+    own("sweep/mine.yaml", "defaults: [own, _self_]\nspace: {algorithm.lr: '0.1,0.2'}\n")
     assert compose_sweep(["sweep=mine"]).space == {"algorithm.lr": "0.1,0.2"}
 
 
@@ -184,6 +181,7 @@ def test_a_value_of_a_ready_made_space_must_be_searched(tmp_path, monkeypatch):
         ("range(10, 0, -3)", Range(1, 10, 3, False)),
         ("range(0.1, 0.5, 0.1)", Range(0.1, 0.4, 0.1, False)),
         ("range(0, 1, 0.3)", Range(0.0, 0.9, 0.3, False)),
+        ("range(0, 1e15, 0.1)", Range(0.0, 999999999999999.9, 0.1, False)),  # at once, not value by value
         ("7,2.5,true,null,mlp", Choices((7, 2.5, True, None, "mlp"))),
         ("choice('1', [1,2], {a:1})", Choices(("'1'", "[1,2]", "{a:1}"))),
         ("shuffle(3,1,2)", Choices((3, 1, 2))),
@@ -223,10 +221,6 @@ def test_a_search_of_nothing_is_refused(expression, part):
     message = refused(dimension, "algorithm.lr", expression)
     assert message.startswith("algorithm.lr=")
     assert part in message
-
-
-def test_a_range_of_any_length_is_read_at_once():
-    assert dimension("seed", "range(0, 1e15, 0.1)") == Range(0.0, 999999999999999.9, 0.1, False)
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False) | st.integers() | st.booleans() | st.none())

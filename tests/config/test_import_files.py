@@ -9,14 +9,7 @@ from deepracer_exp.config.custom_files import import_files, read_custom_files
 
 from .conftest import CONTINUOUS, METADATA, REWARD, refused
 
-
-@pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Stand in an empty folder."""
-    folder = tmp_path / "here"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def bring(folder: Path, name: str) -> list[str]:
@@ -90,10 +83,8 @@ def test_what_is_no_plain_name_is_refused(custom_files, name, here):
 
 
 @pytest.mark.parametrize("name", ["reward/mine.py", "reward/mine.yaml", "experiment/mine.yaml"])
-def test_a_file_that_is_there_is_named_and_left_alone(custom_files, here, name):
-    path = here / "conf" / name
-    path.parent.mkdir(parents=True)
-    path.write_text("# mine\n")
+def test_a_file_that_is_there_is_named_and_left_alone(custom_files, here, own, name):
+    path = own(name, "# mine\n")
     before = everything(here)
     assert f"conf/{name} exists already" in refusal(custom_files(), "mine")
     assert everything(here) == before

@@ -1,35 +1,16 @@
-from pathlib import Path
-
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import conf_dir, conf_dirs, groups, options
 from deepracer_exp.errors import BadInput, nearest
 
-
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Stand in an empty folder."""
-    folder = tmp_path / "mein Ordner, (ü) = '$x'"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
-
-
-def own(folder: Path, name: str, text: str) -> Path:
-    path = folder / "conf" / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    return path
-
-
 BUDGET = "defaults: [default, _self_]\nenv_steps: 777\n"
 
 
-def test_options_of_the_working_folder_stand_beside_the_projects(here):
+def test_options_of_the_working_folder_stand_beside_the_projects(own):
     before = options("budget")
-    own(here, "budget/mine.yaml", BUDGET)
-    own(here, "budget/other.yaml", "defaults: [short]\niterations: 3\n")
+    own("budget/mine.yaml", BUDGET)
+    own("budget/other.yaml", "defaults: [short]\niterations: 3\n")
     assert options("budget") == sorted([*before, "mine", "other"])
     experiment, composition = compose_experiment(["budget=mine"])
     assert (experiment.budget.env_steps, composition.choices["budget"]) == (777, "mine")
@@ -37,14 +18,14 @@ def test_options_of_the_working_folder_stand_beside_the_projects(here):
     assert (budget.env_steps, budget.iterations) == (200_000, 3)
 
 
-def test_the_nearest_of_all_options_is_reported(here):
-    own(here, "budget/mine_all.yaml", BUDGET)
+def test_the_nearest_of_all_options_is_reported(own):
+    own("budget/mine_all.yaml", BUDGET)
     with pytest.raises(BadInput, match=r"did you mean mine_all\?.*long, mine_all, short"):
         compose_experiment(["budget=mine_al"])
 
 
-def test_a_namesake_that_is_not_the_same_is_refused_whatever_is_chosen(here):
-    path = own(here, "budget/short.yaml", (conf_dir() / "budget/short.yaml").read_text())
+def test_a_namesake_that_is_not_the_same_is_refused_whatever_is_chosen(own):
+    path = own("budget/short.yaml", (conf_dir() / "budget/short.yaml").read_text())
     assert len(compose_experiment([])[0].name) > 0
     path.write_text(BUDGET)
     with pytest.raises(
@@ -62,10 +43,10 @@ def test_the_projects_own_folder_is_searched_once(here, monkeypatch):
     assert conf_dirs() == [conf_dir().resolve()]
 
 
-def test_a_conf_folder_of_something_else_does_no_harm(here):
+def test_a_conf_folder_of_something_else_does_no_harm(here, own):
     before = groups()
-    own(here, "train.yaml", "seed: 99\n")
-    own(here, "database/x.yaml", "a: 1\n")
+    own("train.yaml", "seed: 99\n")
+    own("database/x.yaml", "a: 1\n")
     (here / "conf/budget").write_text("a file")
     assert groups() == before
     assert compose_experiment([])[0].seed == 0
@@ -86,8 +67,11 @@ def test_what_begins_with_a_word_is_nearer_than_what_looks_like_it(word, meant):
     assert nearest(word, options("track")) == (f" (did you mean {meant}?)" if meant else "")
 
 
-def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(here):
-    own(here, "track/mine.yaml", "width_m: 0.76\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
+COURSE = "width_m: 0.76\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n"
+
+
+def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(own):
+    own("track/mine.yaml", COURSE)
     overrides = ["track.direction=reversed", "track.floor.friction=0.5"]
     track = compose_experiment(["track=mine", *overrides])[0].track
     assert (track.name, track.title, track.width_m, track.closed) == ("mine", "mine", 0.76, True)
@@ -95,6 +79,6 @@ def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(here):
     several = compose_experiment(["track=[mine,Oval_track]", "track.mine.weight=2"])[0].tracks
     assert [(track.name, track.weight) for track in several.values()] == [("mine", 2), ("Oval_track", 1)]
     assert "mine" in compose_experiment(["track=all"])[0].tracks
-    own(here, "track/Oval_track.yaml", "width_m: 0.76\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n")
+    own("track/Oval_track.yaml", COURSE)
     with pytest.raises(BadInput, match=r"Oval_track\.yaml: the project has another track of that name"):
         compose_experiment([])

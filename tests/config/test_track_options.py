@@ -82,12 +82,9 @@ def test_a_value_without_a_name_reaches_every_track_but_those_with_one_of_their_
     assert [track.direction for track in chosen.values()] == ["alternate", "reversed"]
 
 
-def test_a_list_in_an_experiments_file_is_refused(tmp_path, monkeypatch):
+def test_a_list_in_an_experiments_file_is_refused(own):
     """Hydra would lay one track over the other."""
-    monkeypatch.chdir(tmp_path)
-    file = tmp_path / "conf/experiment/mine.yaml"
-    file.parent.mkdir(parents=True)
-    file.write_text("# @package _global_\ndefaults:\n  - override /track: [Oval_track, Monaco]\n")
+    own("experiment/mine.yaml", "# @package _global_\ndefaults:\n  - override /track: [Oval_track, Monaco]\n")
     assert refusal("experiment=mine").startswith("track: an option file cannot choose several tracks")
 
 
