@@ -32,6 +32,11 @@ def drive(race: Race, actions: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
+def drive_and_see(race: Race, steps: int) -> list[dict[str, np.ndarray]]:
+    """Drive all cars with action 7; return what is seen after each step."""
+    return [(race.step(np.full(race.n_cars, 7)), race.seen)[1] for _ in range(steps)]
+
+
 @pytest.fixture
 def setup_of() -> Callable[..., RaceSetup]:
     return make_setup

@@ -10,13 +10,10 @@ from deepracer_exp.env.lidar import reach_of_rays, readings
 from deepracer_exp.env.race import Race
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M, MOUNT_Z_M
 from deepracer_exp.sim.scenery import box_corners
+from tests.env.conftest import drive_and_see
 
 LIDAR, STILL, FAR = "observation=lidar", "observation.lidar.noise_m=0", "observation.lidar.reach_m=12"
 PLAIN = compose_experiment([LIDAR])[0].observation.lidar
-
-
-def drive(race: Race, steps: int) -> list[np.ndarray]:
-    return [(race.step(np.full(race.n_cars, 7)), race.lidar)[1] for _ in range(steps)]
 
 
 def field_of(race: Race) -> shapely.Polygon:
@@ -46,7 +43,7 @@ def test_it_looks_back_and_sideways_at_the_walls_around_the_field(race_of):
 def test_each_car_sees_the_boxes_of_its_own_episode(race_of, sensors):
     varied = (sensors, STILL, FAR, "randomization=sim2real", "randomization.pictures.objects=[30,30]")
     race = race_of(*varied, "randomization.observation_dropout=[0,0]", n_cars=3)
-    drive(race, 2)
+    drive_and_see(race, 2)
     race.reset(np.array([1]))
     boxes, walls = race._varied.boxes(np.arange(3)).astype(float), field_of(race).exterior
     for car in range(3):
@@ -60,16 +57,11 @@ def test_where_a_world_has_no_walls_it_sees_nothing(race_of):
     assert (race_of(LIDAR, "track.floor.walls_beyond_m=null").lidar == 1).all()
 
 
-@pytest.mark.parametrize(
-    ("changes", "near", "read"),
-    [
-        ({}, [0.02, 0.4, 5.0, np.inf], [0.15, 0.4, 1.0, 1.0]),
-        ({"reach_m": 3.0}, [0.02, 0.4, 5.0, np.inf], [0.15, 0.4, 3.0, 3.0]),
-    ],
-)
-def test_distances_are_clipped(changes, near, read):
-    config = dataclasses.replace(PLAIN, **changes)
-    assert readings(config, np.array([near])).tolist() == [pytest.approx(read)]
+@pytest.mark.parametrize(("changes", "reach_m"), [({}, 1.0), ({"reach_m": 3.0}, 3.0)])
+def test_distances_are_clipped(changes, reach_m):
+    distances = np.array([[0.02, 0.4, 5.0, np.inf]])
+    read = readings(dataclasses.replace(PLAIN, **changes), distances)
+    assert read.tolist() == [pytest.approx([0.15, 0.4, reach_m, reach_m])]
 
 
 def test_a_sector_is_one_where_its_nearest_ray_is_within_reach():
@@ -111,7 +103,7 @@ def test_rays_reach_to_what_is_seen_or_to_the_end_of_its_step():
 
 def test_two_of_three_steps_bring_a_new_scan(race_of):
     race = race_of(LIDAR, FAR)
-    scans = [race.lidar, *drive(race, 12)]
+    scans = [race.lidar, *(seen["lidar"] for seen in drive_and_see(race, 12))]
     new = [not np.array_equal(*pair) for pair in pairwise(scans)]
     assert new == [False, True, True] * 4
 

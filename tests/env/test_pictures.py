@@ -6,8 +6,8 @@ from deepracer_exp.config.driving import PictureRandomizationConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.env.picture_randomization import QUANTITIES, PictureRandomization
 from deepracer_exp.env.pictures import GREY, floor_colors
-from deepracer_exp.env.race import Race
 from deepracer_exp.sim.scenery import MATERIALS, box_corners, paved_area, wall_ring
+from tests.env.conftest import drive_and_see
 
 SMALL = "observation=camera_small"
 OFF = {name: [1, 1] if name.endswith("_scale") else [0, 0] for name in QUANTITIES}
@@ -20,10 +20,6 @@ def written(ranges: dict[str, list[float]]) -> str:
 
 def lens(k1: float) -> str:
     return f"randomization.pictures={written({'lens_k1': [k1, k1]})}"
-
-
-def drive(race: Race, steps: int) -> list[np.ndarray]:
-    return [(race.step(np.full(race.n_cars, 7)), race.pixels)[1] for _ in range(steps)]
 
 
 def test_without_a_camera_nothing_is_drawn(race_of):
@@ -57,8 +53,8 @@ def test_a_started_car_has_seen_its_first_picture_all_along_and_then_the_last_on
     assert np.array_equal(first[0], first[1])
     assert np.array_equal(first[1], first[2])
     one = race_of(SMALL)
-    newest = [picture[0, 0] for picture in drive(one, 8)]
-    stacks = [picture[0] for picture in drive(race, 8)]
+    newest = [seen["pixels"][0, 0] for seen in drive_and_see(one, 8)]
+    stacks = [seen["pixels"][0] for seen in drive_and_see(race, 8)]
     for at in range(2, 8):
         assert np.array_equal(stacks[at], np.stack(newest[at - 2 : at + 1]))
     assert not np.array_equal(newest[-1], newest[-2])
@@ -95,7 +91,8 @@ def test_a_dropped_observation_repeats_the_picture_too(race_of):
 def test_a_car_that_accelerates_looks_up(race_of):
     """Its nose rises, so the horizon sinks in the picture."""
     flat, leaning = (race_of(SMALL, f"car.tilt_deg_per_mps2={tilt}") for tilt in (0, 2))
-    drive(flat, 3), drive(leaning, 3)
+    for race in (flat, leaning):
+        drive_and_see(race, 3)
     ahead = leaning._batch.acceleration_mps2[0, 0]
     assert ahead > 0.3
     wall = [(race.pixels[0, 0] < 60).argmin(axis=0).mean() for race in (flat, leaning)]
@@ -246,5 +243,4 @@ def horizon(picture: np.ndarray) -> float:
 def test_pictures_without_randomization_are_those_with_ranges_that_change_nothing(race_of):
     plain = race_of(SMALL)
     nothing = race_of(SMALL, f"randomization.pictures={written(OFF)}")
-    for ours, theirs in zip(drive(plain, 5), drive(nothing, 5), strict=True):
-        assert np.array_equal(ours, theirs)
+    np.testing.assert_equal(drive_and_see(plain, 5), drive_and_see(nothing, 5))

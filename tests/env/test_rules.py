@@ -60,14 +60,6 @@ def test_nothing_ends_an_episode_in_its_prepare_step(progress, moved_m, off_trac
     assert OneCar(max_steps=1).step(progress, moved_m, off_track) == "prepare"
 
 
-def test_a_car_that_drives_is_in_progress(car):
-    assert car.step() == "in_progress"
-
-
-def test_no_wheel_on_the_road_ends_the_episode_at_once(car):
-    assert car.step(off_track=True) == "off_track"
-
-
 def test_full_progress_completes_the_lap(car):
     assert car.step(progress=99.999) == "in_progress"
     assert car.step(progress=100.0) == "lap_complete"
@@ -96,11 +88,7 @@ def test_the_last_allowed_step_is_time_up():
 
 @pytest.mark.parametrize(
     ("rule", "how"),
-    [
-        ("max_steps", {}),
-        ("immobilized_steps", {"moved_m": 0.0}),
-        ("reversed_steps", {"ahead": -0.001}),
-    ],
+    [("max_steps", {}), ("immobilized_steps", {"moved_m": 0.0}), ("reversed_steps", {"ahead": -0.001})],
 )
 def test_zero_switches_a_rule_off(rule, how):
     car = OneCar(**{"max_steps": 0, rule: 0})

@@ -5,21 +5,16 @@ import numpy as np
 import pytest
 
 import deepracer_exp.env.gym_env  # noqa: F401 - registers DeepRacer-v0
-from deepracer_exp.env.race import Race
+from tests.env.conftest import drive_and_see
 
 PICTURES, SCANS = ("observation=camera_small",), ("observation=lidar", "observation.lidar.reach_m=12")
 RANDOM = "randomization=sim2real"
 
 
-def drive(race: Race, steps: int) -> list[dict[str, np.ndarray]]:
-    """Return what is seen after each step."""
-    return [(race.step(np.full(race.n_cars, 7)), race.seen)[1] for _ in range(steps)]
-
-
 @pytest.mark.parametrize(("key", "sensors"), [("pixels", PICTURES), ("lidar", SCANS)])
 def test_starting_one_car_leaves_what_the_others_see(race_of, key, sensors):
     race = race_of(*sensors, n_cars=3)
-    before = drive(race, 5)[-1][key]
+    before = drive_and_see(race, 5)[-1][key]
     race.reset(np.array([1]))
     now = race.seen[key]
     np.testing.assert_array_equal(now[[0, 2]], before[[0, 2]])
@@ -39,16 +34,16 @@ def test_starting_one_car_leaves_what_the_others_see(race_of, key, sensors):
 )
 def test_a_restored_race_sees_the_same_as_the_original(race_of, steps, overrides):
     race, other = race_of(*overrides, n_cars=4), race_of(*overrides, n_cars=4)
-    drive(race, steps)
+    drive_and_see(race, steps)
     other.load_state_dict(race.state_dict())
-    np.testing.assert_equal(drive(race, 5), drive(other, 5))
+    np.testing.assert_equal(drive_and_see(race, 5), drive_and_see(other, 5))
 
 
 @pytest.mark.parametrize(("key", "overrides"), [("pixels", (*PICTURES, RANDOM)), ("lidar", SCANS)])
 def test_what_a_car_sees_depends_on_its_number_and_not_on_the_batch(race_of, key, overrides):
     overrides = (*overrides, "episode.start_advance=0")
     together, alone = race_of(*overrides, n_cars=5), race_of(*overrides, n_cars=2, first_car=3)
-    for ours, theirs in zip(drive(together, 4), drive(alone, 4), strict=True):
+    for ours, theirs in zip(drive_and_see(together, 4), drive_and_see(alone, 4), strict=True):
         np.testing.assert_array_equal(ours[key][3:], theirs[key])
 
 
