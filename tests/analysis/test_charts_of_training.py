@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
@@ -32,12 +31,10 @@ from deepracer_exp.analysis.charts.training import (
     training_progress,
 )
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.deepracer.recording_reader import read_recording
 
 from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording
 
-CONSOLE = Path(__file__).parents[2] / "../shared/reference/console_training"
 OF_LAPS = (lap_time_histogram, lap_time_percentile, lap_delta, correlations)
 OF_RACES = (evaluations, stability, lap_time_histogram, reward_distribution, common_rewards, discount_factors)
 ALL = (
@@ -238,9 +235,7 @@ def test_lap_time_goes_against_speed_and_the_closest_comes_first(lapping: LogVie
     assert len(chart.rows[0]) == 3
 
 
-@pytest.mark.skipif(not CONSOLE.is_dir(), reason="the recorded console training is not there")
-def test_the_console_training_has_47_laps_the_best_of_14_13_s() -> None:
-    console = prepare(read_recording(CONSOLE))
+def test_the_console_training_has_47_laps_the_best_of_14_13_s(console: LogView) -> None:
     chart = lap_time_histogram(console)
     assert chart.rows[0][0].title == "All complete laps (47)"
     assert any(mark.name == "best 14.13 s" for mark in layers(chart, "mark"))

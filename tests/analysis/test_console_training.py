@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,11 +9,10 @@ import pytest
 from deepracer.logs import AnalysisUtils, DeepRacerLog
 
 from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.deepracer.recording_reader import read_recording
 
-CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
-pytestmark = pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")
+from .conftest import CONSOLE
 
 SAME = {
     "iteration": "iteration",
@@ -34,25 +32,23 @@ SAME = {
 
 
 @pytest.fixture(scope="module")
-def view() -> LogView:
-    return prepare(read_recording(CONSOLE))
-
-
-@pytest.fixture(scope="module")
-def theirs() -> pd.DataFrame:
+def theirs(console: LogView) -> pd.DataFrame:
+    """What deepracer-utils makes of the training, where there is one."""
     log = DeepRacerLog(model_folder=str(CONSOLE))
     with contextlib.redirect_stdout(io.StringIO()):  # it prints what it does
         log.load_training_trace()
         return AnalysisUtils.simulation_agg(log.dataframe(), secondgroup="unique_episode")
 
 
-def test_episodes_equal_those_of_deepracer_utils(view: LogView, theirs: pd.DataFrame) -> None:
-    ours = view.episodes[list(SAME.values())].to_numpy(np.float64)
+def test_episodes_equal_those_of_deepracer_utils(console: LogView, theirs: pd.DataFrame) -> None:
+    ours = console.episodes[list(SAME.values())].to_numpy(np.float64)
     np.testing.assert_allclose(ours, theirs[list(SAME)].to_numpy(np.float64), rtol=1e-12)
-    assert view.episodes["quintile"].tolist() == [int(word[0]) for word in theirs["quintile"]]
+    assert console.episodes["quintile"].tolist() == [int(word[0]) for word in theirs["quintile"]]
 
 
-def test_iterations_equal_the_means_of_deepracer_utils_episodes(view: LogView, theirs: pd.DataFrame) -> None:
+def test_iterations_equal_the_means_of_deepracer_utils_episodes(
+    console: LogView, theirs: pd.DataFrame
+) -> None:
     groups = theirs.groupby("iteration")
     laps = theirs[theirs["complete"].astype(bool)].groupby("iteration")["time"]
     expected = pd.DataFrame(
@@ -65,34 +61,34 @@ def test_iterations_equal_the_means_of_deepracer_utils_episodes(view: LogView, t
             "lap_time_p25_s": laps.quantile(0.25),
         }
     )
-    ours = view.iterations.set_index("iteration")[list(expected)]
+    ours = console.iterations.set_index("iteration")[list(expected)]
     np.testing.assert_allclose(ours.to_numpy(np.float64), expected.to_numpy(np.float64), rtol=1e-12)
 
 
-def test_laps_course_and_evaluations_are_those_that_the_service_reports(view: LogView) -> None:
-    assert len(view.steps) == 44_247
-    assert view.episodes["complete"].sum() == view.episodes["lap_time_s"].notna().sum() == 47
-    assert round(view.episodes["lap_time_s"].min(), 2) == 14.13
-    assert (view.course.name, view.course.reversed) == ("reinvent_base", False)
+def test_laps_course_and_evaluations_are_those_that_the_service_reports(console: LogView) -> None:
+    assert len(console.steps) == 44_247
+    assert console.episodes["complete"].sum() == console.episodes["lap_time_s"].notna().sum() == 47
+    assert round(console.episodes["lap_time_s"].min(), 2) == 14.13
+    assert (console.course.name, console.course.reversed) == ("reinvent_base", False)
     # Where the rear axle really is, it moves where it looks.
-    assert view.steps["slide_deg"].abs().median() < 0.2
-    evaluated = view.iterations["eval_completion"]
+    assert console.steps["slide_deg"].abs().median() < 0.2
+    evaluated = console.iterations["eval_completion"]
     assert evaluated.notna().all()
     assert evaluated.iloc[0] == pytest.approx(3.4)
     assert evaluated.iloc[-6:].tolist() == [100.0] * 6
-    races = view.evaluation_episodes[view.evaluation_episodes["stream"].str.startswith("leaderboard")]
+    races = console.evaluation_episodes[console.evaluation_episodes["stream"].str.startswith("leaderboard")]
     assert len(races) == 6
     assert races["lap_time_s"].between(15.0, 17.5).all()
 
 
-def test_a_checkpoint_that_no_log_names_is_named_by_the_steps_before_it(view: LogView) -> None:
+def test_a_checkpoint_that_no_log_names_is_named_by_the_steps_before_it(console: LogView) -> None:
     traces = read_recording(CONSOLE / "sim-trace" / "training")
-    logged = view.recording.checkpoints
+    logged = console.recording.checkpoints
     assert traces.checkpoints == {number: logged[number] for number in range(28)}
 
 
-def test_findings_name_the_iteration_and_the_places_that_the_tables_show(view: LogView) -> None:
-    found = {one.rule: one for one in findings(view)}
+def test_findings_name_the_iteration_and_the_places_that_the_tables_show(console: LogView) -> None:
+    found = {one.rule: one for one in findings(console)}
     assert set(found) == {"converged", "submit", "chance", "time_lost", "runs_off", "steering", "overfits"}
     assert found["converged"].sentence.startswith("Not converged yet")
     assert "checkpoint 25_Step-33002, which drove iteration 25" in found["submit"].sentence

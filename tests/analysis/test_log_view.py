@@ -10,7 +10,6 @@ import pytest
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.tables import DERIVED_COLUMNS, EPISODE_COLUMNS, ITERATION_COLUMNS
 from deepracer_exp.deepracer.recording import STEP_COLUMNS
-from deepracer_exp.errors import BadInput
 
 from .made_up import Drive, made_up_course, made_up_recording
 
@@ -121,9 +120,3 @@ def test_a_lap_whose_beginning_is_not_recorded_has_no_lap_time() -> None:
     view = prepare(replace(recording, steps=recording.steps.iloc[30:].reset_index(drop=True)))
     assert view.episodes["complete"].tolist() == [True, True]
     assert view.episodes["lap_time_s"].isna().tolist() == [True, False]
-
-
-def test_without_steps_there_is_nothing_to_prepare() -> None:
-    recording = made_up_recording([Drive()])
-    with pytest.raises(BadInput, match="no control steps"):
-        prepare(replace(recording, steps=recording.steps.iloc[:0]))

@@ -1,7 +1,6 @@
 """Another reward function on recorded steps."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -19,14 +18,14 @@ from deepracer_exp.deepracer.recording import (
     Recording,
     typed_table,
 )
-from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs.files import read_config
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.tracks.track import Track
 
-REFERENCE = Path(__file__).parents[2] / "../shared/reference"
+from .conftest import CONSOLE
+
 FOLLOW = """
 def reward_function(params):
     share = params["distance_from_center"] / params["track_width"]
@@ -73,12 +72,9 @@ def reward(tmp_path):
     return write
 
 
-def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_evaluations(reward):
-    folder = REFERENCE / "console_training"
-    if not folder.is_dir():
-        pytest.skip("the recordings of the real service are not on this machine")
-    course = Track.from_route(np.load(REFERENCE / "routes/reinvent_base.npy"), "reinvent_base")
-    view = replace(prepare(read_recording(folder)), course=course)
+def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_evaluations(console, reward):
+    route = np.load(CONSOLE.parent / "routes" / "reinvent_base.npy")
+    view = replace(console, course=Track.from_route(route, "reinvent_base"))
     replayed = replay_reward(view, reward(FOLLOW))
     assert (replayed.steps["stream"] == "training").sum() == 44_247
     np.testing.assert_array_equal(replayed.steps["new_reward"], replayed.steps["reward"])
@@ -101,10 +97,8 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
 
 
 def test_step_by_step_and_all_at_once_pay_the_same(own, reward):
-    from importlib.resources import files
-
     name = "progress_gain"
-    text = (files("reward_zoo") / f"{name}.py").read_text().replace("def reward_batch", "def unused")
+    text = named_reward_source(name).text.replace("def reward_batch", "def unused")
     at_once, one_by_one = replay_reward(own, name), replay_reward(own, reward(text))
     np.testing.assert_allclose(
         at_once.steps["new_reward"], one_by_one.steps["new_reward"], rtol=0, atol=1e-12

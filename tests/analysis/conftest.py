@@ -1,0 +1,16 @@
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.deepracer.recording_reader import read_recording
+
+CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
+
+
+@pytest.fixture(scope="session")
+def console() -> LogView:
+    """A recorded training of the AWS console."""
+    if not CONSOLE.is_dir():
+        pytest.skip("no recorded training of the console is there")
+    return prepare(read_recording(CONSOLE))
