@@ -23,11 +23,14 @@ def random_actions(steps: int, cars: int) -> np.ndarray:
 
 
 def drive(race: Race, actions: np.ndarray) -> np.ndarray:
-    """Drive with actions (steps, cars, ...), start new episodes as they end, return traces (steps, cars, C)."""
+    """Drive with actions (steps, cars, ...), start new episodes as they end.
+
+    Return (steps, cars, C): the trace of every step, and after its columns the observation.
+    """
     rows = []
     for action in actions:
         race.step(action)
-        rows.append(race.trace.copy())
+        rows.append(np.concatenate([race.trace, race.observation], axis=1))
         race.reset(np.flatnonzero(race.terminated | race.truncated))
     return np.array(rows)
 

@@ -5,13 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.setup import build_setup, courses_of_cars
+from deepracer_exp.env.setup import courses_of_cars
 from deepracer_exp.errors import BadInput
-from tests.env.conftest import spied
+from tests.env.conftest import drive, spied
 
 THREE = ("track=[reinvent_wood,Straight_track,Spain_track]", "track.Spain_track.direction=reversed")
 WAYS = ("action_space=continuous", "episode.max_steps=40", "randomization=sim2real")
@@ -23,18 +22,6 @@ def reward_batch(params):
     given = params["track_length"] + 1000 * params["is_reversed"] + len(params["waypoints"]) / 1000
     return np.full(len(params["x"]), given)
 """
-
-
-def drive(race: Race, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drive (steps, cars, 2), start episodes as they end; return traces and observations."""
-    race.reset()
-    rows, seen = [], []
-    for action in actions:
-        race.step(action)
-        rows.append(race.trace.copy())
-        seen.append(race.observation.copy())
-        race.reset(np.flatnonzero(race.terminated | race.truncated))
-    return np.array(rows), np.array(seen)
 
 
 # --- Which cars drive where
@@ -73,31 +60,31 @@ def test_the_number_of_processes_does_not_change_a_cars_course(setup_of):
 # --- Cars of several courses beside one another
 
 
-def test_each_car_drives_bit_for_bit_as_alone_on_its_course(setup_of):
+def test_each_car_drives_bit_for_bit_as_alone_on_its_course(race_of):
     actions = np.random.default_rng(4).uniform(-1, 1, (90, 6, 2))
-    setup = setup_of(*THREE, *WAYS)
-    race = Race(setup, 6)
+    race = race_of(*THREE, *WAYS, n_cars=6)
     np.testing.assert_array_equal(race.rules.course, [0, 1, 2, 0, 1, 2])
-    rows, seen = drive(race, actions)
+    rows = drive(race, actions)
     assert rows[:, :, PACKED["done"]].sum() >= 12
     for car, course in enumerate(race.rules.course):
-        alone = Race(dataclasses.replace(setup, courses=setup.courses[course : course + 1]), 1, first_car=car)
-        own_rows, own_seen = drive(alone, actions[:, car : car + 1])
+        own = dataclasses.replace(race.setup, courses=race.setup.courses[course : course + 1])
+        alone = Race(own, 1, first_car=car)
+        alone.reset()
+        own_rows = drive(alone, actions[:, car : car + 1])
         own_rows[:, :, PACKED["track"]] = course
         np.testing.assert_array_equal(rows[:, car], own_rows[:, 0])
-        np.testing.assert_array_equal(seen[:, car], own_seen[:, 0])
 
 
-def test_the_trace_reports_course_and_length(setup_of):
-    race = Race(setup_of(*THREE), 4)
-    rows, _ = drive(race, np.zeros((2, 4), np.int64))
+def test_the_trace_reports_course_and_length(race_of):
+    race = race_of(*THREE, n_cars=4)
+    rows = drive(race, np.zeros((2, 4), np.int64))
     lengths = [course.tracks[0].length_m for course in race.setup.courses]
     np.testing.assert_array_equal(rows[1, :, PACKED["track"]], [0, 1, 2, 0])
     np.testing.assert_array_equal(rows[1, :, PACKED["track_len"]], np.array(lengths)[[0, 1, 2, 0]])
 
 
-def test_a_reward_function_gets_its_cars_own_course(setup_of, spy):
-    race = Race(setup_of(*THREE, spy), 6)
+def test_a_reward_function_gets_its_cars_own_course(race_of, spy):
+    race = race_of(*THREE, spy, n_cars=6)
     drive(race, np.zeros((3, 6), np.int64))
     for car, seen in enumerate(spied(race)):
         track = race.setup.courses[race.rules.course[car]].tracks[0]
@@ -109,13 +96,12 @@ def test_a_reward_function_gets_its_cars_own_course(setup_of, spy):
             assert np.hypot(params["x"] - ahead[0], params["y"] - ahead[1]) < 1.5
 
 
-def test_the_batch_form_is_called_for_each_course(setup_of, tmp_path):
+def test_the_batch_form_is_called_for_each_course(race_of, tmp_path):
     (tmp_path / "given.py").write_text(GIVEN)
-    scalar = GIVEN.replace("reward_batch", "unused")
-    (tmp_path / "scalar.py").write_text(scalar)
+    (tmp_path / "scalar.py").write_text(GIVEN.replace("reward_batch", "unused"))
     paid = []
     for name in ("given", "scalar"):
-        race = Race(setup_of(*THREE, f"reward.file={tmp_path / name}.py"), 7)
+        race = race_of(*THREE, f"reward.file={tmp_path / name}.py", n_cars=7)
         drive(race, np.zeros((2, 7), np.int64))
         paid.append(race.reward)
     np.testing.assert_array_equal(*paid)
@@ -137,10 +123,9 @@ def test_a_start_inside_an_open_course_is_refused_among_others(setup_of):
         setup_of(*THREE, "episode.start_offset=0.5")
 
 
-def test_a_floor_acts_on_its_own_cars_alone(setup_of):
+def test_a_floor_acts_on_its_own_cars_alone(race_of):
     """On ice a car is slow to start, and the car beside it on the road is not."""
-    setup = setup_of("track=[reinvent_base,Oval_track]", "track.reinvent_base.floor.friction=0.05")
-    race = Race(setup, 2)
+    race = race_of("track=[reinvent_base,Oval_track]", "track.reinvent_base.floor.friction=0.05", n_cars=2)
     drive(race, np.full((8, 2), 7))
     assert race.trace[0, PACKED["speed_mps"]] < 0.7 * race.trace[1, PACKED["speed_mps"]]
     race.reset(np.arange(2), course=np.array([1, 0]))
@@ -205,8 +190,8 @@ def test_gym_cars_are_shared_out_and_each_track_needs_one():
         DeepRacerVectorEnv(2, [THREE[0]])
 
 
-def test_all_tracks_drive_together():
-    race = Race(build_setup(compose_experiment(["track=all"])[0]), 63)
+def test_all_tracks_drive_together(race_of):
+    race = race_of("track=all", n_cars=63)
     drive(race, np.full((3, 63), 2))
     assert np.isfinite(race.observation).all()
     assert len(set(race.trace[:, PACKED["track"]])) == len(race.setup.courses)

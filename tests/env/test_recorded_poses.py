@@ -6,9 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.rules import RaceRules
+from deepracer_exp.env.setup import build_setup
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.sim.batch import CarState
@@ -80,9 +82,6 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def setup():
-    from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.env.setup import build_setup
-
     route = f"track.file={REFERENCE / 'routes/reinvent_base.npy'}"
     if not (REFERENCE / "routes").is_dir():
         pytest.skip("the routes of the real service are not on this machine")
