@@ -7,7 +7,7 @@ from torch.distributions import kl_divergence
 
 from deepracer_exp.agents.ppo import Distillation
 
-from .test_ppo import drive, make, parameters, train
+from .test_ppo import KINDS, drive, make, parameters, train
 
 
 def taught(shared=False, actions=3, seed=0, iterations=20):
@@ -22,7 +22,7 @@ def make_ppo(networks, like):
     return type(like)(networks, like.config, like.schedule, 7)
 
 
-@pytest.mark.parametrize(("shared", "actions"), [(False, 3), (True, 3), (False, None), (True, None)])
+@pytest.mark.parametrize(("shared", "actions"), KINDS)
 def test_it_comes_to_act_as_the_teacher_would_like_best(shared, actions):
     networks, pupil, teacher = taught(shared, actions)
     before = parameters(teacher).clone()

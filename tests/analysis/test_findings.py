@@ -206,9 +206,7 @@ def test_the_car_runs_off_where_it_was_made_to() -> None:
     assert of(off_at(), "runs_off").sentence == "The car does not run off the road since iteration 0."
 
 
-def test_a_car_that_goes_straight_on_with_the_wheel_turned_understeers_and_a_spinning_one_oversteers() -> (
-    None
-):
+def test_a_car_that_goes_straight_on_though_steered_understeers_and_a_spinning_one_oversteers() -> None:
     found = of(off_at((35, 6, False), (85, 4, True)), "steering")
     assert found.sentence.startswith("Before it runs off, at waypoint 35 it understeers")
     assert "at waypoint 85 it oversteers" in found.sentence

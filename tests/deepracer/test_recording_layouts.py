@@ -303,8 +303,7 @@ def test_a_name_that_is_no_utf_8_can_be_shown(tmp_path):
 
 def test_nothing_readable_is_refused_in_one_line(tmp_path):
     (tmp_path / "empty").mkdir()
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes/shopping.csv").write_text("milk,eggs\n1,2\n")
+    made.write_folder({"notes/shopping.csv": "milk,eggs\n1,2\n"}, tmp_path)
     (tmp_path / "no.tar.gz").write_bytes(b"\x1f\x8b no archive")
     for name in ("absent", "empty", "notes", "notes/shopping.csv", "no.tar.gz"):
         with pytest.raises(BadInput) as refused:
@@ -314,12 +313,9 @@ def test_nothing_readable_is_refused_in_one_line(tmp_path):
 
 
 def test_unrelated_files_are_named(tmp_path):
-    made.write_folder(made.drfc_single(), tmp_path)
-    (tmp_path / "invoice.docx").write_bytes(b"PK")
-    (tmp_path / "prices.csv").write_text("milk,eggs\n1,2\n")
-    (tmp_path / "other.json").write_text("[1, 2]")
-    recording = read_recording(tmp_path)
+    unrelated = {"invoice.docx": "PK", "prices.csv": "milk,eggs\n1,2\n", "other.json": "[1, 2]"}
+    recording = read_recording(made.write_folder(made.drfc_single() | unrelated, tmp_path))
     assert len(made.training(recording)) == 36
     logged = "\n".join(map(str, recording.problems))
-    for name in ("invoice.docx", "prices.csv", "other.json"):
+    for name in unrelated:
         assert name in logged

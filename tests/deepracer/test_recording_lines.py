@@ -97,9 +97,9 @@ def test_the_radians_of_2019_become_degrees_and_later_degrees_stay(tmp_path):
 )
 def test_a_continuous_action_is_no_number(tmp_path, action):
     rows = ROWS.assign(action=action)
-    (tmp_path / "a.log").write_text(made.log_text(rows, 19))
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b/0-iteration.csv").write_text(made.csv_text(rows, 19))
+    made.write_folder(
+        {"a.log": made.log_text(rows, 19), "b/0-iteration.csv": made.csv_text(rows, 19)}, tmp_path
+    )
     for path in (tmp_path / "a.log", tmp_path / "b"):
         recording = read_recording(path)
         assert len(recording.steps) == len(ROWS)
@@ -107,17 +107,12 @@ def test_a_continuous_action_is_no_number(tmp_path, action):
 
 
 def test_generations_one_after_the_other_in_one_file_are_all_read(tmp_path):
-    text = "".join(
-        made.log_text(ROWS.assign(episode=ROWS["episode"] + 3 * at), f) for at, f in enumerate(GENERATIONS)
-    )
-    (tmp_path / "a.log").write_text(text)
+    rows = [ROWS.assign(episode=ROWS["episode"] + 3 * at) for at in range(len(GENERATIONS))]
+    (tmp_path / "a.log").write_text("".join(map(made.log_text, rows, GENERATIONS)))
     recording = read_recording(tmp_path)
     assert not recording.problems
     assert len(recording.steps) == len(ROWS) * len(GENERATIONS)
-    tables = [
-        made.csv_text(ROWS.assign(episode=ROWS["episode"] + 3 * at), f) for at, f in enumerate(GENERATIONS)
-    ]
-    (tmp_path / "all.csv").write_text("\n".join(tables))
+    (tmp_path / "all.csv").write_text("\n".join(map(made.csv_text, rows, GENERATIONS)))
     assert len(read_recording(tmp_path / "all.csv").steps) == len(ROWS) * len(GENERATIONS)
 
 

@@ -77,7 +77,7 @@ def programmed(default: Written, monkeypatch: pytest.MonkeyPatch) -> None:
         ("action_space=continuous", "network=mlp_small", "network.activation=tanh"),
         ("action_space=continuous", "network=mlp_small_shared", "network.activation=elu"),
     ],
-    ids=lambda overrides: " ".join(overrides),
+    ids=" ".join,
 )
 def test_the_file_gives_the_command_of_the_policys_likeliest_action(tmp_path, overrides):
     file = written(tmp_path / "policy.onnx", *overrides)

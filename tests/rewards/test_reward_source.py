@@ -143,5 +143,5 @@ def test_a_function_of_the_zoo_is_known_by_its_text_whatever_its_constants() -> 
     assert is_of_zoo(source.text)
     assert is_of_zoo(source_with_constants(other))
     assert not is_of_zoo(source.text + "\nprint('hello')\n")
-    assert not is_of_zoo("def reward_function(params):\n    return 1.0\n")
+    assert not is_of_zoo(PLAIN)
     assert not is_of_zoo("no Python at all")
