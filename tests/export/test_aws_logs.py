@@ -62,9 +62,10 @@ def exported(run, export):
     return {layout: export(run.folder, layout) for layout in LAYOUTS}
 
 
-def finished(folder) -> pd.DataFrame:
-    """Return our trace's rows of episodes that ended, with the iteration in which they did."""
-    rows = read_trace(folder / "trace").rename(columns=RENAMED)
+@pytest.fixture(scope="module")
+def ours(run) -> pd.DataFrame:
+    """Our trace's rows of episodes that ended, with the iteration in which they did."""
+    rows = read_trace(run.folder / "trace").rename(columns=RENAMED)
     rows["ended"] = rows.groupby("episode")["done"].transform("any")
     rows["iteration"] = rows.groupby("episode")["iteration"].transform("max")
     rows = rows[rows["ended"]]
@@ -87,15 +88,14 @@ def log(request, exported, caplog) -> DeepRacerLog:
     return loaded(exported[request.param][0], request.param, caplog)
 
 
-def test_deepracer_utils_loads_the_rows_of_our_trace(run, log):
-    theirs, ours = log.dataframe(), finished(run.folder)
+def test_deepracer_utils_loads_the_rows_of_our_trace(ours, log):
+    theirs = log.dataframe()
     assert len(theirs) == len(ours) > 1000
     for name in EXACT:
         assert theirs[name].tolist() == ours[name].tolist(), name
 
 
-def test_deepracer_utils_counts_our_episodes(run, log):
-    ours = finished(run.folder)
+def test_deepracer_utils_counts_our_episodes(ours, log):
     episodes = AnalysisUtils.simulation_agg(
         log.dataframe(), firstgroup="iteration", secondgroup="unique_episode"
     )
@@ -108,8 +108,8 @@ def test_deepracer_utils_counts_our_episodes(run, log):
     assert episodes["unique_episode"].is_unique
 
 
-def test_deepracer_utils_finds_hyperparameters_and_action_space(run, log):
-    per_iteration = finished(run.folder).groupby("iteration")["episode"].nunique().max()
+def test_deepracer_utils_finds_hyperparameters_and_action_space(ours, log):
+    per_iteration = ours.groupby("iteration")["episode"].nunique().max()
     assert log.hyperparameters()["num_episodes_between_training"] == per_iteration
     # As trained, though the console takes no such values.
     assert log.hyperparameters()["batch_size"] == 256
@@ -148,11 +148,10 @@ def test_deepracer_utils_measures_the_control_period(exported, caplog):
         ("deepracer-for-cloud", "metrics/TrainingMetrics.json"),
     ],
 )
-def test_deepracer_utils_loads_the_metrics(run, exported, layout, pattern, monkeypatch):
+def test_deepracer_utils_loads_the_metrics(run, ours, exported, layout, pattern, monkeypatch):
     monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")  # it makes a client of S3 even for a file
     (file,) = exported[layout][0].glob(pattern)
     metrics = TrainingMetrics(None, fname=str(file))
-    ours = finished(run.folder)
     own = ours.groupby(["iteration", "episode"])
     training = metrics.getTraining()
     assert training["iteration"].tolist() == [iteration for iteration, _ in own.groups]
@@ -172,9 +171,9 @@ def test_the_trainers_log_has_a_line_for_each_update(run, exported):
     assert f"KL divergence={run.metrics[-1]['kl']}, " in lines[-1]
 
 
-def test_what_is_left_out_is_reported(run, exported):
+def test_what_is_left_out_is_reported(run, ours, exported):
     _, said = exported["console"]
-    missing = len(read_trace(run.folder / "trace", ["steps"])) - len(finished(run.folder))
+    missing = len(read_trace(run.folder / "trace", ["steps"])) - len(ours)
     assert f"{missing:,} rows of unfinished episodes are left out" in said
 
 
@@ -193,8 +192,8 @@ def test_a_continuous_policy_with_lidar_writes_its_commands_and_sensors(trained,
     assert back.metadata.sensor == ("FRONT_FACING_CAMERA", "LIDAR")
 
 
-def test_our_own_reader_finds_in_the_files_what_the_run_had(run, exported):
-    ours, back = finished(run.folder), read_recording(exported["console"][0])
+def test_our_own_reader_finds_in_the_files_what_the_run_had(run, ours, exported):
+    back = read_recording(exported["console"][0])
     assert back.problems == ()
     assert len(back.steps) == len(ours)
     for name in ("reward", "progress", "tstamp", "iteration"):
@@ -207,8 +206,7 @@ def test_a_folder_that_is_not_empty_is_refused(run, call, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     ended = call("export", str(run.folder), "format=aws-logs", "-o", "full")
-    assert ended.code == 2
-    assert "full: is not empty; accepted: a new or an empty folder" in ended.complaint
+    ended.assert_bad_input("full: is not empty; accepted: a new or an empty folder")
 
 
 def test_the_files_of_the_model_are_those_of_the_run(run, exported):

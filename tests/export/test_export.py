@@ -26,13 +26,8 @@ def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
 def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tmp_path):
     reward = tmp_path / "mine.py"
     reward.write_text("import os\n\n\ndef reward_function(params):\n    return 1.0\n")
-    ended = call(
-        "export",
-        str(trained(f"reward.file={reward}", "budget.iterations=1").folder),
-        "format=aws",
-        "-o",
-        "files",
-    )
+    run = trained(f"reward.file={reward}", "budget.iterations=1")
+    ended = call("export", str(run.folder), "format=aws", "-o", "files")
     assert ended.code == 0, ended.stderr
     assert "reward_function.py: the AWS console would reject it: line 1: import of os" in ended.stdout
 
@@ -51,9 +46,7 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(call, arguments, words):
-    ended = call("export", *arguments)
-    assert ended.code == 2
-    assert words in ended.complaint
+    call("export", *arguments).assert_bad_input(words)
 
 
 @pytest.mark.parametrize(
@@ -65,6 +58,4 @@ def test_what_cannot_be_exported_is_refused_in_one_line(call, arguments, words):
     ],
 )
 def test_what_a_run_does_not_have_is_refused(trained, call, arguments, words):
-    ended = call("export", str(trained().folder), *arguments)
-    assert ended.code == 2
-    assert words in ended.complaint
+    call("export", str(trained().folder), *arguments).assert_bad_input(words)
