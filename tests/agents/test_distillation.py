@@ -12,14 +12,10 @@ from .test_ppo import KINDS, drive, make, parameters, train
 
 def taught(shared=False, actions=3, seed=0, iterations=20):
     networks, ppo = make(shared, actions, seed)
-    teacher, _ = make(False, actions, seed=7)
-    train(teacher, make_ppo(teacher, ppo), 3)
+    teacher, of_teacher = make(False, actions, seed=7)
+    train(teacher, of_teacher, 3)
     config = dataclasses.replace(ppo.config, teacher_iterations=iterations, teacher_batch_size=32)
     return networks, Distillation(networks, config, ppo.schedule, seed, teacher.policy), teacher
-
-
-def make_ppo(networks, like):
-    return type(like)(networks, like.config, like.schedule, 7)
 
 
 @pytest.mark.parametrize(("shared", "actions"), KINDS)

@@ -9,9 +9,8 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import replay_reward
 from deepracer_exp.analysis.reward_terms import contributed_terms, run_terms
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.rewards.source import RewardSource, load_reward_source, zoo_names
+from deepracer_exp.rewards.source import RewardSource, named_reward_source, zoo_names
 
 from .made_up import Drive, made_up_recording
 
@@ -28,29 +27,27 @@ def view() -> LogView:
     return prepare(made_up_recording([*drives, Drive(speed_mps=2.0, off_at=60)]))
 
 
-def source(name: str) -> RewardSource:
-    return load_reward_source(RewardConfig(name=name, file=None, constants={}, time_limit_s=30.0))
-
-
 def module(text: str) -> RewardSource:
     return RewardSource("mine", "mine.py", text, "", {}, {})
 
 
 @pytest.mark.parametrize("name", zoo_names())
 def test_the_functions_of_the_zoo_that_are_sums_name_their_terms(name: str, view: LogView) -> None:
-    assert (contributed_terms(view, source(name), CAR, most=50) is not None) == (name in WITH_TERMS)
+    assert (contributed_terms(view, named_reward_source(name), CAR, most=50) is not None) == (
+        name in WITH_TERMS
+    )
 
 
 @pytest.mark.parametrize("name", WITH_TERMS)
 def test_terms_add_up_to_the_reward(name: str, view: LogView) -> None:
-    terms = contributed_terms(view, source(name), CAR)
+    terms = contributed_terms(view, named_reward_source(name), CAR)
     assert terms is not None
-    paid = replay_reward(view, source(name), CAR).steps["new_reward"]
+    paid = replay_reward(view, named_reward_source(name), CAR).steps["new_reward"]
     np.testing.assert_allclose(terms.sum(axis=1), paid.loc[terms.index], rtol=1e-9, atol=1e-12)
 
 
 def test_every_driven_row_has_its_terms(view: LogView) -> None:
-    terms = contributed_terms(view, source("center_speed_blend"), CAR)
+    terms = contributed_terms(view, named_reward_source("center_speed_blend"), CAR)
     assert terms is not None
     driven = view.steps[view.steps["episode_status"] != "prepare"]
     assert terms.index.equals(driven.index)
@@ -58,7 +55,7 @@ def test_every_driven_row_has_its_terms(view: LogView) -> None:
 
 def test_of_a_long_training_whole_episodes_are_asked_about(view: LogView) -> None:
     most = len(view.steps) // 3
-    terms = contributed_terms(view, source("center_speed_blend"), CAR, most=most)
+    terms = contributed_terms(view, named_reward_source("center_speed_blend"), CAR, most=most)
     assert terms is not None
     asked = view.steps.loc[terms.index, "episode"]
     assert 0 < len(terms) < 1.5 * most
@@ -77,7 +74,7 @@ def test_a_recordings_own_function_is_run_if_it_was_just_trained(view: LogView) 
 
 
 def test_without_a_course_there_are_no_terms(view: LogView) -> None:
-    assert contributed_terms(replace(view, course=None), source("progress_gain"), CAR) is None
+    assert contributed_terms(replace(view, course=None), named_reward_source("progress_gain"), CAR) is None
 
 
 @pytest.mark.parametrize(

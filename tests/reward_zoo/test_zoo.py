@@ -12,7 +12,7 @@ from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.rewards.source import load_reward_source, zoo_names
+from deepracer_exp.rewards.source import load_reward_source, named_reward_source, zoo_names
 
 CONF = Path(__file__).parents[2] / "conf" / "reward"
 STATELESS = [name for name in zoo_names() if name != "progress_delta"]
@@ -94,12 +94,9 @@ def anywhere(road: str, n: int) -> tuple[dict[str, np.ndarray], list[TrackParams
     return {**columns, "closest_waypoints": pairs}, track_params
 
 
-def config(name: str, **constants: float) -> RewardConfig:
-    return RewardConfig(name=name, file=None, constants=constants, time_limit_s=30.0)
-
-
 def zoo(name: str, n_cars: int, scalar: bool = False, **constants: float) -> RewardFunction:
-    source = load_reward_source(config(name, **constants))
+    config = RewardConfig(name=name, file=None, constants=constants, time_limit_s=30.0)
+    source = load_reward_source(config)
     if scalar:
         text = source.text.replace("def reward_batch(", "def not_called(")
         source = dataclasses.replace(source, text=text)
@@ -143,7 +140,7 @@ def test_every_reward_but_one_has_a_batch_and_no_memory(name: str) -> None:
 
 @pytest.mark.parametrize("name", zoo_names())
 def test_every_reward_passes_the_rules_of_the_console(name: str) -> None:
-    text = load_reward_source(config(name)).text
+    text = named_reward_source(name).text
     words = [
         "__import__",
         "load",
@@ -172,7 +169,7 @@ def test_every_reward_passes_the_rules_of_the_console(name: str) -> None:
 
 @pytest.mark.parametrize("name", zoo_names())
 def test_every_reward_says_what_it_teaches_and_when_it_fails(name: str) -> None:
-    docstring = ast.get_docstring(ast.parse(load_reward_source(config(name)).text))
+    docstring = ast.get_docstring(ast.parse(named_reward_source(name).text))
     assert docstring is not None
     assert docstring.startswith("Teaches ")
     assert re.search(r"\bFails\b", docstring)
@@ -189,7 +186,7 @@ def test_every_constant_has_an_effect(name: str) -> None:
         return [reward(call, track_params, None) for call in calls]
 
     before = rewards()
-    for constant, value in load_reward_source(config(name)).constants.items():
+    for constant, value in named_reward_source(name).constants.items():
         assert not np.array_equal(rewards(**{constant: value * 0.75}), before), constant
 
 
@@ -305,7 +302,7 @@ def test_slow_in_fast_out_pays_for_slow_before_a_corner_and_fast_after_it() -> N
 
 def racing_line(road: str) -> tuple[np.ndarray, ...]:
     namespace: dict[str, Any] = {}
-    exec(load_reward_source(config("racing_line")).text, namespace)
+    exec(named_reward_source("racing_line").text, namespace)
     return namespace["_work_out"](ROADS[road])
 
 
