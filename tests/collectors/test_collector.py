@@ -5,38 +5,22 @@ import numpy as np
 import pytest
 import torch
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.collectors import watchdog
 from deepracer_exp.collectors.base import worker_count
-from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.collectors.worker import EnvFactory
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.trace import PACKED
-from deepracer_exp.env.observation import observation_shape
-from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.sim.batch import cores
 
 pytestmark = pytest.mark.usefixtures("workers_start_early")
 
+FEW = "collector.cars=4"
+
 
 @pytest.fixture
-def collect(tmp_path):
-    """Open a collector with the cars of experiment=tiny; the policy drives at random, its weights are 0."""
-    opened = []
-
-    def open_(*overrides: str) -> LocalCollector:
-        experiment, _ = compose_experiment(["experiment=tiny", "collector.cars=4", *overrides])
-        setup = build_setup(experiment)
-        shapes = observation_shape(experiment.observation), setup.actions.n
-        networks = build_actor_critic(experiment.network, *shapes, torch.Generator())
-        opened.append(LocalCollector(experiment.collector, setup, networks.policy, 61, tmp_path))
-        opened[-1].networks = networks
-        return opened[-1]
-
-    yield open_
-    for collection in opened:
-        collection.close()
+def collect(driver_of):
+    return lambda *overrides: driver_of(FEW, *overrides, frames=61).open()
 
 
 def test_processes_are_as_many_as_asked_for_or_as_there_are_cores():
@@ -74,14 +58,15 @@ def test_a_batch_has_cars_first_and_time_last_in_whole_steps_of_all_cars(collect
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_the_cars_of_the_workers_drive_with_the_weights_published_last(collect, mode):
-    collection = collect(f"collector={mode}", "collector.processes=2")
+def test_the_cars_of_the_workers_drive_with_the_weights_published_last(driver_of, mode):
+    driver = driver_of(FEW, f"collector={mode}", "collector.processes=2", frames=61)
+    collection = driver.open()
     collection.next_batch()
     chosen = 3
     with torch.no_grad():
-        for parameter in collection.networks.policy.parameters():
+        for parameter in driver.policy.parameters():
             parameter.zero_()
-        last_bias = [p for p in collection.networks.policy.parameters() if p.ndim == 1][-1]
+        last_bias = [p for p in driver.policy.parameters() if p.ndim == 1][-1]
         last_bias[chosen] = 100.0
     collection.publish_policy()
     batch = collection.next_batch()

@@ -1,4 +1,3 @@
-import copy
 import os
 import signal
 
@@ -7,11 +6,6 @@ import pytest
 import torch
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.collectors.collector import LocalCollector
-from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.observation import observation_shape
-from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.checkpoints import State
 
@@ -25,59 +19,6 @@ EVERYTHING = (
     # Cars are in the middle of a later episode when the state is taken.
     "episode.max_steps=11",
 )
-
-
-class Driver:
-    """Opens collectors of one experiment, and has the policy that drives in them."""
-
-    def __init__(self, folder, *overrides: str):
-        experiment, _ = compose_experiment(["experiment=tiny", *overrides])
-        self._config, self._setup, self._folder = experiment.collector, build_setup(experiment), folder
-        shapes = observation_shape(experiment.observation), self._setup.actions.n
-        generator = torch.Generator().manual_seed(1)
-        self.policy = build_actor_critic(experiment.network, *shapes, generator).policy
-        self._weights = copy.deepcopy(self.policy.state_dict())
-        self._opened = []
-
-    def open(self, state=None) -> LocalCollector:
-        self.policy.load_state_dict(self._weights)
-        opened = LocalCollector(self._config, self._setup, self.policy, 6 * 20, self._folder, state=state)
-        self._opened.append(opened)
-        return opened
-
-    def learn(self, collection: LocalCollector, turn: int) -> None:
-        """Change the weights as an update would, in a way that depends on the turn alone."""
-        generator = torch.Generator().manual_seed(turn)
-        with torch.no_grad():
-            for name, parameter in self.policy.named_parameters():
-                noise = torch.randn(parameter.shape, generator=generator)
-                parameter.copy_(self._weights[name] + 0.3 * noise)
-        collection.publish_policy()
-
-    def collect(self, collection: LocalCollector, turns: range) -> list:
-        batches = []
-        for turn in turns:
-            if turn:
-                self.learn(collection, turn)
-            batches.append(collection.next_batch().exclude("collector").clone())
-        return batches
-
-    def close(self) -> None:
-        for collection in self._opened:
-            collection.close()
-
-
-@pytest.fixture
-def driver_of(tmp_path):
-    made = []
-
-    def make(*overrides: str) -> Driver:
-        made.append(Driver(tmp_path, *overrides))
-        return made[-1]
-
-    yield make
-    for driver in made:
-        driver.close()
 
 
 def stored(state, folder):
