@@ -40,10 +40,10 @@ CONTINUOUS = METADATA | {
 REWARD = "WEIGHT = 2.0\n\n\ndef reward_function(params):\n    return WEIGHT * params['speed']\n"
 
 
-def refused(call: Callable[..., object], *arguments: object) -> str:
+def refused(call: Callable[..., object], *arguments: object, **options: object) -> str:
     """Return the one line with which a call refuses its arguments."""
     with pytest.raises(BadInput) as caught:
-        call(*arguments)
+        call(*arguments, **options)
     message = str(caught.value)
     assert "\n" not in message
     return message

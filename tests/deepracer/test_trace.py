@@ -22,6 +22,7 @@ from deepracer_exp.deepracer.trace import (
 )
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.trace import TraceWriter, read_trace
+from tests.config.conftest import refused
 
 CONSOLE = (
     Path(__file__).parents[2] / "../shared/reference/console_training/sim-trace/training/training-simtrace"
@@ -146,9 +147,7 @@ def test_a_corrupt_file_is_named(tmp_path: Path, content: bytes | None) -> None:
         pq.write_table(pa.table({"episode": [1]}), file)
     else:
         file.write_bytes(content)
-    with pytest.raises(BadInput, match=r"00001-iteration\.parquet") as caught:
-        read_trace(tmp_path)
-    assert "\n" not in str(caught.value)
+    assert "00001-iteration.parquet" in refused(read_trace, tmp_path)
 
 
 def test_a_folder_without_a_trace_is_named(tmp_path: Path) -> None:

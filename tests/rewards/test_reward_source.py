@@ -14,6 +14,7 @@ from deepracer_exp.rewards.source import (
     source_with_constants,
     zoo_names,
 )
+from tests.config.conftest import refused
 
 PLAIN = "def reward_function(params):\n    return 1.0\n"
 
@@ -29,11 +30,7 @@ def from_text(folder: Path, text: str | bytes, **constants: float) -> RewardSour
 
 
 def refusal(folder: Path, text: str | bytes, **constants: float) -> str:
-    with pytest.raises(BadInput) as caught:
-        from_text(folder, text, **constants)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
+    return refused(from_text, folder, text, **constants)
 
 
 @pytest.mark.parametrize("name", zoo_names())
