@@ -103,8 +103,8 @@ def made_up_recording(
     )
     return Recording(
         name=name,
-        steps=_typed(steps, STEP_COLUMNS),
-        updates=_typed(updates, UPDATE_COLUMNS),
+        steps=typed(steps, STEP_COLUMNS),
+        updates=typed(updates, UPDATE_COLUMNS),
         metrics=_evaluated(drives, evaluated),
         metadata=ModelMetadata(actions=tuple(Action(angle, v) for v in speeds for angle in STEERING_DEG)),
         hyperparameters={"discount_factor": 0.99},
@@ -213,8 +213,8 @@ def _evaluated(drives: Sequence[Drive], evaluated: Sequence[float]) -> pd.DataFr
     ]
     more = {"stream": "training", "worker": 0, "phase": "evaluation", "time_s": 10.0}
     more |= {"episode_status": "Off track", "resets": np.nan}
-    return _typed(pd.DataFrame(rows, columns=list(METRICS_COLUMNS)).assign(**more), METRICS_COLUMNS)
+    return typed(pd.DataFrame(rows, columns=list(METRICS_COLUMNS)).assign(**more), METRICS_COLUMNS)
 
 
-def _typed(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
+def typed(table: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
     return table[list(columns)].astype({name: kind for name, (kind, _) in columns.items()})

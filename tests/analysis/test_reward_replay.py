@@ -11,13 +11,7 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.deepracer.recording import (
-    METRICS_COLUMNS,
-    STEP_COLUMNS,
-    UPDATE_COLUMNS,
-    Recording,
-    typed_table,
-)
+from deepracer_exp.deepracer.recording import STEP_COLUMNS
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs.files import read_config
@@ -25,6 +19,7 @@ from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.tracks.track import Track
 
 from .conftest import CONSOLE
+from .made_up import Drive, made_up_recording, typed
 
 FOLLOW = """
 def reward_function(params):
@@ -42,22 +37,6 @@ def replay_reward(view: LogView, reward: str, **more) -> ReplayedRewards:
 def own(trained) -> LogView:
     run = trained("algorithm.frames_per_iteration=2048", "budget.env_steps=8192").folder
     return prepare(read_own_recording(run))
-
-
-def made(steps: pd.DataFrame, course: Track) -> LogView:
-    recording = Recording(
-        name="made up",
-        steps=steps,
-        updates=typed_table(UPDATE_COLUMNS),
-        metrics=typed_table(METRICS_COLUMNS),
-        metadata=None,
-        hyperparameters=None,
-        reward_source=None,
-        track=None,
-        problems=(),
-        files=(),
-    )
-    return replace(prepare(recording), course=course)
 
 
 @pytest.fixture
@@ -162,8 +141,8 @@ def laps_of(times: dict[int, int], back: tuple[int, ...] = ()) -> LogView:
         stream="training", track="circle", all_wheels_on_track=True
     )
     missing = {name: 0 for name in STEP_COLUMNS if name not in steps}
-    kinds = {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
-    return made(steps.assign(**missing)[list(STEP_COLUMNS)].astype(kinds), circle())
+    steps = typed(steps.assign(**missing), STEP_COLUMNS)
+    return replace(prepare(replace(made_up_recording([Drive()]), steps=steps)), course=circle())
 
 
 def test_laps_are_ranked_by_the_new_reward(reward):
