@@ -256,7 +256,7 @@ def _compare(args: argparse.Namespace) -> int:
         console.print()
         console.print(table)
     if args.output is not None:
-        console.print(f"\n{args.output}: learning curves and lap times", soft_wrap=True)
+        console.print(f"\n{args.output}: learning curves", soft_wrap=True)
     return 0
 
 

@@ -122,6 +122,10 @@ def test_runs_of_any_kind_are_drawn_over_each_other(record):
     assert draw(chart).data
     none = learning_curves_compared({"A": record("x", lap_s=None), "B": record("y", lap_s=None)})
     assert draw(none).data
+    assert [panel.title for row in none.rows for panel in row] == [
+        "Completion, mean",
+        "Return of an episode, mean",
+    ]
 
 
 def write(record: RunRecord) -> None:

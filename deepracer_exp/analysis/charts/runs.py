@@ -217,11 +217,16 @@ def evaluation_results(view: LogView) -> dict[str, float]:
 
 def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     """Draw the learning curves of our own runs, by a short label, over each other, and their lap times."""
+    best_s, mean_s = (
+        np.array([last_value(record, name) for record in records.values()], np.float64)
+        for name in ("best_lap_time_s", "mean_lap_time_s")
+    )
+    has_laps = np.isfinite(best_s).any()
     panels: list[Panel] = []
     for column, title, unit in (
         ("completion", "Completion, mean", "per cent of the lap"),
         ("mean_return", "Return of an episode, mean", "return"),
-        ("mean_lap_time_s", "Lap time, mean", "s"),
+        *([("mean_lap_time_s", "Lap time, mean", "lap time, s")] if has_laps else []),
     ):
         layers: list[Layer] = []
         for number, (label, record) in enumerate(records.items()):
@@ -234,20 +239,19 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
             name = None if panels else f"{label}  {record.name}"
             layers.append(line(rows["env_steps"] / 1000, curve, color, name, dashed=dashed))
         panels.append(Panel(title=title, x_label="thousand control steps", y_label=unit, layers=layers))
-    best_s, mean_s = (
-        np.array([last_value(record, name) for record in records.values()], np.float64)
-        for name in ("best_lap_time_s", "mean_lap_time_s")
-    )
-    at = np.arange(len(records))
-    laps: list[Layer] = [
-        bars(at, best_s, BLUE, "best"),
-        points(at, mean_s, ORANGE, "mean of the last iteration", size=11, symbol="diamond"),
-        *(note((float(k), 0.0), "no lap") for k in at[np.isnan(best_s)]),
-    ]
-    panels.append(Panel(title="Laps in training", y_label="lap time, s", layers=laps, x_names=list(records)))
+    if has_laps:
+        at = np.arange(len(records))
+        laps: list[Layer] = [
+            bars(at, best_s, BLUE, "best"),
+            points(at, mean_s, ORANGE, "mean of the last iteration", size=11, symbol="diamond"),
+            *(note((float(k), 0.0), "no lap") for k in at[np.isnan(best_s)]),
+        ]
+        panels.append(
+            Panel(title="Laps in training", y_label="lap time, s", layers=laps, x_names=list(records))
+        )
     return Chart(
         name="learning_curves_compared",
-        title="Learning curves and lap times",
+        title="Learning curves and lap times" if has_laps else "Learning curves",
         caption="Lines are moving averages of three iterations.",
         rows=in_rows(panels),
     )
