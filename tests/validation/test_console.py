@@ -1,6 +1,6 @@
 import pytest
 
-from deepracer_exp.validation.console import BUILTINS, WORDS, console_findings, style_findings
+from deepracer_exp.validation.console import console_findings, style_findings
 
 GOOD = '''\
 import math
@@ -38,7 +38,7 @@ def test_an_import_inside_a_function_is_refused():
     assert any("line 5: an import that is not at the top of the file" in line for line in findings(text))
 
 
-@pytest.mark.parametrize("name", BUILTINS)
+@pytest.mark.parametrize("name", ["open", "exec", "eval", "compile", "input"])
 def test_forbidden_built_ins_are_found_even_where_they_are_not_called(name):
     text = GOOD.replace("return", f"f = {name}\n    return f and")
     assert f"line 6: use of {name}, which is forbidden" in findings(text)
@@ -48,7 +48,13 @@ def test_a_method_of_a_forbidden_name_is_no_built_in():
     assert findings(GOOD.replace("params['speed']", "params['speed'].real.compile")) == []
 
 
-@pytest.mark.parametrize("word", WORDS)
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("__import__", "load", "loadtxt", "fromfile", "genfromtxt", "tofile", "save", "savetxt", "savez"),
+        "memmap",
+    ],
+)
 def test_forbidden_words_are_found_in_comments_too(word):
     assert findings(f"{GOOD}# my {word} of it\n") == [
         f"line 7: the word {word}, forbidden anywhere in the text"
