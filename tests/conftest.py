@@ -84,13 +84,17 @@ class Ended:
         (line,) = [line for line in self.stderr.splitlines() if line.startswith("deepracer-exp: ")]
         return line
 
-    def assert_bad_input(self, *words: str) -> None:
-        """Refused before anything began."""
+    def assert_refused(self, *words: str) -> None:
+        """Refused with one line that has these words."""
         assert self.code == 2, self.stderr
-        assert not list(self.cwd.glob("runs/*/*")), "a run folder was made"
         for word in words:
             assert word in self.complaint
         assert self.stdout == ""
+
+    def assert_bad_input(self, *words: str) -> None:
+        """Refused before anything began."""
+        self.assert_refused(*words)
+        assert not list(self.cwd.glob("runs/*/*")), "a run folder was made"
 
     def assert_run_failed(self, *words: str) -> None:
         """Failed with one line, and says so in its folder."""

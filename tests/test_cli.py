@@ -81,9 +81,7 @@ def test_options_may_stand_between_overrides(call):
 
 @pytest.mark.parametrize("arguments", [["train", "seed=1", "--fast"], ["tracks", "a", "b"]])
 def test_an_unknown_argument_is_refused(call, arguments):
-    ended = call(*arguments)
-    assert ended.code == 2
-    assert f"unrecognized arguments: {arguments[-1]}" in ended.stderr
+    call(*arguments).assert_bad_input(f"unrecognized arguments: {arguments[-1]}")
 
 
 def test_a_grid_without_m_is_refused(call):

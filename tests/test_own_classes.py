@@ -101,9 +101,7 @@ def test_a_run_stores_names_of_classes_and_no_code(run):
 def test_a_stored_run_imports_no_code_by_itself(run, command):
     extra = {"resume": ["budget.env_steps=8192"], "export": ["format=onnx"]}.get(command, [])
     ended = call_in(at_home(run), command, run.name, *extra)
-    assert ended.code == 2
-    assert "named by a stored run, which imports no code by itself" in ended.complaint
-    assert ".target=my_" in ended.complaint
+    ended.assert_refused("named by a stored run, which imports no code by itself", ".target=my_")
     assert not [name for name in sys.modules if name.startswith("my_")]
 
 
@@ -147,8 +145,7 @@ def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path)
 
 def test_a_resumed_run_needs_the_same_class_importable(run, tmp_path):
     ended = call_in(tmp_path, "evaluate", str(run), *NAMED)
-    assert ended.code == 2
-    assert "network.target=my_network:ResidualNet: ModuleNotFoundError" in ended.complaint
+    ended.assert_refused("network.target=my_network:ResidualNet: ModuleNotFoundError")
 
 
 @pytest.mark.parametrize(

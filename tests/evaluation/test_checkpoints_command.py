@@ -66,10 +66,7 @@ def test_a_corrupt_checkpoint_is_shown_and_left_out(run_dir, call):
 def test_a_run_with_only_corrupt_checkpoints_is_refused(run_dir, call):
     for name in ("000007", "000008", "000009"):
         corrupt(run_dir, name)
-    ended = call("checkpoints", run_dir.name, *QUICK)
-    assert ended.code == 2
-    assert "state.tdz" in ended.complaint
-    assert ended.stdout == ""
+    call("checkpoints", run_dir.name, *QUICK).assert_refused("state.tdz")
 
 
 def test_by_default_the_trials_of_the_training_are_driven(run_dir, call):
@@ -95,4 +92,4 @@ def test_evaluate_warns_when_it_uses_another_checkpoint(run_dir, call):
 
 def test_a_run_without_checkpoints_is_refused(run_dir, call):
     shutil.rmtree(run_dir / "checkpoints")
-    assert "checkpoints: none" in call("checkpoints", run_dir.name).complaint
+    call("checkpoints", run_dir.name).assert_refused("checkpoints: none")

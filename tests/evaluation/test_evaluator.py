@@ -93,7 +93,7 @@ def test_summit_puts_the_car_back_at_its_last_progress_standing(experiment, prot
         assert abs(speed[at + 1]) < 1e-6
 
 
-def test_no_car_is_put_back_behind_the_start(experiment, protocol, driver):
+def test_no_car_is_put_back_behind_the_start(experiment, protocol):
     race = Evaluator(experiment, protocol("three_trials", trials=1), threads=1).race
     race.reset()
     race.put_back(np.array([0]), np.array([0.0]))

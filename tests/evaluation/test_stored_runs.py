@@ -134,19 +134,14 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
     ],
 )
 def test_bad_input_is_one_line(call, arguments, words):
-    ended = call(*arguments)
-    assert ended.code == 2
-    assert all(word in ended.complaint for word in words)
-    assert ended.stdout == ""
+    call(*arguments).assert_refused(*words)
 
 
 def test_a_video_needs_a_library_to_draw_with(call, monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     monkeypatch.setattr("sys.platform", "linux")
-    ended = call("evaluate", "x", "--video", "lap.mp4")
-    assert ended.code == 2
-    assert "EGL nor OSMesa" in ended.complaint
+    call("evaluate", "x", "--video", "lap.mp4").assert_refused("EGL nor OSMesa")
 
 
 @pytest.mark.parametrize(

@@ -44,10 +44,8 @@ def test_cars_that_do_not_fit_into_memory_are_refused_in_one_line(train_here):
         refused = train_here("collector.cars=100", "algorithm.frames_per_iteration=10000000")
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-    assert refused.code == 2, refused.stderr
     words = "collector.cars=100, algorithm.frames_per_iteration=10000000: needs more memory than there is"
-    assert words in refused.complaint
-    assert "Traceback" not in refused.stderr
+    refused.assert_refused(words)
     assert refused.summary["status"] == "failed"
 
 
@@ -182,14 +180,8 @@ def test_bad_input_shows_its_traceback_with_debug(train_here):
     assert ended.stderr.splitlines()[-1].startswith("deepracer-exp: ")
 
 
-def test_an_unknown_option_is_refused_by_the_command_itself(start, tmp_path):
+def test_an_unknown_option_is_refused_by_the_command_itself(start):
     """The same in a process of its own: nothing else may write to stderr there."""
     ended = start("train", "track=reinvent_bse").end()
     ended.assert_bad_input("did you mean reinvent_base?")
     assert ended.stderr.count("\n") == 1
-
-
-def test_an_unknown_argument_is_refused(call):
-    ended = call("train", "--fast")
-    assert ended.code == 2
-    assert "--fast" in ended.stderr

@@ -54,8 +54,7 @@ def test_a_hostile_reward_fails_a_training_and_a_validation_in_one_line(call, tm
 def test_a_hostile_reward_fails_a_replay_in_one_line(call, trained, tmp_path, kind):
     run = str(trained().folder)
     ended = call("analyze", run, "--output", "page.html", "--reward", write_hostile(tmp_path, kind, "call"))
-    assert ended.code == 2, ended.stderr
-    assert ZOO[kind][1] in ended.complaint
+    ended.assert_refused(ZOO[kind][1])
 
 
 @pytest.mark.slow

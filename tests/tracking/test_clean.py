@@ -164,8 +164,6 @@ def test_apply_removes_what_was_listed_and_nothing_else(season, call):
         path for path in before if not any(f"{path}/".startswith(f"{part}/") for part in gone)
     }
     assert "nothing to remove" in call("runs", "clean").stdout
-    missing = call("runs", "clean", "runs_dir=nowhere")
-    assert (missing.code, "is not a folder" in missing.complaint) == (2, True)
 
 
 def test_what_a_link_inside_leads_to_outlives_it(season, client, call, tmp_path):
@@ -211,7 +209,5 @@ def test_where_a_file_cannot_be_read_nothing_is_removed(season, call, name):
     season.run("1")
     (season.run("2") / name).write_text("{")
     before = tree(season.runs_dir)
-    ended = call("runs", "clean", "--apply")
-    assert ended.code == 2
-    assert name in ended.complaint
+    call("runs", "clean", "--apply").assert_refused(name)
     assert tree(season.runs_dir) == before

@@ -70,10 +70,7 @@ def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
     second = read_record(train_here(*shared).folders[1]).summary
     assert (second["reason"], second["env_steps"]) == ("budget reached: experiment_env_steps", 1024)
     third = train_here(*shared)
-    assert third.code == 2
-    assert (
-        "budget.experiment_env_steps=3072: the runs in runs/tiny have used 3,072 already" in third.complaint
-    )
+    third.assert_refused("budget.experiment_env_steps=3072: the runs in runs/tiny have used 3,072 already")
     assert len(third.folders) == 2
 
 

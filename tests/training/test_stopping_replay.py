@@ -132,10 +132,7 @@ def test_the_command_prints_a_line_a_run_and_rule_and_their_means(make_run, call
 )
 def test_what_cannot_be_replayed_is_refused_in_one_line(make_run, call, arguments, words):
     make_run()
-    ended = call("stopping", "replay", *arguments)
-    assert ended.code == 2
-    for word in words:
-        assert word in ended.complaint
+    call("stopping", "replay", *arguments).assert_refused(*words)
 
 
 @pytest.mark.parametrize(
