@@ -22,6 +22,7 @@ import pytest
 from hypothesis import settings
 
 from deepracer_exp.cli import main
+from deepracer_exp.errors import BadInput
 
 from .browser import chromium, tab
 from .postgres import postgres, postgres_server
@@ -238,6 +239,15 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Started]]:
     yield go
     for one in started:
         one.destroy()
+
+
+def refused(call: Callable[..., object], *arguments: object, **options: object) -> str:
+    """Return the one line with which a call refuses its arguments."""
+    with pytest.raises(BadInput) as caught:
+        call(*arguments, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
 
 
 IN_PROCESS = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")

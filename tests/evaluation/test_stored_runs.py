@@ -11,11 +11,11 @@ import torch
 import yaml
 from rich.console import Console
 
-from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluate import results_table
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.resolve import resolve
+from tests.conftest import refused
 
 from .test_result import attempt, group
 
@@ -31,13 +31,6 @@ def read(tmp_path):
 
 def weights(stored) -> torch.Tensor:
     return torch.cat([value.flatten() for value in stored.networks.state_dict().values()])
-
-
-def refusal(read, *arguments) -> str:
-    with pytest.raises(BadInput) as refused:
-        read(*arguments)
-    assert "\n" not in str(refused.value)
-    return str(refused.value)
 
 
 def test_a_run_is_found_by_folder_name_beginning_and_path_under_runs_dir(run_dir, read):
@@ -57,17 +50,17 @@ def test_best_last_and_the_number_lead_to_checkpoints(run_dir, read):
 
 def test_a_beginning_that_several_runs_have_is_refused(run_dir, read):
     shutil.copytree(run_dir, run_dir.with_name(f"{run_dir.name}-2"), symlinks=True)
-    assert "ambiguous: 2 runs match" in refusal(read, run_dir.name[:8])
+    assert "ambiguous: 2 runs match" in refused(read, run_dir.name[:8])
     assert read(run_dir.name).path.parents[1] == run_dir
 
 
 def test_a_missing_run_is_answered_with_the_nearest(run_dir, read):
-    assert run_dir.name in refusal(read, run_dir.name.replace("seed0", "seed1"))
-    assert "mlflow.db" in refusal(read, "0" * 32)
+    assert run_dir.name in refused(read, run_dir.name.replace("seed0", "seed1"))
+    assert "mlflow.db" in refused(read, "0" * 32)
 
 
 def test_a_missing_checkpoint_is_answered_with_those_that_are_there(run_dir, read):
-    assert "best, last" in refusal(read, run_dir, "77")
+    assert "best, last" in refused(read, run_dir, "77")
 
 
 def change_config(run_dir: Path, group: str, **values: object) -> None:
@@ -79,19 +72,18 @@ def change_config(run_dir: Path, group: str, **values: object) -> None:
 
 def test_a_checkpoint_of_another_network_is_refused(run_dir, read):
     change_config(run_dir, "network", hidden=[32])
-    assert "does not fit" in refusal(read, run_dir)
+    assert "does not fit" in refused(read, run_dir)
 
 
 def test_an_unknown_key_in_a_run_s_configuration_is_refused(run_dir, read):
     change_config(run_dir, "network", wings=2)
-    text = refusal(read, run_dir)
-    assert "config.yaml: network.wings: no such key" in text
+    assert "config.yaml: network.wings: no such key" in refused(read, run_dir)
 
 
 @pytest.mark.parametrize("text", ["", "- a", "a: [", "\x00"])
 def test_a_configuration_that_is_none_is_refused(run_dir, read, text):
     (run_dir / "config.yaml").write_text(text)
-    assert "config.yaml" in refusal(read, run_dir)
+    assert "config.yaml" in refused(read, run_dir)
 
 
 def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):

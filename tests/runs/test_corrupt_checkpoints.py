@@ -1,5 +1,6 @@
 """What is read if a checkpoint is not as it was written."""
 
+import functools
 import json
 import os
 import pickle
@@ -11,9 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import pin, write_hashes
 from deepracer_exp.runs.checkpoints import CheckpointStore, intact_checkpoint, read_checkpoint
+from tests.conftest import refused
 
 from .agents import TINY, make_agent
 
@@ -104,11 +105,7 @@ def _nothing_is_unpickled(tmp_path, monkeypatch):
     assert not Path("unpickled").exists()
 
 
-def refusal(folder: Path, name: str, **how: bool) -> str:
-    with pytest.raises(BadInput) as refused:
-        intact_checkpoint(folder, name, **how)
-    assert "\n" not in str(refused.value)
-    return str(refused.value)
+refusal = functools.partial(refused, intact_checkpoint)
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

@@ -12,6 +12,7 @@ from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput
 from sweeps.space import SearchSpace
+from tests.conftest import refused
 
 GRIDS = ("action_space=discrete,grid", "action_space.speed_levels=2,3", "algorithm.lr=interval(0.001,0.01)")
 
@@ -21,12 +22,7 @@ def space(*overrides: str) -> SearchSpace:
     return SearchSpace.from_request(compose_sweep(overrides))
 
 
-def refusal(*overrides: str) -> str:
-    with pytest.raises(BadInput) as caught:
-        space(*overrides)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
+refusal = functools.partial(refused, space)
 
 
 def drawn(searched: SearchSpace) -> list[str]:

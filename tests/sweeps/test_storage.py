@@ -16,17 +16,11 @@ from deepracer_exp.errors import BadInput, RunFailed
 from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage, patiently, resolve_database
 from sweeps.study import load_study
+from tests.conftest import refused
 
 from .racer import make_trials
 
 HOUR_S = 3600.0
-
-
-def _refused(url: str | None, runs_dir: Path) -> str:
-    with pytest.raises(BadInput) as refused:
-        open_storage(url, runs_dir)
-    assert "\n" not in str(refused.value)
-    return str(refused.value)
 
 
 @pytest.mark.parametrize("name", ["runs", "two words {0} 50%41 who?x=1 #1 läufe [a]*"])
@@ -104,7 +98,7 @@ def test_a_file_that_a_killed_process_left_incomplete_is_completed(tmp_path, mis
     ],
 )
 def test_an_impossible_address_is_refused_in_one_line_without_the_password(url, words, tmp_path):
-    message = _refused(url, tmp_path)
+    message = refused(open_storage, url, tmp_path)
     for word in words:
         assert word in message
     assert "s3cret" not in message
@@ -113,7 +107,7 @@ def test_an_impossible_address_is_refused_in_one_line_without_the_password(url, 
 
 def test_a_file_that_is_no_database_is_refused(tmp_path):
     (tmp_path / "sweeps.db").write_text("my notes, long enough to be looked at " * 100)
-    assert "not a database" in _refused(None, tmp_path)
+    assert "not a database" in refused(open_storage, None, tmp_path)
     assert (tmp_path / "sweeps.db").read_text().startswith("my notes")
 
 
@@ -122,21 +116,22 @@ def test_a_database_of_another_program_is_refused_and_left_as_it_is(url):
     with engine.begin() as connection:
         connection.execute(sa.text("CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL)"))
         connection.execute(sa.text("INSERT INTO alembic_version VALUES ('1b5f0d9ad7c1')"))
-    assert "a database of their own" in _refused(url, Path())
+    assert "a database of their own" in refused(open_storage, url, Path())
     assert sa.inspect(engine).get_table_names() == ["alembic_version"]
     engine.dispose()
 
 
 def test_no_password_is_shown_by_a_storage_nor_by_a_server_that_refuses(postgres_server):
     storage = open_storage(postgres_server.new_database(), Path())
-    with pytest.raises(BadInput, match=r"study none: not found in .*127\.0\.0\.1") as unknown:
-        load_study("none", storage)
-    wrong = _refused(postgres_server.url(password="wr0ng/{p}@ss%"), Path())
-    missing = _refused(postgres_server.url("nowhere"), Path())
+    unknown = refused(load_study, "none", storage)
+    assert "study none: not found in " in unknown
+    assert "127.0.0.1" in unknown
+    wrong = refused(open_storage, postgres_server.url(password="wr0ng/{p}@ss%"), Path())
+    missing = refused(open_storage, postgres_server.url("nowhere"), Path())
     assert "password authentication failed" in wrong
     assert '"nowhere" does not exist' in missing
     database = resolve_database(postgres_server.url(), Path())
-    for text in (repr(storage), str(storage), str(unknown.value), repr(database), wrong, missing):
+    for text in (repr(storage), str(storage), unknown, repr(database), wrong, missing):
         assert "s3cr" not in text
         assert "wr0ng" not in text
 

@@ -1,7 +1,7 @@
 import pytest
 
-from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
+from tests.conftest import refused
 
 # world: published length in metres, median width in metres, order of the points
 PUBLISHED = {
@@ -58,7 +58,7 @@ def test_a_file_of_knots_names_its_course(track_config, tmp_path):
         ("tight.yaml", "width_m: 4\nknots: [[0, 0], [9, 0], [9, 1], [0, 1]]", "border"),
         ("few.yaml", "width_m: 1\nknots: [[0, 0], [9, 0], [9, 1]]", "3 knots; accepted are at least 4"),
         ("widths.yaml", "width_m: [1, 2]\nknots: [[0, 0], [9, 0], [9, 9], [0, 9]]", "2 values for 4 knots"),
-        ("again.yaml", "width_m: 1\nknots: [[0, 0], [9, 0], [9, 0], [0, 9]]", r"knots\[2\] repeats"),
+        ("again.yaml", "width_m: 1\nknots: [[0, 0], [9, 0], [9, 0], [0, 9]]", "knots[2] repeats"),
         ("shut.yaml", "width_m: 1\nknots: [[0, 0], [9, 0], [9, 9], [0, 0]]", "last knot repeats the first"),
         ("road.txt", "", "accepted: .npy"),
         ("missing.npy", None, "No such file"),
@@ -71,8 +71,7 @@ def test_a_file_that_makes_no_course_gives_one_line_that_names_it(
     if content is not None:
         path.write_text(content)
     config = track_config("Monaco", f"track.file='{path}'")
-    with pytest.raises(BadInput, match=complaint) as caught:
-        Track.from_config(config)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert "accepted" in str(caught.value)
+    said = refused(Track.from_config, config)
+    assert complaint in said
+    assert str(path) in said
+    assert "accepted" in said
