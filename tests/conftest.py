@@ -310,6 +310,18 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Ended]:
 
 
 @pytest.fixture
+def copied(trained: Callable[..., Ended], tmp_path: Path) -> Callable[..., Path]:
+    """Train with these overrides, once for all tests, and return a copy of the run, which may be changed."""
+
+    def copy(*overrides: str) -> Path:
+        ended = trained(*overrides)
+        assert ended.code == 0, ended.stderr
+        return shutil.copytree(ended.folder, tmp_path / "runs" / "tiny" / ended.folder.name, symlinks=True)
+
+    return copy
+
+
+@pytest.fixture
 def start_training(start: Callable[..., Started]) -> Callable[..., Started]:
     """Start a training of two workers that would take an hour."""
     return lambda *overrides: start(

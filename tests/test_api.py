@@ -20,8 +20,7 @@ from deepracer_exp import (
     resume,
     train,
 )
-
-TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
+from tests.conftest import IN_PROCESS
 
 
 class StopsAfterTwo(Callback):
@@ -34,7 +33,7 @@ class StopsAfterTwo(Callback):
 
 
 def test_an_experiment_is_trained_with_an_own_callback_raced_and_read(tmp_path):
-    experiment = compose(*TINY, f"runs_dir={tmp_path}", "algorithm.lr=1e-3")
+    experiment = compose(*IN_PROCESS, f"runs_dir={tmp_path}", "algorithm.lr=1e-3")
     assert experiment.config.algorithm.lr == 1e-3
     result = train(experiment, callbacks=[StopsAfterTwo()])
     assert (result.status, result.reason, result.exit_code) == ("finished", "two are enough", 0)
@@ -51,7 +50,9 @@ def test_an_experiment_is_trained_with_an_own_callback_raced_and_read(tmp_path):
 
 
 def test_a_run_is_resumed_with_the_callbacks_it_was_trained_with(tmp_path):
-    run = train(compose(*TINY, f"runs_dir={tmp_path}", "budget.env_steps=1024"), callbacks=[StopsAfterTwo()])
+    run = train(
+        compose(*IN_PROCESS, f"runs_dir={tmp_path}", "budget.env_steps=1024"), callbacks=[StopsAfterTwo()]
+    )
     assert read_run(run.folder).metrics["twice"].tolist() == [2]
     with pytest.raises(BadInput, match="has ended"):
         resume(run.folder.name, runs_dir=tmp_path)
@@ -62,7 +63,7 @@ def test_a_run_is_resumed_with_the_callbacks_it_was_trained_with(tmp_path):
 
 def test_a_stored_policy_drives_the_environment(trained):
     run = trained()
-    env = make_env(compose(*TINY), n_cars=3)
+    env = make_env(compose(*IN_PROCESS), n_cars=3)
     check_env_specs(env)
     policy = load_policy(run.folder, "last")
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

@@ -16,10 +16,9 @@ LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain"
 
 
 @pytest.fixture
-def run_dir(trained, tmp_path) -> Path:
+def run_dir(copied) -> Path:
     """A copy of a trained run of one's own, under `runs/tiny/`."""
-    original = trained(*LAPS).folder
-    return Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
+    return copied(*LAPS)
 
 
 def findings_told(page: Path) -> str:

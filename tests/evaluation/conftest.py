@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -63,10 +62,9 @@ def protocol() -> Callable[..., EvaluationConfig]:
 
 
 @pytest.fixture
-def run_dir(trained, tmp_path: Path) -> Path:
+def run_dir(copied: Callable[..., Path]) -> Path:
     """A copy of a trained run of one's own, under `runs/tiny/`."""
-    original = trained().folder
-    return Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
+    return copied()
 
 
 @pytest.fixture

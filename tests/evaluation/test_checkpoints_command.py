@@ -14,13 +14,12 @@ QUICK = ("evaluation.trials=2", "evaluation.held_out=aws", "evaluation.time_s=20
 
 
 @pytest.fixture
-def run_dir(trained, tmp_path) -> Path:
+def run_dir(copied) -> Path:
     """A run with three checkpoints of one's own: 7, its best, 8 and 9, its last; 7 and 9 have the same weights."""
-    original = trained("checkpoints.every=1", "checkpoints.keep=9").folder
-    copy = Path(shutil.copytree(original, tmp_path / "runs" / "tiny" / original.name, symlinks=True))
-    checkpoints = copy / "checkpoints"
-    own = sorted(path for path in (original / "checkpoints").iterdir() if path.name.isdigit())
-    shutil.rmtree(checkpoints)
+    run = copied("checkpoints.every=1", "checkpoints.keep=9")
+    checkpoints = run / "checkpoints"
+    original = checkpoints.rename(run / "original")
+    own = sorted(path for path in original.iterdir() if path.name.isdigit())
     for name, source in (("000007", own[-1]), ("000008", own[0]), ("000009", own[-1])):
         shutil.copytree(source, checkpoints / name)
         (checkpoints / name / HASHES).unlink(missing_ok=True)
@@ -30,7 +29,8 @@ def run_dir(trained, tmp_path) -> Path:
         write_hashes(checkpoints / name)
     (checkpoints / "best").symlink_to("000007")
     (checkpoints / "last").symlink_to("000009")
-    return copy
+    shutil.rmtree(original)
+    return run
 
 
 def corrupt(run_dir: Path, name: str) -> None:

@@ -1,6 +1,5 @@
 import ctypes.util
 import os
-import shutil
 
 import numpy as np
 import pytest
@@ -21,9 +20,9 @@ drawable = os.environ.get("MUJOCO_GL") or any(map(ctypes.util.find_library, ("EG
         ("chase", ("observation=camera", "budget.env_steps=256"), ("evaluation=real_car",), 30),
     ],
 )
-def test_a_film_shows_the_car_on_its_way(trained, start, tmp_path, view, sees, given, rate):
+def test_a_film_shows_the_car_on_its_way(copied, start, tmp_path, view, sees, given, rate):
     """As fast as it drove, also where it acts more often than in the simulator."""
-    folder = shutil.copytree(trained(*sees).folder, tmp_path / "run", symlinks=True)
+    folder = copied(*sees)
     ended = start(
         *("evaluate", str(folder), *given, "evaluation.trials=1", "evaluation.time_s=2"),
         *("evaluation.held_out=null", "--video", "lap.mp4", "--view", view),

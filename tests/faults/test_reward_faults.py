@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from tests.conftest import IN_PROCESS
+
 SWALLOWS_EVERYTHING = """
 def reward_function(params):
     while params["steps"] > 3:
@@ -41,8 +43,7 @@ def write_hostile(folder, kind, when):
 @pytest.mark.parametrize("kind", list(ZOO)[:-2])
 def test_a_hostile_reward_fails_a_training_and_a_validation_in_one_line(call, tmp_path, kind, when):
     override = f"reward.file={write_hostile(tmp_path, kind, when)}"
-    tiny = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
-    for command in (("validate",), ("train", *tiny)):
+    for command in (("validate",), ("train", *IN_PROCESS)):
         ended = call(*command, override)
         assert ended.code == (3 if command[0] == "train" and when == "call" else 2), ended.stderr
         assert ZOO[kind][1] in ended.stdout + ended.stderr

@@ -27,9 +27,9 @@ def kinds(table) -> dict[str, str]:
 
 
 @pytest.fixture
-def folder(trained, tmp_path):
+def folder(copied):
     """Return a copy of a run's folder that may be spoilt."""
-    return shutil.copytree(trained().folder, tmp_path / "run", symlinks=True)
+    return copied()
 
 
 def test_the_steps_are_the_rows_of_the_trace(trained):

@@ -1,7 +1,5 @@
 import multiprocessing
-import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -19,15 +17,3 @@ def workers_start_early() -> Iterator[None]:
     start_workers_early(True)
     yield
     multiprocessing.set_start_method(before, force=True)
-
-
-@pytest.fixture
-def copied(trained, tmp_path: Path) -> Callable[..., Path]:
-    """Train with these overrides, once for all tests, and return a copy of the run, which may be changed."""
-
-    def copy(*overrides: str) -> Path:
-        ended = trained(*overrides)
-        assert ended.code == 0, ended.stderr
-        return shutil.copytree(ended.folder, tmp_path / "runs" / "tiny" / ended.folder.name, symlinks=True)
-
-    return copy
