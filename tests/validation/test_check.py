@@ -3,9 +3,9 @@ import re
 import pytest
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.validation import validate as checking
 from deepracer_exp.validation.probe import NOT_CALLED, Probe
 from deepracer_exp.validation.reward_map import state_of
-from deepracer_exp.validation.validate import read
 
 
 def function(body: str, before: str = "") -> str:
@@ -176,19 +176,10 @@ def test_stateful_and_random_rewards_are_distinguished(race_with, text, memory):
     assert state_of(race, Probe(race)) == memory
 
 
-def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with, monkeypatch):
-    from deepracer_exp.validation import validate as checking
-
+def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with):
     first = "done = []\n" + function(
         "if not done:\n    done.append(sum(i % 3 for i in range(2000000)))\nreturn params['speed']"
     )
     race = race_with(first)
     cost_s = checking._cpu_s_per_call(Probe(race), race)
     assert cost_s < checking._SAMPLES[0][0]
-
-
-def test_several_tracks_are_refused_in_one_line():
-    from deepracer_exp.config.compose import compose_experiment
-
-    with pytest.raises(BadInput, match="on one track; accepted"):
-        read(compose_experiment(["track=[reinvent_base,Oval_track]"])[0])

@@ -71,7 +71,7 @@ TIMES = ("", "0s", "-5s", "20000steps", "inf", "1h")
         (("reward.file=two_arguments.py",), ("must take one argument",)),
         (("reward.file=syntax.py",), ("line 2", "not valid Python")),
         (("trial=soon",), ("trial=soon", "trial=60s")),
-        (("track=[reinvent_base,Oval_track]",), ("one track",)),
+        (("track=[reinvent_base,Oval_track]",), ("on one track; accepted",)),
         (("track=nowhere",), ("no such track",)),
         *(((f"trial={text}",), ("accepted: seconds or minutes above 0",)) for text in TIMES),
     ],
