@@ -141,36 +141,22 @@ def test_a_folder_in_the_place_of_a_file_is_refused(train_here, tmp_path):
         train_here(f"{key}={tmp_path}").assert_bad_input(str(tmp_path))
 
 
-def test_runs_dir_that_is_a_file_is_refused(train_here, tmp_path):
+@pytest.mark.parametrize("runs_dir", ["taken", "taken/deeper"])
+@pytest.mark.parametrize("tracking", ["off", "mlflow"])
+def test_runs_dir_that_is_a_file_is_refused(train_here, tmp_path, runs_dir, tracking):
     (tmp_path / "taken").write_text("")
-    ended = train_here("runs_dir=taken")
-    ended.assert_bad_input("runs_dir=taken")
-    train_here("runs_dir=taken/deeper").assert_bad_input("runs_dir=taken/deeper")
+    train_here(f"runs_dir={runs_dir}", f"tracking={tracking}").assert_bad_input(f"runs_dir={runs_dir}")
     assert (tmp_path / "taken").read_text() == ""
 
 
-def test_runs_dir_that_is_a_file_is_refused_with_tracking_too(call, tmp_path):
-    (tmp_path / "taken").write_text("")
-    call("train", "experiment=tiny", "collector=in_process", "runs_dir=taken").assert_bad_input("taken")
-
-
-def test_a_grid_with_one_bad_file_runs_nothing(call, tmp_path):
-    good = tmp_path / "good.py"
-    good.write_text("def reward_function(params):\n    return 1.0\n")
-    ended = call(
-        "train",
-        "-m",
-        "experiment=tiny",
-        "tracking=off",
-        "collector=in_process",
-        f"reward.file={good},missing.py",
-    )
-    ended.assert_bad_input("missing.py")
-
-
-def test_a_grid_with_one_bad_value_runs_nothing(call):
-    ended = call("train", "-m", "experiment=tiny", "tracking=off", "collector=in_process", "seed=1,two")
-    ended.assert_bad_input('seed="two"')
+@pytest.mark.parametrize(
+    ("grid", "word"),
+    [("reward.file=good.py,missing.py", "missing.py"), ("seed=1,two", 'seed="two"')],
+    ids=["file", "value"],
+)
+def test_a_grid_with_one_that_cannot_be_used_runs_nothing(train_here, tmp_path, grid, word):
+    (tmp_path / "good.py").write_text("def reward_function(params):\n    return 1.0\n")
+    train_here("-m", grid).assert_bad_input(word)
 
 
 def test_bad_input_shows_its_traceback_with_debug(train_here):
