@@ -14,8 +14,7 @@ from deepracer_exp.training.metrics import Finished, Ranking, RunMetrics
 class Driven:
     """Rows of cars that drive episodes of given lengths, one after the other."""
 
-    def __init__(self, lengths: list[list[int]], tracks: list[int] | None = None):
-        self.tracks = tracks or [0] * len(lengths)
+    def __init__(self, lengths: list[list[int]]):
         self.cars = [[(step, step == n) for n in car for step in range(1, n + 1)] for car in lengths]
         self.at = [0] * len(lengths)
 
@@ -25,7 +24,6 @@ class Driven:
             step, done = self.cars[car][self.at[car]]
             self.at[car] += 1
             row[[PACKED["car"], PACKED["steps"], PACKED["done"]]] = car, step, done
-            row[PACKED["track"]] = self.tracks[car]
             row[PACKED["episode_return"]] = 10 * car + step
             row[PACKED["episode_status"]] = STATUS_CODE["lap_complete" if done else "in_progress"]
         return trace

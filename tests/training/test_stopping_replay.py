@@ -125,7 +125,6 @@ def test_the_command_prints_a_line_a_run_and_rule_and_their_means(make_run, call
     ("arguments", "words"),
     [
         (["stopping=entropy"], ["RUN: missing"]),
-        (["nowhere"], ["nowhere: no such run"]),
         ([NAME, "stopping=entropie"], ["no such stopping", "did you mean entropy?"]),
         ([NAME, "stopping.converged.window=4"], ["stopping.converged.window", "patience"]),
     ],
