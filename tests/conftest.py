@@ -150,16 +150,20 @@ class Started:
         """Wait until the first worker of the collector is being started and return it."""
         return self.wait_for(self.workers, "worker")[0]
 
-    def wait_for(self, condition: Callable[[], Any], what: str) -> Any:
+    def wait_for(self, condition: Callable[[], Any], what: str, within_s: float = PATIENCE_S) -> Any:
         """Wait until a condition holds and return it."""
-        give_up_at = time.monotonic() + PATIENCE_S
+        give_up_at = time.monotonic() + within_s
         while time.monotonic() < give_up_at:
             value = condition()
             if value:
                 return value
-            assert self.popen.poll() is None, f"ended before {what}: {self._err.read_text()}"
+            assert self.popen.poll() is None, f"ended before {what}: {self._said()}"
             time.sleep(0.02)
-        pytest.fail(f"no {what} within {PATIENCE_S} s: {self._err.read_text()}")
+        pytest.fail(f"no {what} within {within_s} s: {self._said()}")
+
+    def _said(self) -> str:
+        """Return what the command has written to stderr, and the workers of a sweep to their log."""
+        return "\n".join(file.read_text() for file in (self._err, *self.cwd.glob("runs/*/workers.log")))
 
     def wait_for_iterations(self, count: int = 1) -> None:
         """Wait until as many iterations are recorded."""
@@ -319,6 +323,34 @@ def copied(trained: Callable[..., Ended], tmp_path: Path) -> Callable[..., Path]
         return shutil.copytree(ended.folder, tmp_path / "runs" / "tiny" / ended.folder.name, symlinks=True)
 
     return copy
+
+
+@pytest.fixture
+def mounted(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Mount a file system of its own at `tmp_path/runs`, with the given options; it is taken away again."""
+    # Half of these can be mounted by root only; modes of files do not hold root back.
+    if sys.platform != "linux" or os.getuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("needs root to mount")
+    folder = tmp_path / "runs"
+    folder.mkdir()
+
+    def mount(options: str) -> Path:
+        done = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=False)
+        if done.returncode:
+            pytest.skip("mount is not allowed here")
+        return folder
+
+    yield mount
+    subprocess.run(["umount", "--lazy", str(folder)], check=False)
+
+
+@pytest.fixture(scope="session")
+def reference() -> Path:
+    """The folder of what the real service recorded."""
+    path = Path(__file__).parents[2] / "shared" / "reference"
+    if not path.is_dir():
+        pytest.skip("the recordings of the real service are not on this machine")
+    return path
 
 
 @pytest.fixture

@@ -10,12 +10,11 @@ import yaml
 
 from benchmarks import calibrate
 from benchmarks.recorded import BANDS, car_named, held_out, in_band, join, median_error, read_recorded, sample
-from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, cut_windows, errors, replay
+from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, cut_windows, errors, replay
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim.batch import CarBatch
 
 CAR = car_named("deepracer_v5")
-REFERENCE = Path(__file__).parents[3] / "shared/reference"
 
 
 def record(car: CarConfig, cars: int = 20, episodes: int = 4, rows: int = 35) -> pd.DataFrame:
@@ -60,8 +59,13 @@ def recorded() -> pd.DataFrame:
     return record(CAR)
 
 
-def test_windows_begin_where_the_car_begins_to_move_and_every_second_from_there(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+@pytest.fixture(scope="module")
+def windows(recorded: pd.DataFrame) -> Windows:
+    """Windows of a second."""
+    return cut_windows(recorded, CAR.front_point_m, 15)
+
+
+def test_windows_begin_where_the_car_begins_to_move_and_every_second_from_there(windows):
     assert len(windows) == 20 * 4 * 2
     assert windows.standing.tolist() == [True, False] * 80
     # The start of the second window is the end of the first.
@@ -69,8 +73,7 @@ def test_windows_begin_where_the_car_begins_to_move_and_every_second_from_there(
     np.testing.assert_array_equal(windows.action[0, WARM_UP_STEPS:], windows.action[1, :WARM_UP_STEPS])
 
 
-def test_what_comes_before_a_standing_start_is_the_same_cars_episode_before(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_what_comes_before_a_standing_start_is_the_same_cars_episode_before(recorded, windows):
     first, second = windows.choose(windows.standing & (windows.iteration < 2)).action[:2]
     last = recorded[(recorded["worker"] == 0) & (recorded["iteration"] == 0)].tail(WARM_UP_STEPS)
     np.testing.assert_array_equal(second[:WARM_UP_STEPS, 0], last["throttle"])
@@ -120,8 +123,7 @@ def test_windows_under_way_begin_as_often_as_asked_and_never_before_a_whole_warm
     assert len(np.unique(windows.episode)) == 20 * 4
 
 
-def test_the_replay_drives_exactly_as_the_cars_of_the_environment_do(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_the_replay_drives_exactly_as_the_cars_of_the_environment_do(recorded, windows):
     windows = windows.choose(windows.standing & (windows.iteration == 0))
     batch = CarBatch(CAR, len(windows), 1)
     batch.place(np.arange(len(windows)), *windows.start.T)
@@ -142,8 +144,7 @@ def test_a_fitted_value_that_no_car_has_is_named_with_the_bound_it_breaks():
     assert line.startswith("unphysical: tyre_friction 9.04 is above 2;")
 
 
-def test_a_car_predicts_its_own_recording_and_one_that_steers_later_does_not(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_a_car_predicts_its_own_recording_and_one_that_steers_later_does_not(windows):
     late = dataclasses.replace(CAR, steering_time_s=CAR.steering_time_s + 0.2)
     # Under way the motion has to be found from the poses.
     own, other = (np.median(errors(replay(car, windows), windows).distance_m[:, -1]) for car in (CAR, late))
@@ -151,14 +152,12 @@ def test_a_car_predicts_its_own_recording_and_one_that_steers_later_does_not(rec
     assert other > 0.04
 
 
-def test_predictions_do_not_depend_on_the_other_windows(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_predictions_do_not_depend_on_the_other_windows(windows):
     some = np.array([3, 8, 9, 40])
     np.testing.assert_array_equal(replay(CAR, windows)[some], replay(CAR, windows.choose(some)))
 
 
-def test_a_heading_is_wrong_by_half_a_turn_at_most(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_a_heading_is_wrong_by_half_a_turn_at_most(windows):
     turned = windows.truth + np.array([0.0, 0.0, 4 * np.pi + 0.1])
     np.testing.assert_allclose(errors(turned, windows).yaw_rad, 0.1)
 
@@ -167,8 +166,7 @@ def chosen(*keys: str) -> list[calibrate.Parameter]:
     return [p for p in calibrate.PARAMETERS if p.key in keys]
 
 
-def test_a_fit_finds_the_parameters_of_the_car_that_was_recorded_and_leaves_the_others(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_a_fit_finds_the_parameters_of_the_car_that_was_recorded_and_leaves_the_others(windows):
     wrong = dataclasses.replace(CAR, steering_trim_deg=3.0, tyre_friction=1.3 * CAR.tyre_friction)
     some = windows.choose(np.flatnonzero(~held_out(windows.iteration))[::2])
     found = calibrate.fit(wrong, some, chosen("steering_trim_deg", "tyre_friction"), 15)
@@ -180,7 +178,7 @@ def test_a_fit_finds_the_parameters_of_the_car_that_was_recorded_and_leaves_the_
     )
 
 
-def test_what_the_recordings_do_not_determine_is_named_and_kept_where_it_began(recorded):
+def test_what_the_recordings_do_not_determine_is_named_and_kept_where_it_began():
     # Driving straight ahead says nothing about the tyres' sideways grip.
     straight = record(CAR, cars=10, episodes=2)
     straight["steer"] = 0.0
@@ -208,8 +206,7 @@ def record_again(recorded: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts)
 
 
-def test_a_sample_takes_as_many_windows_of_each_band_as_there_are(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_a_sample_takes_as_many_windows_of_each_band_as_there_are(windows):
     there = [int(in_band(windows, band).sum()) for band in BANDS]
     some = sample(windows, 90, 0)
     taken = [int(in_band(some, band).sum()) for band in BANDS]
@@ -228,8 +225,7 @@ def test_an_interval_resamples_episodes_and_not_windows():
     assert few.interval_m[1] - few.interval_m[0] > 3 * (many.interval_m[1] - many.interval_m[0])
 
 
-def test_episodes_of_several_recordings_keep_apart(recorded):
-    windows = cut_windows(recorded, CAR.front_point_m, 15)
+def test_episodes_of_several_recordings_keep_apart(windows):
     assert len(np.unique(join([windows, windows]).episode)) == 2 * len(np.unique(windows.episode))
 
 
@@ -262,17 +258,8 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
     monkeypatch.setattr(calibrate, "PARAMETERS", chosen("steering_trim_deg", "steering_kick"))
     (tmp_path / "conf/car").mkdir(parents=True)
     output = tmp_path / "conf/car/mine.yaml"
-    arguments = [
-        "--traces",
-        str(traces),
-        "--car",
-        "deepracer_v4",
-        "--output",
-        str(output),
-        "--evaluations",
-        "4",
-    ]
-    assert calibrate.main(arguments) == 0
+    arguments = ["--traces", str(traces), "--car", "deepracer_v4", "--output", str(output)]
+    assert calibrate.main([*arguments, "--evaluations", "4"]) == 0
     printed = capsys.readouterr().out
     assert "held out, middle" in printed
     assert "0 left out" in printed
@@ -315,8 +302,7 @@ def test_bad_input_is_refused_in_one_line_before_the_fit(
     assert not Path("missing").exists()
 
 
-@pytest.mark.skipif(not REFERENCE.is_dir(), reason="the recordings of the service are not here")
-def test_a_version_is_found_where_it_is_stated_and_where_it_is_not():
+def test_a_version_is_found_where_it_is_stated_and_where_it_is_not(reference):
     names = ("console_v5_reinvent_base.log.gz", "droa_v6_training.tar.gz", "console_v5_one_bot_ppo.tar.gz")
-    found = read_recorded([REFERENCE / "race_pace" / name for name in names])
+    found = read_recorded([reference / "race_pace" / name for name in names])
     assert [(one.version, one.stated) for one in found] == [(5, True), (6, True), (5, False)]

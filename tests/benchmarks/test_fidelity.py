@@ -1,7 +1,6 @@
 """The measure of fidelity, on what a known car drove."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from benchmarks.recorded import BANDS, car_named
 from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, errors
 
 CAR = car_named("deepracer")
-RACE_PACE = Path(__file__).parents[3] / "shared/reference/race_pace"
 
 
 def windows(count: int, steps: int = 15) -> Windows:
@@ -62,11 +60,13 @@ def test_fitting_the_formula_finds_the_formula_that_drove():
     assert found.rate_lag_s == pytest.approx(0.3, rel=0.02)
 
 
-@pytest.mark.skipif(not RACE_PACE.is_dir(), reason="the recordings of the service are not here")
-def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_drawn(tmp_path, capsys):
+def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_drawn(
+    reference, tmp_path, capsys
+):
     file = tmp_path / "figures.json"
     names = ("console_v5_reinvent_base.log.gz", "drfc_v5_FS_June2020.log.gz", "droa_v6_training.tar.gz")
-    arguments = ["--traces", *(str(RACE_PACE / name) for name in names), "--held-out", "--json", str(file)]
+    traces = [str(reference / "race_pace" / name) for name in names]
+    arguments = ["--traces", *traces, "--held-out", "--json", str(file)]
     assert fidelity.main([*arguments, "--figures", str(tmp_path / "figures")]) == 0
     versions = json.loads(file.read_text())["versions"]
     assert {version: of["car"] for version, of in versions.items()} == {

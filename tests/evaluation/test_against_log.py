@@ -15,8 +15,6 @@ from deepracer_exp.export.aws_logs import TRACE_HEADER
 from deepracer_exp.tracks.track import Track
 from tests.analysis.made_up import Drive, made_up_recording
 
-CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
-
 
 def started(course: Track, races: list[tuple[float, int]]) -> pd.DataFrame:
     """Return a log of which only the starts are known: where each race starts, and its laps."""
@@ -89,9 +87,8 @@ def test_a_log_of_another_track_is_refused(experiment):
         course_driven(view, experiment, "Oval_track")
 
 
-@pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")
-def test_the_races_of_the_console_are_driven_as_often_and_from_the_same_starts(experiment, driver):
-    view = prepare_races(read_recording(CONSOLE / "logs" / "leaderboard"))
+def test_the_races_of_the_console_are_driven_as_often_and_from_the_same_starts(experiment, driver, reference):
+    view = prepare_races(read_recording(reference / "console_training" / "logs" / "leaderboard"))
     config, track = course_driven(view, experiment)
     assert (config.name, config.direction) == ("reinvent_base", "forward")
     logged = logged_laps(view, track)
@@ -108,9 +105,8 @@ def test_the_races_of_the_console_are_driven_as_often_and_from_the_same_starts(e
     assert np.abs(alike.table["difference"]).max() == 0.0
 
 
-@pytest.mark.skipif(not CONSOLE.is_dir(), reason="no recorded training of the console is there")
-def test_a_training_without_an_evaluation_stands_with_its_fastest_laps(experiment):
-    view = prepare_races(read_recording(CONSOLE / "sim-trace" / "training"))
+def test_a_training_without_an_evaluation_stands_with_its_fastest_laps(experiment, reference):
+    view = prepare_races(read_recording(reference / "console_training" / "sim-trace" / "training"))
     logged = logged_laps(view, course_driven(view, experiment)[1])
     assert "the fastest 10 of 47 complete laps of the training" in logged.words
     assert round(logged.episodes["lap_time_s"].min(), 2) == 14.13

@@ -1,39 +1,13 @@
 """Folders that take nothing, or no more; and folders with unusual names."""
 
 import json
-import os
-import shutil
-import subprocess
-import sys
 import threading
 import time
 
 import numpy as np
 import pytest
 
-# Half of these can be mounted by root only; modes of files do not hold root back.
-mounts = pytest.mark.skipif(
-    sys.platform != "linux" or os.getuid() != 0 or shutil.which("mount") is None, reason="needs root to mount"
-)
 
-
-@pytest.fixture
-def mounted(tmp_path):
-    """Mount a file system of its own at `tmp_path/runs`; it is taken away again."""
-    folder = tmp_path / "runs"
-    folder.mkdir()
-
-    def mount(options: str):
-        done = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=False)
-        if done.returncode:
-            pytest.skip("mount is not allowed here")
-        return folder
-
-    yield mount
-    subprocess.run(["umount", "--lazy", str(folder)], check=False)
-
-
-@mounts
 @pytest.mark.parametrize("size_kib", [150, 200, 300, 500])
 def test_a_disk_that_fills_up_ends_the_run_with_one_line(train_here, mounted, size_kib):
     """With these sizes: in the first, in later iterations, while pictures are drawn."""
@@ -50,14 +24,12 @@ def test_a_disk_that_fills_up_ends_the_run_with_one_line(train_here, mounted, si
             assert json.loads((link / "manifest.json").read_text())
 
 
-@mounts
 def test_a_disk_that_is_full_already_is_bad_input(train_here, mounted):
     mounted("size=4k")
     ended = train_here()
     ended.assert_bad_input("runs_dir=runs", "No space left on device")
 
 
-@mounts
 def test_a_folder_that_is_read_only_is_bad_input(train_here, mounted):
     mounted("ro")
     ended = train_here()
@@ -72,15 +44,8 @@ def test_paths_of_any_name_work(train_here, tmp_path):
     angle = np.linspace(0, 2 * np.pi, 100)
     ring = 3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     np.save(folder / f"{name}.npy", np.concatenate([ring, 0.9 * ring, 1.1 * ring], axis=1))
-    (folder / f"{name}.json").write_text(
-        json.dumps(
-            {
-                "action_space": [
-                    {"steering_angle": a, "speed": 1.0, "index": i} for i, a in enumerate((-20, 20))
-                ]
-            }
-        )
-    )
+    actions = [{"steering_angle": angle, "speed": 1.0} for angle in (-20, 20)]
+    (folder / f"{name}.json").write_text(json.dumps({"action_space": actions}))
 
     def quoted(path) -> str:
         escaped = str(path).replace("'", "\\'")

@@ -55,7 +55,7 @@ class Sweep:
         return sum(file.read_bytes().count(b"\n") for file in self.cwd.glob("runs/s/*/metrics.jsonl"))
 
     def wait_for(self, condition, what):
-        return wait_for(condition, what, self)
+        return self.command.wait_for(condition, what)
 
     def end(self):
         ended = self.command.end(PATIENCE_S)
@@ -65,15 +65,6 @@ class Sweep:
     def log(self):
         file = self.cwd / "runs" / "s" / "workers.log"
         return file.read_text() if file.exists() else ""
-
-
-def wait_for(condition, what, *sweeps):
-    until = time.monotonic() + PATIENCE_S
-    while not (value := condition()):
-        assert time.monotonic() < until, f"no {what}: {[one.log() for one in sweeps]}"
-        assert any(one.command.popen.poll() is None for one in sweeps), f"ended before {what}"
-        time.sleep(0.02)
-    return value
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import importlib.util
 import shutil
 import signal
 import tempfile
-import time
 from pathlib import Path
 
 import psutil
@@ -20,6 +19,8 @@ from sweeps.ray_launcher import refuse_files
 from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, claims  # noqa: TID252
 
 pytestmark = pytest.mark.timeout(600)
+PATIENCE_S = 280.0
+"""Longer than that of other tests: three processes import PyTorch one after the other."""
 _MEMORY = 80 * 2**20
 """Bytes of shared memory a node has for objects."""
 _TINY = ("train", "experiment=tiny", "tracking=off", "collector.processes=2", "report=false")
@@ -106,7 +107,7 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
         held = [claim for claim in claims(tmp_path) if claim.state == "claimed" and claim.progress]
         return next((claim for claim in held if int(claim.owner.split(":")[-2]) in pids), None)
 
-    lost = wait_for(running, held_by_the_second, "trial on the second node")
+    lost = running.wait_for(held_by_the_second, "trial on the second node", PATIENCE_S)
     two_nodes.kill_the_second()
     ended = running.end(240)
     assert ended.code == 0, ended.stderr
@@ -119,24 +120,15 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
 def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_resume(two_nodes, start, tmp_path):
     two_nodes.second()
     running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
-    wait_for(running, lambda: known(tmp_path) and any(claim.progress for claim in claims(tmp_path)), "trial")
+    running.wait_for(
+        lambda: known(tmp_path) and any(claim.progress for claim in claims(tmp_path)), "trial", PATIENCE_S
+    )
     running.popen.send_signal(signal.SIGINT)
     assert running.end(240).code == 130
     assert not two_nodes.actors()
     assert all(claim.expired or claim.result for claim in claims(tmp_path))
     assert start("sweep", "study=s", "sweep.workers=2").end(240).code == 0
     assert_every_trial_is_accounted_for_once(tmp_path)
-
-
-def wait_for(running, condition, what):
-    """Wait longer than other tests do: three processes import PyTorch one after the other."""
-    until = time.monotonic() + 280.0
-    while not (value := condition()):
-        said = (running.cwd / "stderr.txt").read_text()
-        assert time.monotonic() < until, f"no {what}: {said}"
-        assert running.popen.poll() is None, f"ended before {what}: {said}"
-        time.sleep(0.1)
-    return value
 
 
 def known(cwd):
@@ -175,7 +167,7 @@ def test_prints_and_errors_of_a_remote_reward_function_are_in_the_run_folder(two
 def test_a_killed_remote_collector_is_named(two_nodes, start, tmp_path):
     two_nodes.second()
     running = start(*_TINY, "collector=ray", "budget.env_steps=100000000")
-    wait_for(running, lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration")
+    running.wait_for(lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration", PATIENCE_S)
     next(
         one for one in psutil.process_iter(["cmdline"]) if "ray::Cars" in " ".join(one.info["cmdline"] or ())
     ).kill()

@@ -1,6 +1,5 @@
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,8 +7,6 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.tracks.track import Track
-
-ROOT = Path(__file__).parents[2]
 
 
 @cache
@@ -25,14 +22,6 @@ def track_config() -> Callable[..., TrackConfig]:
 @pytest.fixture(scope="session")
 def catalogue_track() -> Callable[..., Track]:
     return cache(lambda name, *overrides: Track.from_config(compose_track(name, *overrides)))
-
-
-@pytest.fixture(scope="session")
-def reference() -> Path:
-    path = ROOT / "../shared/reference"
-    if not path.is_dir():
-        pytest.skip("the recordings of the real service are not on this machine")
-    return path
 
 
 @pytest.fixture
