@@ -7,6 +7,9 @@ import pytest
 
 MODES = pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
 SOON_S = 30.0
+HANGS_SOON = ("collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
+LEARNS_LONG = ("algorithm.epochs=100", "algorithm.batch_size=32")
+"""Little driving and much learning, so that a signal interrupts the update or the sending of weights."""
 
 
 def _lost(training, *words):
@@ -32,7 +35,7 @@ def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
 @pytest.mark.slow
 @MODES
 def test_a_worker_that_stops_is_ended_and_named(start_training, mode):
-    training = start_training(f"collector={mode}", "collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
+    training = start_training(f"collector={mode}", *HANGS_SOON)
     training.wait_for_iterations(2)
     training.workers()[0].send_signal(signal.SIGSTOP)
     _lost(training, "collector worker 0", "took no ")
@@ -48,7 +51,7 @@ def test_a_worker_killed_while_it_starts_ends_the_run(start_training, mode):
 
 @pytest.mark.slow
 def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
-    training = start_training("collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
+    training = start_training(*HANGS_SOON)
     training.wait_for_worker().send_signal(signal.SIGSTOP)
     ended = training.end()
     ended.assert_run_failed("worker", "was ended")
@@ -56,25 +59,16 @@ def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
 
 
 @pytest.mark.slow
-def test_a_worker_killed_while_the_learner_learns_ends_the_run(start_training):
-    """Little driving and much learning, so that the kill interrupts the update or the sending of weights."""
-    training = start_training("algorithm.epochs=100", "algorithm.batch_size=32")
+@pytest.mark.parametrize(
+    ("signum", "options", "words"),
+    [(signal.SIGKILL, (), "died by signal SIGKILL"), (signal.SIGSTOP, HANGS_SOON, "took no ")],
+    ids=["killed", "stopped"],
+)
+def test_a_worker_lost_while_the_learner_learns_ends_the_run(start_training, signum, options, words):
+    training = start_training(*LEARNS_LONG, *options)
     training.wait_for_iterations(1)
-    training.workers()[0].send_signal(signal.SIGKILL)
-    _lost(training, "collector worker 0", "died by signal SIGKILL")
-
-
-@pytest.mark.slow
-def test_a_worker_stopped_while_the_learner_learns_ends_the_run(start_training):
-    training = start_training(
-        "algorithm.epochs=100",
-        "algorithm.batch_size=32",
-        "collector.hang_timeout_s=2",
-        "reward.time_limit_s=0.5",
-    )
-    training.wait_for_iterations(1)
-    training.workers()[0].send_signal(signal.SIGSTOP)
-    _lost(training, "collector worker 0", "took no ")
+    training.workers()[0].send_signal(signum)
+    _lost(training, "collector worker 0", words)
 
 
 @pytest.mark.slow
@@ -120,12 +114,7 @@ def test_a_fork_server_that_is_killed_ends_the_run(start_training):
 @pytest.mark.slow
 def test_a_run_stopped_as_a_whole_continues_afterwards(start_training):
     """Ctrl-Z and fg: no worker is to blame for the pause."""
-    training = start_training(
-        "collector.hang_timeout_s=2",
-        "reward.time_limit_s=0.5",
-        "budget.env_steps=null",
-        "budget.iterations=40",
-    )
+    training = start_training(*HANGS_SOON, "budget.env_steps=null", "budget.iterations=40")
     training.wait_for_iterations(1)
     training.signal_group(signal.SIGSTOP)
     time.sleep(6)

@@ -32,6 +32,13 @@ def log(tracker, rows, safe: bool = True):
             tracker.safe_until(one["env_steps"])
 
 
+def reopened(store, identity) -> MLflowTracker:
+    """Return a tracker that continues a run."""
+    tracker = MLflowTracker(store)
+    tracker.reopen(identity)
+    return tracker
+
+
 @pytest.fixture
 def killed(store, identity, wait_until):
     """Return the tracker of a run of ten iterations that was never finished."""
@@ -46,9 +53,7 @@ def killed(store, identity, wait_until):
 @pytest.fixture
 def resumed(store, identity, killed):
     """Return a tracker that continues that run."""
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
-    return tracker
+    return reopened(store, identity)
 
 
 def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, resumed):
@@ -81,8 +86,7 @@ def test_points_wait_for_a_checkpoint_and_block_nothing_else(tracker, mlflow, wa
 
 def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, identity, killed):
     identity.write_text(json.dumps({**json.loads(identity.read_text()), "run_id": None}))
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
+    tracker = reopened(store, identity)
     assert tracker.finish("FINISHED") == 0
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
     assert read_tracked_run(identity).run_id == killed.run_id
@@ -94,8 +98,7 @@ def test_a_run_that_was_never_created_begins_when_it_began(store, mlflow, identi
     log(away, rows_until(1))
     away.finish("KILLED", deadline_s=0)
     tracked = read_tracked_run(identity)
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
+    tracker = reopened(store, identity)
     log(tracker, rows_until(2))
     assert tracker.finish("FINISHED") == 0
     (run,) = runs_of(mlflow)
@@ -110,15 +113,13 @@ def test_a_run_resumed_with_another_store_is_complete_there(
     (tmp_path / "other").mkdir()
     shutil.copy(empty_database, tmp_path / "other" / "mlflow.db")
     other = resolve_store(None, tmp_path / "other")
-    tracker = MLflowTracker(other)
-    tracker.reopen(identity)
+    tracker = reopened(other, identity)
     log(tracker, rows_until(12))
     assert tracker.finish("FINISHED") == 0
     there = MlflowClient(tracking_uri=other.uri)
     assert [run.info.run_id for run in runs_of(there)] == [tracker.run_id]
     assert points(there, tracker.run_id) == logged_until(12)
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
+    tracker = reopened(store, identity)
     assert tracker.finish("FINISHED") == 0
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
 
@@ -127,8 +128,7 @@ def test_a_resumed_run_is_shown_as_running(store, mlflow, identity, killed, wait
     killed.set_tag("end", "interrupted: by Ctrl-C")
     killed.finish("KILLED")
     mlflow.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
+    tracker = reopened(store, identity)
     wait_until(lambda: mlflow.get_run(killed.run_id).info.status == "RUNNING")
     tracker.set_tag("went", "on")
     wait_until(lambda: "went" in mlflow.get_run(killed.run_id).data.tags)
@@ -143,8 +143,7 @@ def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
     store, mlflow, identity, killed, caplog
 ):
     mlflow.delete_run(killed.run_id)
-    tracker = MLflowTracker(store)
-    tracker.reopen(identity)
+    tracker = reopened(store, identity)
     log(tracker, rows_until(20))
     assert tracker.finish("FINISHED") > 0
     (record,) = caplog.records
@@ -177,7 +176,7 @@ def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
     if text is not None:
         identity.write_text(text)
     with pytest.raises(BadInput, match=says) as refused:
-        MLflowTracker(store).reopen(identity)
+        reopened(store, identity)
     assert str(identity) in str(refused.value)
 
 
