@@ -108,7 +108,6 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
         (("evaluate",), ("RUN: missing",)),
         (("evaluate", "nowhere"), ("nowhere: no such run",)),
         (("evaluate", "x", "checkpoint=newest"), ("checkpoint", "best, last")),
-        (("evaluate", "x", "evaluation=sumit"), ("sumit", "summit")),
         (("evaluate", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
         (("evaluate", "x", "evaluation.trials=0"), ("evaluation.trials=0",)),
         (
@@ -116,7 +115,6 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
             ("tracking: no such group for evaluate", "accepted: tracking.uri"),
         ),
         (("evaluate", "x", "track=Oval_track"), ("track: no such key", "evaluate --cfg")),
-        (("checkpoints", "nowhere"), ("nowhere: no such run",)),
         (("checkpoints", "evaluation=summit"), ("RUN: missing",)),
         (("checkpoints", "one", "two"), ("one two: 2 runs given",)),
         (("checkpoints", "x", "checkpoint=best"), ("checkpoint=best", "evaluate")),
