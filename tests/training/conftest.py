@@ -1,13 +1,27 @@
 import multiprocessing
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
 
+from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.commands.startup import start_workers_early
+from deepracer_exp.runs.files import read_metrics, read_object
 
 # As a training does: on a busy machine threads of torch wait for one another, and saving a small network took 20 s.
 torch.set_num_threads(1)
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """Two run folders have the same rows, weights, traces and best checkpoint."""
+    both = (one, other)
+    assert different_rows(*(read_metrics(folder / "metrics.jsonl") for folder in both)) is None
+    assert different_tensors(*(folder / "checkpoints" / "last" for folder in both)) is None
+    assert different_traces(one, other) is None
+    bests = [read_object(folder / "summary.json")["best"] for folder in both]
+    assert bests[0] == bests[1]
+    assert len({(folder / "checkpoints" / "best").readlink() for folder in both}) == 1
 
 
 @pytest.fixture(scope="session")

@@ -7,13 +7,14 @@ import torch
 import yaml
 from mlflow import MlflowClient
 
-from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.trainer import Trainer
 from tests.conftest import IN_PROCESS
+
+from .conftest import assert_same_run
 
 # Reached sooner than a lap: episodes end often, and evaluations soon.
 OFTEN = (
@@ -33,14 +34,6 @@ def rows(folder) -> list[dict]:
 
 def summary(folder) -> dict:
     return read_object(folder / "summary.json")
-
-
-def assert_same_run(one, other) -> None:
-    assert different_rows(rows(one), rows(other)) is None
-    assert different_tensors(*(folder / "checkpoints" / "last" for folder in (one, other))) is None
-    assert different_traces(one, other) is None
-    assert summary(one)["best"] == summary(other)["best"]
-    assert len({(folder / "checkpoints" / "best").readlink() for folder in (one, other)}) == 1
 
 
 @pytest.fixture
