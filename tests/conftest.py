@@ -36,6 +36,9 @@ settings.load_profile("no_deadline")
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+REFERENCE = Path(__file__).parents[2] / "shared" / "reference"
+"""What the real service recorded."""
+
 
 def pytest_collection_finish() -> None:
     """Leave what is imported so far out of garbage collection, which took a seventh of the time."""
@@ -347,10 +350,9 @@ def mounted(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
 @pytest.fixture(scope="session")
 def reference() -> Path:
     """The folder of what the real service recorded."""
-    path = Path(__file__).parents[2] / "shared" / "reference"
-    if not path.is_dir():
+    if not REFERENCE.is_dir():
         pytest.skip("the recordings of the real service are not on this machine")
-    return path
+    return REFERENCE
 
 
 @pytest.fixture

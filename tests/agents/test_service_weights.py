@@ -13,7 +13,7 @@ from deepracer_exp.agents.service_weights import POLICY, VALUE, from_service, ma
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.errors import BadInput
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 CAMERA = "FRONT_FACING_CAMERA"
 SENSORS = {

@@ -1,11 +1,10 @@
-from pathlib import Path
-
 import pytest
 
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.deepracer.recording_reader import read_recording
+from tests.conftest import REFERENCE
 
-CONSOLE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
+CONSOLE = REFERENCE / "console_training"
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from deepracer_exp.analysis.reward_replay import replay_reward
 from deepracer_exp.analysis.reward_terms import contributed_terms, run_terms
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.rewards.source import RewardSource, named_reward_source, zoo_names
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 from .made_up import Drive, made_up_recording
 

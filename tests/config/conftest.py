@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.errors import BadInput
-
 HYPERPARAMETERS = {
     "batch_size": 64,
     "beta_entropy": 0.01,
@@ -38,15 +36,6 @@ CONTINUOUS = METADATA | {
     "action_space_type": "continuous",
 }
 REWARD = "WEIGHT = 2.0\n\n\ndef reward_function(params):\n    return WEIGHT * params['speed']\n"
-
-
-def refused(call: Callable[..., object], *arguments: object, **options: object) -> str:
-    """Return the one line with which a call refuses its arguments."""
-    with pytest.raises(BadInput) as caught:
-        call(*arguments, **options)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 @pytest.fixture

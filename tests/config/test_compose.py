@@ -12,8 +12,7 @@ from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.errors import BadInput
-
-from .conftest import refused
+from tests.conftest import refused
 
 
 def refusal(*overrides: str) -> str:

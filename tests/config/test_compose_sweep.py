@@ -12,8 +12,7 @@ from deepracer_exp.config.dimension import Choices, Range, as_override, dimensio
 from deepracer_exp.config.options import conf_dir, options
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.sweep import SweepConfig, SweepEntry, compose_sweep
-
-from .conftest import refused
+from tests.conftest import refused
 
 READY = [name for name in options("sweep") if name != "own"]
 FILES = ["sweep", *(f"sweep/{name}" for name in options("sweep")), "sweep/executor/local"]

@@ -12,8 +12,9 @@ from deepracer_exp.config.overrides import override_line, parse_single
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.errors import BadInput
+from tests.conftest import refused
 
-from .conftest import CONTINUOUS, HYPERPARAMETERS, METADATA, refused
+from .conftest import CONTINUOUS, HYPERPARAMETERS, METADATA
 
 
 @cache

@@ -18,9 +18,8 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stopping import NoStopping
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput
+from tests.conftest import refused
 from tests.hostile_files import KINDS, TEXTS, make
-
-from .conftest import refused
 
 VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 2**31, 10**18, 10**400, -(10**400)),

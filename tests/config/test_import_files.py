@@ -6,8 +6,9 @@ import pytest
 
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.custom_files import import_files, read_custom_files
+from tests.conftest import refused
 
-from .conftest import CONTINUOUS, METADATA, REWARD, refused
+from .conftest import CONTINUOUS, METADATA, REWARD
 
 pytestmark = pytest.mark.usefixtures("here")
 

@@ -8,8 +8,7 @@ from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.config.track_options import by_world_name
 from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
-
-from .conftest import refused
+from tests.conftest import refused
 
 TWO = "track=[Oval_track,Bowtie_track]"
 

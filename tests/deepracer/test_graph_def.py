@@ -1,7 +1,6 @@
 """Frozen graphs: what is written is read back, and anything else is refused."""
 
 import tracemalloc
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +9,9 @@ import pytest
 from deepracer_exp.deepracer.graph_def import HEAD, INPUTS, POLICY, POLICY_NETWORK, policy_graph, read_weights
 from deepracer_exp.deepracer.protobuf import field, read_fields
 from deepracer_exp.errors import BadInput
-from tests.config.conftest import refused
+from tests.conftest import REFERENCE, refused
 
-REFERENCE = Path(__file__).parents[3] / "shared" / "reference" / "aws_checkpoint" / "model"
+MODEL = REFERENCE / "aws_checkpoint" / "model"
 SENSORS = {"STEREO_CAMERAS": (20, 24, 2), "LIDAR": (6,)}
 
 
@@ -185,9 +184,9 @@ def test_a_tensor_of_one_element_may_be_listed_as_tensorflow_lists_it():
     assert read_weights("model.pb", field(1, node)) == {"a/bias": value}
 
 
-@pytest.mark.skipif(not REFERENCE.is_dir(), reason=f"no checkpoint at {REFERENCE}")
+@pytest.mark.skipif(not MODEL.is_dir(), reason=f"no checkpoint at {MODEL}")
 def test_every_node_is_one_of_the_services_own_graph():
-    (meta,) = REFERENCE.glob("*.meta")
+    (meta,) = MODEL.glob("*.meta")
     (content,) = (value for number, value in read_fields(memoryview(meta.read_bytes())) if number == 2)
     theirs = {node.name: node for node in nodes(content)}
     middleware, camera = f"{POLICY_NETWORK}/middleware_fc_embedder", f"{POLICY_NETWORK}/FRONT_FACING_CAMERA"

@@ -26,7 +26,7 @@ from deepracer_exp.deepracer.model_metadata import (
 )
 from deepracer_exp.errors import BadInput
 from tests.config.conftest import HYPERPARAMETERS as DRFC
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 SENSORS = ["FRONT_FACING_CAMERA", "DISCRETIZED_SECTOR_LIDAR"]
 DISCRETE = [{"steering_angle": -30, "speed": 0.6}, {"steering_angle": 30, "speed": 1.2}]

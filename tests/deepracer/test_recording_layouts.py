@@ -10,7 +10,7 @@ import pytest
 
 from deepracer_exp.deepracer.recording import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
 from deepracer_exp.deepracer.recording_reader import read_recording
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 from . import made_up_logs as made
 

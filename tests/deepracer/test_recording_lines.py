@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 from . import made_up_logs as made
 

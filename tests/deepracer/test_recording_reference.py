@@ -2,7 +2,6 @@
 
 import math
 import tarfile
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,14 +9,15 @@ import pytest
 
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.deepracer.recording_reader import read_recording
+from tests.conftest import REFERENCE
 
-REFERENCE = Path(__file__).parents[3] / "shared" / "reference" / "console_training"
-pytestmark = pytest.mark.skipif(not REFERENCE.is_dir(), reason=f"no recordings at {REFERENCE}")
+CONSOLE = REFERENCE / "console_training"
+pytestmark = pytest.mark.skipif(not CONSOLE.is_dir(), reason=f"no recordings at {CONSOLE}")
 
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    return read_recording(REFERENCE)
+    return read_recording(CONSOLE)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def training(recording) -> pd.DataFrame:
 
 @pytest.fixture(scope="module")
 def from_log() -> pd.DataFrame:
-    return read_recording(REFERENCE / "logs/training").steps
+    return read_recording(CONSOLE / "logs/training").steps
 
 
 def test_the_training_has_all_its_rows_iterations_episodes_and_laps(training):
@@ -105,7 +105,7 @@ def test_settings_are_those_of_the_training(recording):
 def test_the_archive_of_the_folder_reports_the_same(recording, tmp_path):
     path = tmp_path / "logs.tar.gz"
     with tarfile.open(path, "w:gz", compresslevel=1) as archive:
-        archive.add(REFERENCE, "EHNgTNY2T9")
+        archive.add(CONSOLE, "EHNgTNY2T9")
     packed = read_recording(path)
     for name in ("steps", "updates", "metrics"):
         pd.testing.assert_frame_equal(getattr(packed, name), getattr(recording, name))

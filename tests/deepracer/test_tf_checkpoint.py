@@ -1,7 +1,6 @@
 """Checkpoints of TensorFlow are what TensorFlow writes, and what is damaged is refused."""
 
 import contextlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,9 @@ from deepracer_exp.deepracer.tf_checkpoint import (
     write_index,
 )
 from deepracer_exp.errors import BadInput
+from tests.conftest import REFERENCE
 
-REFERENCE = Path(__file__).parents[3] / "shared/reference/aws_checkpoint/model/11_Step-38428.ckpt.index"
+INDEX = REFERENCE / "aws_checkpoint/model/11_Step-38428.ckpt.index"
 SCOPE = "main_level/agent/main/online"
 SHAPES = {
     "FRONT_FACING_CAMERA/Conv2d_0": (8, 8, 1, 32),
@@ -33,10 +33,10 @@ def tensors(seed=0, sizes=((3, 3, 1, 8), (8,), (17, 5), ())):
     return {f"a/layer_{n}/kernel": random.random(size).astype(np.float32) for n, size in enumerate(sizes)}
 
 
-@pytest.mark.skipif(not REFERENCE.is_file(), reason=f"no index at {REFERENCE}")
+@pytest.mark.skipif(not INDEX.is_file(), reason=f"no index at {INDEX}")
 def test_the_services_index_is_read_exactly_and_written_byte_for_byte():
-    raw = REFERENCE.read_bytes()
-    entries = read_index(raw, str(REFERENCE))
+    raw = INDEX.read_bytes()
+    entries = read_index(raw, str(INDEX))
     expected = {}
     for network, (head, outputs) in HEADS.items():
         for layer, shape in (SHAPES | {head: (512, outputs)}).items():

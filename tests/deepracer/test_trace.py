@@ -22,11 +22,9 @@ from deepracer_exp.deepracer.trace import (
 )
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.trace import TraceWriter, read_trace
-from tests.config.conftest import refused
+from tests.conftest import REFERENCE, refused
 
-CONSOLE = (
-    Path(__file__).parents[2] / "../shared/reference/console_training/sim-trace/training/training-simtrace"
-)
+CONSOLE = REFERENCE / "console_training/sim-trace/training/training-simtrace"
 WHOLE = ("episode", "steps", "action", "closest_waypoint", "car")
 YES_NO = ("done", "all_wheels_on_track")
 TRACKS = ("Oval_track", "Bowtie_track", "2022_summit_speedway")

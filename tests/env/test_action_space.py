@@ -22,7 +22,7 @@ from deepracer_exp.config.driving import (
 from deepracer_exp.config.options import options
 from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions, build_action_space
 from deepracer_exp.errors import BadInput
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 
 def grid(

@@ -7,7 +7,7 @@ import pytest
 from deepracer_exp.deepracer.trace import STATUS_CODE
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.rules import EpisodeRules
-from tests.config.conftest import refused
+from tests.conftest import refused
 from tests.env.conftest import make_setup
 
 EVERYTHING = (

@@ -1,7 +1,5 @@
 """The environment's rules on what the real service recorded: its poses go through the very code a race uses."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,8 +12,8 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.sim.batch import CarState
+from tests.conftest import REFERENCE
 
-REFERENCE = Path(__file__).parents[2] / "../shared/reference"
 TRACES = REFERENCE / "console_training/sim-trace"
 FRONT_M = 0.14
 JUDGED = ("progress", "all_wheels_on_track", "status", "done", "closest_waypoint", "reward", "steps")

@@ -19,7 +19,7 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.export.aws_model import aws_model, services_kind
 from deepracer_exp.runs.checkpoints import StoredPolicy
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 REWARD = "def reward_function(params):\n    return 1.0\n"
 CAMERA = ("FRONT_FACING_CAMERA",)

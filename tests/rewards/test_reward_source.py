@@ -14,7 +14,7 @@ from deepracer_exp.rewards.source import (
     source_with_constants,
     zoo_names,
 )
-from tests.config.conftest import refused
+from tests.conftest import refused
 
 PLAIN = "def reward_function(params):\n    return 1.0\n"
 
