@@ -358,6 +358,7 @@ def _promote(args: argparse.Namespace) -> int:
     from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
+    from deepracer_exp.runs.checkpoint_files import find_checkpoint
     from deepracer_exp.runs.files import read_config
     from deepracer_exp.runs.resolve import resolve
     from deepracer_exp.tracking.registry import check_alias, check_model, promote
@@ -368,6 +369,8 @@ def _promote(args: argparse.Namespace) -> int:
     if args.model is not None:
         check_model("--model", args.model)
     run = resolve(name, stores.runs_dir, stores.uri)
+    checkpoint = stores.values.get("checkpoint") or run.checkpoint or "best"
+    find_checkpoint(run.checkpoints, checkpoint)
 
     from deepracer_exp.env.observation import feature_names, observation_shape
 
@@ -375,7 +378,7 @@ def _promote(args: argparse.Namespace) -> int:
     observation = parse_config(config.get("observation", {}), ObservationConfig)
     registered = promote(
         run.path,
-        stores.values.get("checkpoint") or run.checkpoint or "best",
+        checkpoint,
         args.model or run.path.resolve().parent.name,
         args.alias,
         feature_names(observation),

@@ -107,7 +107,6 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
     [
         (("evaluate",), ("RUN: missing",)),
         (("evaluate", "nowhere"), ("nowhere: no such run",)),
-        (("evaluate", "x", "checkpoint=newest"), ("checkpoint", "best, last")),
         (("evaluate", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
         (("evaluate", "x", "evaluation.trials=0"), ("evaluation.trials=0",)),
         (
