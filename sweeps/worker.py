@@ -219,6 +219,11 @@ class TrialRun(Callback):
             self._pruned_by, reason = decision
             trainer.request_stop(f"{self._pruned_by}: {reason}", STOPPED_EARLY)
 
+    def summary(self, trainer: Trainer) -> dict[str, Any]:
+        """Keep the claim: pictures took a while, and a run that another worker continues has no end here."""
+        self._lease.confirm()
+        return {}
+
     def _begin(self, run_dir: Path) -> None:
         self._show(0.0, {})
         run = {"seed": self._seed, "run_dir": str(run_dir.resolve()), "status": None, "value": None}

@@ -354,6 +354,14 @@ def _printing(console: Console) -> Callable[[str], None]:
 def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
     """Train, and write how it ended, whatever ends it."""
     try:
+        return _ended(trainer, interruption)
+    except TakenOver:
+        trainer.release()
+        raise
+
+
+def _ended(trainer: Trainer, interruption: Interruption) -> TrainResult:
+    try:
         reason = trainer.fit(interruption)
         code = interruption.exit_code
         return trainer.end(trainer.status if code is None else INTERRUPTED, reason, code or 0)
@@ -362,7 +370,6 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
     except OSError as error:
         return trainer.fail(f"{error.filename or trainer.folder.path}: {error.strerror or error}", error)
     except TakenOver:
-        trainer.release()
         raise
     except KeyboardInterrupt:
         # No checkpoint, since an update may be half done, and no pictures.

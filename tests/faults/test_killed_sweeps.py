@@ -199,7 +199,7 @@ def test_after_kill_9_of_everything_the_study_resumes(sweep, tmp_path, seed):
 def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_nor_into_the_run(
     sweep, tmp_path, seed
 ):
-    running = sweep("sweep.workers=2")
+    running = sweep("sweep.workers=2", "sweep.trials=10")
     running.wait_for(lambda: running.rows() >= 1 + random.Random(seed).randrange(4), "rows")
     held, late = running.wait_for(lambda: suspended(running), "trial under way")
     try:
@@ -214,7 +214,7 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
     finally:
         late.resume()
     running.end()
-    assert_every_trial_is_accounted_for_once(tmp_path)
+    assert_every_trial_is_accounted_for_once(tmp_path, trials=10)
     claim = next(claim for claim in claims(tmp_path) if claim.index == held.index)
     assert claim.attempt == taken.attempt
     # The sleeper held its folder, so that the other one continued in a copy.
@@ -241,7 +241,8 @@ def suspended(running):
             worker = psutil.Process(int(claim.owner.rsplit(":", 2)[1]))
             worker.suspend()
             (now,) = [one for one in claims(running.cwd) if one.index == claim.index]
-            if now.state == "claimed" and now.owner == claim.owner and not is_locked(running.cwd):
+            is_ours = now.state == "claimed" and now.owner == claim.owner and not is_locked(running.cwd)
+            if is_ours and not (Path(now.runs[-1]["run_dir"]) / "summary.json").exists():
                 return now, worker
             worker.resume()
     return None
