@@ -91,7 +91,7 @@ def claims(cwd, storage=None):
     return TrialClaims(open_storage(storage, cwd / "runs").engine, "s").all()
 
 
-def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS):
+def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS, iterations=ITERATIONS):
     """The study has each trial once, with the value of a run that has each of its iterations once."""
     opened = open_storage(storage, cwd / "runs")
     found = TrialClaims(opened.engine, "s").all()
@@ -113,7 +113,7 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS):
         folder = cwd / "runs" / "s" / Path(run["run_dir"]).name
         assert read_object(folder / "summary.json")["status"] == "finished"
         rows = [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")]
-        assert rows == list(range(1, ITERATIONS + 1))
+        assert rows == list(range(1, iterations + 1))
     assert len({trial.params["algorithm.lr"] for trial in known.values() if trial.params}) == trials
 
 
@@ -199,7 +199,7 @@ def test_after_kill_9_of_everything_the_study_resumes(sweep, tmp_path, seed):
 def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_nor_into_the_run(
     sweep, tmp_path, seed
 ):
-    running = sweep("sweep.workers=2", "sweep.trials=10")
+    running = sweep("sweep.workers=2", "budget.iterations=40")
     running.wait_for(lambda: running.rows() >= 1 + random.Random(seed).randrange(4), "rows")
     held, late = running.wait_for(lambda: suspended(running), "trial under way")
     try:
@@ -214,7 +214,7 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
     finally:
         late.resume()
     running.end()
-    assert_every_trial_is_accounted_for_once(tmp_path, trials=10)
+    assert_every_trial_is_accounted_for_once(tmp_path, iterations=40)
     claim = next(claim for claim in claims(tmp_path) if claim.index == held.index)
     assert claim.attempt == taken.attempt
     # The sleeper held its folder, so that the other one continued in a copy.
