@@ -220,7 +220,7 @@ class TrialRun(Callback):
             trainer.request_stop(f"{self._pruned_by}: {reason}", STOPPED_EARLY)
 
     def summary(self, trainer: Trainer) -> dict[str, Any]:
-        """Keep the claim: pictures took a while, and a run that another worker continues has no end here."""
+        """Check the claim before the end of the run is written: drawing its pictures takes a second."""
         self._lease.confirm()
         return {}
 

@@ -35,6 +35,7 @@ CASES = {
     ("validate", "reward=racing"): "reward=racing",
     ("evaluate", "unknown"): "unknown: no such run in runs (3 there)",
     ("evaluate", "runs/a/run", "checkpoint=120"): "checkpoint=120",
+    ("evaluate", "runs/a/run", "checkpoint="): "checkpoint",
     (
         "evaluate",
         "runs/a/run",

@@ -110,7 +110,7 @@ class StoredRunConfig:
     run: Annotated[str, Field(min_length=1)]
     """The run: a folder, its name under `runs_dir` or the beginning of it, MLflow's id, `best:EXPERIMENT`, or the alias
     of a registered model."""
-    checkpoint: str | None
+    checkpoint: Annotated[str, Field(min_length=1)] | None
     """`best`, `last` or an iteration; null: the one of the alias that names the run, else `best`."""
     runs_dir: Annotated[str, Field(min_length=1)]
     tracking: StoreConfig

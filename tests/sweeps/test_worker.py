@@ -1,13 +1,18 @@
 """Trials made by a worker in a real database, without their trainings."""
 
+import time
+from types import SimpleNamespace
+
 import optuna
 import pytest
+from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.training import callbacks
 from deepracer_exp.training.signals import Interruption
-from sweeps.claims import TrialResult
+from sweeps.claims import TrialClaims, TrialResult
 from sweeps.space import SearchSpace
 from sweeps.storage import open_storage
 from sweeps.study import open_study
@@ -21,15 +26,9 @@ SPACE = {
 MIXED = ("algorithm.lr=tag(log,interval(1e-5,1e-3))", "network=mlp_small,mlp")
 
 
-def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
-    """Make the trials of a sweep, with nearly the same values and without training."""
-
-    def untrained(self: TrialRun, overrides) -> TrialResult:
-        attrs = {"overrides": overrides, "reason": "made up"}
-        return TrialResult(state="COMPLETE", values=[9.0 + len(overrides)], attrs=attrs)
-
-    monkeypatch.setattr(TrialRun, "_result", untrained)
-    overrides = [*asked, "sweep.startup_trials=2", "tracking=off"]
+def worker(tmp_path, *asked: str) -> tuple[Worker, RDBStorage]:
+    """Begin a sweep and return a worker of it, with the database."""
+    overrides = [*asked, "tracking=off"]
     request = compose_sweep([*overrides, "study=s"])
     space = SearchSpace.from_request(request)
     storage = open_storage(None, tmp_path)
@@ -46,7 +45,19 @@ def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
         evaluations=None,
         cores=1,
     )
-    Worker(config, storage, "host:1:a").work(Interruption())
+    return Worker(config, storage, "host:1:a"), storage
+
+
+def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
+    """Make the trials of a sweep, with nearly the same values and without training."""
+
+    def untrained(self: TrialRun, overrides) -> TrialResult:
+        attrs = {"overrides": overrides, "reason": "made up"}
+        return TrialResult(state="COMPLETE", values=[9.0 + len(overrides)], attrs=attrs)
+
+    monkeypatch.setattr(TrialRun, "_result", untrained)
+    one, storage = worker(tmp_path, *asked, "sweep.startup_trials=2")
+    one.work(Interruption())
     return optuna.load_study(study_name="s", storage=storage).trials
 
 
@@ -68,3 +79,28 @@ def test_values_drawn_again_are_trained_with_the_next_seed(tmp_path, monkeypatch
     assert sorted(map(len, seeds.values()))[-1] >= 3
     for found in seeds.values():
         assert found == [7 + 2 * again for again in range(len(found))]
+
+
+def test_a_run_whose_trial_is_taken_over_while_its_pictures_are_drawn_has_no_end(tmp_path, monkeypatch):
+    one, storage = worker(
+        tmp_path,
+        "experiment=tiny",
+        "network=mlp_small,mlp",
+        "sweep.trials=1",
+        "sweep.lease_s=1",
+        "sweep.rerank=0",
+    )
+    claims, until = TrialClaims(storage.engine, "s"), SimpleNamespace(signum=None)
+
+    def drawn(*_: object) -> None:
+        claims.release("host:1:a", is_lost=True)
+        assert claims.claim("host:2:b", 1, 3600.0).attempt == 2
+        time.sleep(1.0)
+        until.signum = 15
+
+    monkeypatch.setattr(callbacks, "write_pictures", drawn)
+    one.work(until)
+    (run,) = (tmp_path / "s").glob("*-seed*")
+    assert (run / "metrics.jsonl").is_file()
+    assert not (run / "summary.json").exists()
+    assert [claim.state for claim in claims.all()] == ["claimed"]
