@@ -50,8 +50,8 @@ race: $(RACER)  ## train the default experiment until the car drives reliably
 test: $(STAMP)  ## the tests, without the long ones
 	@$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile
 
-test-long: $(STAMP)  ## the tests that take longer than ten seconds each
-	@$(BIN)/python -m pytest -q -m slow -n 2
+test-long: $(STAMP)  ## the tests that take longer than ten seconds each, and those of drawn examples with new ones
+	@$(BIN)/python -m pytest -q -m "slow or hypothesis" --hypothesis-profile=new -n 2
 
 test-faults: $(STAMP)  ## runs and sweeps whose processes are killed and stopped, twenty times each; kill_loops.jsonl
 	@FAULT_TIMES=20 KILL_LOOPS=kill_loops.jsonl $(BIN)/python -m pytest -q tests/faults/test_kill_loops.py tests/faults/test_killed_sweeps.py -n 2

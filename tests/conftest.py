@@ -29,9 +29,11 @@ from .postgres import postgres, postgres_server
 
 __all__ = ["chromium", "postgres", "postgres_server", "tab"]
 
-# A deadline is a timed test: it fails on a busy machine.
-settings.register_profile("no_deadline", deadline=None)
-settings.load_profile("no_deadline")
+# A deadline is a timed test: it fails on a busy machine. `make test` draws the same examples every time, for everyone;
+# `make test-long` draws new ones by `--hypothesis-profile=new`.
+settings.register_profile("same", deadline=None, derandomize=True)
+settings.register_profile("new", deadline=None, print_blob=True)
+settings.load_profile("same")
 
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -94,14 +94,14 @@ def build_scenery(track: Track) -> Scenery:
     if ring is None:
         low_x, low_y, high_x, high_y = road.bounds
         (field,) = _rings(shapely.box(low_x - FIELD_M, low_y - FIELD_M, high_x + FIELD_M, high_y + FIELD_M))
-        drawing.add([field], FIELD, SKY)
+        drawing.add(([field], FIELD, SKY))
     else:
         for (ax, ay), (bx, by) in pairwise(ring):
             wall = WALL_Y if ay == by and not floor.walls_follow_road else WALL_X
             z = floor.walls_height_m
             # Counter-clockwise in the picture of a camera between the walls.
-            drawing.add([np.array([[ax, ay, 0], [ax, ay, z], [bx, by, z], [bx, by, 0]])], wall, SKY)
-            drawing.add([np.array([[bx, by, 0], [ax, ay, 0]])], wall, FIELD)
+            drawing.add(([np.array([[ax, ay, 0], [ax, ay, z], [bx, by, z], [bx, by, 0]])], wall, SKY))
+            drawing.add(([np.array([[bx, by, 0], [ax, ay, 0]])], wall, FIELD))
     plain = road
     if floor.lines_inside:
         borders = [shapely.LineString(line).buffer(LINE_WIDTH_M) for line in (track.inner, track.outer)]
@@ -110,18 +110,21 @@ def build_scenery(track: Track) -> Scenery:
         for ring in _rings(area):
             for first in range(0, len(ring) - 1, _PIECE_LINES):
                 some = ring[first : first + _PIECE_LINES + 1]
-                drawing.add([some], inside, outside, far_m=CURVES_UNTIL_M)
                 coarse = shapely.get_coordinates(shapely.LineString(some).simplify(COARSE_M))
-                drawing.add([coarse], inside, outside, near_m=CURVES_UNTIL_M)
+                drawing.add_levels(CURVES_UNTIL_M, [([some], inside, outside)], [([coarse], inside, outside)])
     # In the published direction: what lies on the floor does not depend on how the track is driven.
     center = track.waypoints[::-1] if track.reversed else track.waypoints
     dashes = list(_dashes(center, DASH_WIDTH_M, floor.dash_length_m, floor.dash_gap_m))
     runs = [dashes]
     if floor.start_line_color is not None:
         start, dark = _start_line(center, plain)
-        drawing.add(list(_rings(start)), LINE, ROAD, far_m=CURVES_UNTIL_M)
-        drawing.add(list(_rings(dark)), START, LINE, far_m=CURVES_UNTIL_M)
-        drawing.add(list(_rings(start)), FAR_START, ROAD, near_m=CURVES_UNTIL_M)
+        rings = list(_rings(start))
+        if rings:  # not on a road that is narrower than its lines
+            drawing.add_levels(
+                CURVES_UNTIL_M,
+                [(rings, LINE, ROAD), (list(_rings(dark)), START, LINE)],
+                [(rings, FAR_START, ROAD)],
+            )
         seen = groupby(dashes, lambda dash: not start.intersects(shapely.Polygon(dash)))
         runs = [list(run) for visible, run in seen if visible]
     for run in runs:
@@ -188,6 +191,9 @@ def join_sceneries(sceneries: Sequence[Scenery]) -> Scenery:
 
 _PIECE_LINES = 16
 
+_Outline = tuple[Sequence[NDArray[np.float64]], int, int]
+"""Lines of connected points, (n, 2) on the floor or (n, 3) each, and the materials to their left and right."""
+
 
 class _Drawing:
     """Collects pieces."""
@@ -198,34 +204,45 @@ class _Drawing:
         self._pieces: list[tuple[object, ...]] = []
         self._count = 0
 
-    def add(
-        self,
-        outlines: Sequence[NDArray[np.float64]],
-        inside: int,
-        outside: int,
-        near_m: float = 0.0,
-        far_m: float = math.inf,
-    ) -> None:
-        """Add a piece of connected points, (n, 2) on the floor or (n, 3) each."""
-        if not outlines:  # of a road that is narrower than its lines
-            return
-        first = self._count
-        for points in outlines:
-            points = points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
-            self._points.append(points)
-            self._joined.append(np.arange(len(points)) > 0)
-            self._count += len(points)
-        all_points = np.concatenate(outlines)[:, :2]
-        middle = 0.5 * (all_points.min(axis=0) + all_points.max(axis=0))
-        radius = np.linalg.norm(all_points - middle, axis=1).max()
-        self._pieces.append((first, self._count, inside, outside, middle, radius, near_m, far_m))
+    def add(self, outline: _Outline) -> None:
+        """Add an outline that is drawn from every distance."""
+        self._add(outline, self._circle([outline]), 0.0, math.inf)
+
+    def add_levels(self, until_m: float, near: Sequence[_Outline], far: Sequence[_Outline]) -> None:
+        """Add outlines that are drawn up to a distance, and others that take their place from there on.
+
+        The distance of all of them is that of one circle: cameras draw either all of `near` or all of `far`.
+        """
+        circle = self._circle(near)
+        for outline in near:
+            self._add(outline, circle, 0.0, until_m)
+        for outline in far:
+            self._add(outline, circle, until_m, math.inf)
 
     def add_dashes(self, dashes: Sequence[NDArray[np.float64]], dash: int, far: int, under: int) -> None:
         """Add consecutive dashes, which run together from `DASHES_UNTIL_M` on."""
         for first in range(0, len(dashes), _PIECE_LINES):
             few = dashes[first : first + _PIECE_LINES]
-            self.add(few, dash, under, far_m=DASHES_UNTIL_M)
-            self.add([_strip(few)], far, under, near_m=DASHES_UNTIL_M)
+            self.add_levels(DASHES_UNTIL_M, [(few, dash, under)], [([_strip(few)], far, under)])
+
+    @staticmethod
+    def _circle(outlines: Sequence[_Outline]) -> tuple[NDArray[np.float64], float]:
+        """Return the middle and the radius of a circle around outlines."""
+        points = np.concatenate([line[:, :2] for lines, _, _ in outlines for line in lines])
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        return middle, np.linalg.norm(points - middle, axis=1).max()
+
+    def _add(
+        self, outline: _Outline, circle: tuple[NDArray[np.float64], float], near_m: float, far_m: float
+    ) -> None:
+        lines, inside, outside = outline
+        first = self._count
+        for points in lines:
+            points = points if points.shape[1] == 3 else np.column_stack([points, np.zeros(len(points))])
+            self._points.append(points)
+            self._joined.append(np.arange(len(points)) > 0)
+            self._count += len(points)
+        self._pieces.append((first, self._count, inside, outside, *circle, near_m, far_m))
 
     def finish(self) -> Scenery:
         return Scenery(
