@@ -1,13 +1,16 @@
-"""Write the catalogue's data file, `deepracer_exp/deepracer/worlds.zip`, from the service's route files.
+"""Write the catalogue's data file, `deepracer_exp/deepracer/worlds.zip`, from route files.
 
     git clone https://github.com/aws-deepracer-community/deepracer-simapp
     git -C deepracer-simapp checkout 01f5f015fd85
-    python -m benchmarks.build_catalogue deepracer-simapp/bundle/routes
+    git clone https://github.com/aws-deepracer-community/deepracer-analysis
+    git -C deepracer-analysis checkout 6f8cf6b2f732
+    cd deepracer-analysis/tracks && git show fce64302d8a5:./reinvent_base.npy > reinvent_base_2019.npy && cd -
+    python -m benchmarks.build_catalogue deepracer-simapp/bundle/routes deepracer-analysis/tracks
 
-The coordinates are those of deepracer-simapp (Apache-2.0, Amazon.com, Inc. or its affiliates), rounded to 0.1 mm. The
-file holds `index.json`, which names source and licence and lists the worlds, and `routes.npy`: the rows of all worlds
-one after another, in units of 0.1 mm, as second differences along each world (int32). The same routes give the same
-bytes.
+The coordinates are those of deepracer-simapp (Apache-2.0, Amazon.com, Inc. or its affiliates) and, for the worlds of
+`FORMER`, of deepracer-analysis (MIT-0), rounded to 0.1 mm. The file holds `index.json`, which names sources and
+licences and lists the worlds, and `routes.npy`: the rows of all worlds one after another, in units of 0.1 mm, as second
+differences along each world (int32). The same routes give the same bytes.
 """
 
 import argparse
@@ -23,10 +26,29 @@ import numpy as np
 from deepracer_exp.deepracer.routes import is_first_of_equals, read_route
 from deepracer_exp.deepracer.worlds import FILE, INDEX, ROUTES, UNITS_PER_M, World
 
-SOURCE = "https://github.com/aws-deepracer-community/deepracer-simapp, bundle/routes, commit 01f5f015fd85"
-LICENCE = "Apache-2.0, Copyright Amazon.com, Inc. or its affiliates"
+SOURCES = (
+    {
+        "source": "https://github.com/aws-deepracer-community/deepracer-simapp, bundle/routes, commit 01f5f015fd85",
+        "licence": "Apache-2.0, Copyright Amazon.com, Inc. or its affiliates",
+    },
+    {
+        "source": "https://github.com/aws-deepracer-community/deepracer-analysis, tracks, commit 6f8cf6b2f732; "
+        "reinvent_base_2019: reinvent_base at commit fce64302d8a5",
+        "licence": "MIT-0, Copyright 2018-2019 Amazon.com, Inc. or its affiliates, 2019-2022 AWS DeepRacer Community",
+    },
+)
+FORMER = (
+    "2022_reinvent_champ",
+    "Canada_Eval",
+    "China_eval_track",
+    "H_track",
+    "Mexico_track_eval",
+    "New_York_Eval_Track",
+    "reinvent_base_2019",
+)
+"""Worlds of earlier years that deepracer-simapp no longer has. In its time `reinvent_base_2019` was `reinvent_base`."""
 VARIANT = re.compile(r"_(?:ccw|cw|mirrored|building|f1)$")
-FLOORS = {f"reinvent_{floor}": "reinvent_base" for floor in ("carpet", "concrete", "wood")}
+OF_REINVENT_BASE = tuple(f"reinvent_{other}" for other in ("base_2019", "carpet", "concrete", "wood"))
 TITLES = {
     # Official names: aws-solutions/deepracer-on-aws, source/libs/config/src/data/tracks.json (Apache-2.0).
     "2022_april_open": "Ace Speedway",
@@ -91,44 +113,48 @@ TITLES = {
     "reinvent_base": "re:Invent 2018",
     "thunder_hill_open": "Lars Loop",
     "thunder_hill_pro": "Lars Circuit",
+    # The races of the Virtual Circuit of 2019, whose trainings have the same titles with "Training" behind them.
+    "Canada_Eval": "Toronto Turnpike",
+    "China_eval_track": "Shanghai Sudu",
+    "Mexico_track_eval": "Cumulo Carrera",
+    "New_York_Eval_Track": "Empire City",
     # The service names these nowhere.
     "2022_summit_speedway_mini": "RL Speedway Mini",
     "AWS_track": "AWS Track",
+    "H_track": "H Track",
+    "reinvent_base_2019": "re:Invent 2018 until 2020",
     "Straight_track": "Straight Track",
 }
 
 
-def build(routes: Path) -> bytes:
+def build(routes: Path, former: Path) -> bytes:
     """Return the data file's content.
 
     Args:
         routes: folder of NAME.npy.
+        former: likewise, of which the worlds of `FORMER` are taken.
 
     Raises:
         BadInput: a route cannot be read.
         SystemExit: there is none, a world has no title, or rounding opens a ring or moves a repeated point.
     """
     found: list[tuple[World, np.ndarray]] = []
-    for path in routes.glob("*.npy"):
-        family = FLOORS.get(path.stem) or VARIANT.sub("", path.stem)
+    for path in (*routes.glob("*.npy"), *(former / f"{name}.npy" for name in FORMER)):
+        family = "reinvent_base" if path.stem in OF_REINVENT_BASE else VARIANT.sub("", path.stem)
         title = TITLES.get(path.stem) or TITLES.get(family)
         if title is None:
             raise SystemExit(f"{path}: no title; TITLES has one for every family")
-        rows = read_route(path)
+        rows = _closed(read_route(path))
         units = np.rint(rows * UNITS_PER_M).astype(np.int64)
         same_repeats = is_first_of_equals(units / UNITS_PER_M) == is_first_of_equals(rows)
         if not same_repeats.all() or (units[0] == units[-1]).all() != (rows[0] == rows[-1]).all():
             raise SystemExit(f"{path}: rounding changes its shape")
         found.append((World(name=path.stem, family=family, title=title, rows=len(rows)), units))
-    if not found:
+    if len(found) == len(FORMER):
         raise SystemExit(f"{routes}: no routes (*.npy)")
     found.sort(key=lambda one: (one[0].family, one[0].name))
     bends = [np.diff(np.diff(units, axis=0, prepend=0), axis=0, prepend=0) for _, units in found]
-    index = {
-        "source": SOURCE,
-        "licence": LICENCE,
-        "worlds": [world._asdict() for world, _ in found],
-    }
+    index = {"sources": SOURCES, "worlds": [world._asdict() for world, _ in found]}
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
         file.writestr(zipfile.ZipInfo(INDEX), json.dumps(index, indent=1), zipfile.ZIP_DEFLATED, 9)
@@ -138,6 +164,16 @@ def build(routes: Path) -> bytes:
     return content.getvalue()
 
 
+def _closed(rows: np.ndarray) -> np.ndarray:
+    """Return a ring's rows with its closing row, which two of deepracer-analysis lack; others as they are.
+
+    Their ends are no farther apart than two neighbouring rows; those of `Straight_track` are 5.7 m apart.
+    """
+    steps_m = np.linalg.norm(np.diff(rows[:, :2], axis=0), axis=1)
+    gap_m = np.linalg.norm(rows[0, :2] - rows[-1, :2])
+    return np.vstack([rows, rows[:1]]) if 0 < gap_m < 2 * np.median(steps_m) else rows
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Build the data file in its place."""
     parser = argparse.ArgumentParser(
@@ -145,10 +181,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         prog="benchmarks.build_catalogue",
     )
-    parser.add_argument("routes", type=Path, help="the folder of route files")
+    parser.add_argument("routes", type=Path, help="the folder of deepracer-simapp's route files")
+    parser.add_argument("former", type=Path, help="the folder of deepracer-analysis' route files")
     parser.add_argument("--output", type=Path, default=FILE, help="where to write it (default: %(default)s)")
     args = parser.parse_args(arguments)
-    content = build(args.routes)
+    content = build(args.routes, args.former)
     args.output.write_bytes(content)
     print(f"{args.output}: {len(content):,} bytes")
 

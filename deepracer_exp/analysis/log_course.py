@@ -2,20 +2,24 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.deepracer.recording import LogProblem, Recording
-from deepracer_exp.deepracer.routes import recognise, world_rows
+from deepracer_exp.deepracer.routes import NEAR_M, recognise, world_rows
 from deepracer_exp.deepracer.worlds import find_world, worlds
+from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.files import CONFIG, read_config
-from deepracer_exp.tracks.track import Track, world_track
+from deepracer_exp.tracks.track import Track, TrackIndex, Tracks, world_track
 
 _SAMPLE = 2000
 """Rows of a course that are used to recognise it."""
@@ -25,6 +29,9 @@ _INSIDE = 0.95
 """Share of the rows that must be on or just beside the road."""
 _BESIDE_M = 0.3
 """How far beside the road a car may be before its episode ends."""
+_MISJUDGED = 0.02
+"""Share of the rows whose wheels may be on the other side of the borders than logged: on the right world at most half a
+per cent (rounding), on one of another width four to ten."""
 _SAME_NUMBERS = 0.9
 """Share of the rows whose waypoint must be one of the two around them; the rest is rounding."""
 _LEAST_WAYPOINTS = 20
@@ -39,11 +46,11 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
     """Find the course of each name in a recording's `steps.track`, in the direction in which most rows were driven.
 
     One of our own runs has its courses in its config.yaml. Other names are looked up among the service's worlds; a
-    course without a known name, or with one that does not match where the car drove, is recognised by its waypoint
-    numbers, its length and the positions of the car.
+    course without a known name, or with one that does not match where the car drove, is recognised by its length, its
+    width, its waypoint numbers and the positions of the car.
 
     Returns:
-        The courses by name, and those that were not recognised with the reason.
+        The courses by name, and those that were not recognised, or not for certain, with the reason.
     """
     own: Mapping[str, TrackConfig] = {}
     problems: list[LogProblem] = []
@@ -64,7 +71,9 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
             if logged in own:
                 both = [Track.from_config(own[logged], reversed=back) for back in (False, True)]
             elif (world := _recognised(logged, sample)) is not None:
-                both = [world_track(world, back) for back in (False, True)]
+                both = [world_track(world.name, back) for back in (False, True)]
+                if world.misjudged > _MISJUDGED and world.name != find_world(logged):
+                    problems.append(LogProblem(recording.name, None, _of_another_width(logged, world)))
             else:
                 raise BadInput(_unknown(logged, sample))
             tracks[name] = directed(both[0], both[1], rows)
@@ -90,24 +99,72 @@ def catalogue_track(name: str, reversed: bool = False) -> Track:
     return world_track(name, reversed)
 
 
-def _recognised(logged: str, sample: pd.DataFrame) -> str | None:
-    """Return the world of the rows: the one logged, one with the same waypoint numbers, or one of the same length."""
-    points = sample[["X", "Y"]].to_numpy(np.float64)
-    known = np.isfinite(points).all(axis=1) & (sample["closest_waypoint"].to_numpy() >= 0)
-    points, waypoint = points[known], sample["closest_waypoint"].to_numpy(np.intp)[known]
-    if not len(points):
+class _Recognised(NamedTuple):
+    name: str
+    """Of the world."""
+    misjudged: float
+    """Share of the rows whose wheels are on the other side of its borders than logged."""
+
+
+def _recognised(logged: str, sample: pd.DataFrame) -> _Recognised | None:
+    """Return the world whose length, width and waypoint numbers are those of the rows; None if the car was elsewhere.
+
+    Several worlds have one shape: resampled, with other borders, or on other floors. The width decides before the
+    waypoint numbers, because a wrong one makes off-tracks; the name decides last, because worlds were resampled under
+    the names they had.
+    """
+    waypoint = sample["closest_waypoint"].to_numpy(np.intp)
+    known = np.isfinite(sample[["X", "Y", "yaw"]].to_numpy(np.float64)).all(axis=1) & (waypoint >= 0)
+    sample, waypoint = sample[known], waypoint[known]
+    if not len(sample):
         return None
+    points = sample[["X", "Y"]].to_numpy(np.float64)
     length_m = float(sample["track_len"].median())
-    named = find_world(logged)
-    numbered = [one.name for one in recognise(points, waypoint)]
-    # Courses of the same shape differ in their floors only, so the first one will do.
-    for name in dict.fromkeys([*([named] if named else []), *numbered, *worlds()]):
+    away_m: dict[str, float] = {}
+    for one in recognise(points, waypoint):
+        away_m.setdefault(one.name, one.distance_m)
+    named, car = find_world(logged), compose_option("car", "deepracer", CarConfig)
+    ranked: list[tuple[tuple[bool, float, bool, float], _Recognised]] = []
+    for name in worlds():
         steps_m = np.linalg.norm(np.diff(world_rows(name)[:, :2], axis=0), axis=1)
-        if abs(steps_m.sum() - length_m) > _LENGTH_NEAR * length_m:
+        if abs(steps_m.sum() - length_m) > _LENGTH_NEAR * length_m or not _inside(world_track(name), points):
             continue
-        if _inside(world_track(name), points):
-            return name
-    return None
+        share = _misjudged(world_track(name), sample, car)
+        rank = share > _MISJUDGED, round(away_m.get(name, NEAR_M), 3), name != named, share
+        ranked.append((rank, _Recognised(name, share)))
+    # Of equals, which differ in their floors only, the first one will do.
+    return min(ranked, key=lambda one: one[0])[1] if ranked else None
+
+
+def _misjudged(track: Track, sample: pd.DataFrame, car: CarConfig) -> float:
+    """Return the share of rows whose `all_wheels_on_track` is not what a course's borders say."""
+    on_road = recorded_wheels_on_road(Tracks([track]), np.zeros(1, np.intp), sample, car)
+    return float(np.mean(on_road.all(axis=1) != sample["all_wheels_on_track"].to_numpy(bool)))
+
+
+def recorded_wheels_on_road(
+    tracks: Tracks, track_index: TrackIndex, steps: pd.DataFrame, car: CarConfig
+) -> NDArray[np.bool_]:
+    """Return which wheels of a recorded car were on the road, (n, 4), rebuilt from X, Y and yaw.
+
+    Args:
+        tracks: the courses.
+        track_index: index of each row's course in them, as `Tracks.on_road` takes them.
+        steps: rows with finite X, Y and yaw, (n,).
+        car: with the positions of its wheels and front.
+    """
+    # Recorded poses are of the front point; wheels are measured from the chassis origin.
+    wheels_m = np.array(car.wheel_points_m) - [car.front_point_m, 0.0]
+    x_m, y_m, yaw_deg = steps[["X", "Y", "yaw"]].to_numpy(np.float64).T
+    return wheels_on_road(tracks, track_index, x_m, y_m, np.radians(yaw_deg), wheels_m)
+
+
+def _of_another_width(logged: str, world: _Recognised) -> str:
+    who = f"track {logged!r}" if logged else "the track, which the log does not name,"
+    return (
+        f"{who} has the shape of {world.name} but not its width: {world.misjudged:.0%} of the rows have wheels on the "
+        "other side of its borders; `--track ROUTE` takes the file of its route (.npy)"
+    )
 
 
 def _inside(track: Track, points: NDArray[np.float64]) -> bool:

@@ -8,11 +8,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.tracks.track import Track, Tracks
 
-from .log_course import progress_along
+from .log_course import progress_along, recorded_wheels_on_road
 
 Ids = NDArray[np.intp]
 
@@ -82,7 +81,7 @@ class RecordedParams:
             "track_width": width_m,
             "closest_waypoints": np.column_stack([at.previous, at.next]),
             "is_left_of_center": is_left,
-            "is_offtrack": self._off_track(part, front, track_index),
+            "is_offtrack": self._off_track(part, track_index),
             "sim_time": part["tstamp"].to_numpy(np.float64),
         }
 
@@ -92,18 +91,12 @@ class RecordedParams:
         for row, index in zip(columns, self.track_index[chosen].tolist(), strict=True):
             yield scalar_params(row, self.track_params[index])
 
-    def _off_track(
-        self, part: pd.DataFrame, front: NDArray[np.float64], track_index: Ids
-    ) -> NDArray[np.bool_]:
+    def _off_track(self, part: pd.DataFrame, track_index: Ids) -> NDArray[np.bool_]:
         status = part["episode_status"].astype("category")
         off = np.array([_DECIDED.get(word, -1) for word in status.cat.categories] + [-1])[status.cat.codes]
         open_ = np.flatnonzero(off < 0)
         if len(open_):
-            yaw_rad = np.radians(part["yaw"].to_numpy(np.float64)[open_])
-            # Recorded poses are of the front point; wheels are measured from the chassis origin.
-            wheels_m = np.array(self._car.wheel_points_m) - [self._car.front_point_m, 0.0]
-            x_m, y_m = front[open_].T
-            on_road = wheels_on_road(self._tracks, track_index[open_], x_m, y_m, yaw_rad, wheels_m)
+            on_road = recorded_wheels_on_road(self._tracks, track_index[open_], part.iloc[open_], self._car)
             off[open_] = ~on_road.any(axis=1)
         return off.astype(bool)
 

@@ -1,7 +1,8 @@
-"""The 127 worlds of the DeepRacer service.
+"""The worlds of the DeepRacer service, today's 127 and seven of earlier years.
 
-`worlds.zip` holds their names and their routes: the coordinates of deepracer-simapp (Apache-2.0), rounded to 0.1 mm.
-Every world has the rows of its own file in their order, so that waypoints have the numbers they have in the service.
+`worlds.zip` holds their names and their routes: the coordinates of deepracer-simapp (Apache-2.0) and, of the earlier
+ones, deepracer-analysis (MIT-0), rounded to 0.1 mm. Every world has the rows of its own file in their order, so that
+waypoints have the numbers they have in the service.
 `python -m benchmarks.build_catalogue` writes it; `tracks.track.world_track` builds a course from it.
 """
 

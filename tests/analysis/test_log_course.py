@@ -12,6 +12,7 @@ from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.errors import BadInput
 
@@ -32,6 +33,74 @@ def renamed(recording: Recording, name: str) -> Recording:
 def test_a_course_is_found_by_its_name_or_by_where_the_car_drove(name: str) -> None:
     tracks, problems = find_courses(renamed(made_up_recording([Drive()]), name))
     assert (tracks[name].name, problems) == ("reinvent_base", ())
+
+
+@pytest.mark.parametrize(
+    ("world", "logged"),
+    [
+        ("2022_reinvent_champ", "2022_reinvent_champ"),
+        ("2022_reinvent_champ", ""),
+        ("2022_reinvent_champ_ccw", ""),
+        ("Canada_Eval", ""),
+        ("Mexico_track_eval", "Mexico_track_eval"),
+        # Until 2020 the service called it that.
+        ("reinvent_base_2019", "reinvent_base"),
+        ("reinvent_base_2019", ""),
+        ("reinvent_wood", "reinvent_wood"),
+    ],
+)
+def test_a_world_is_recognised_with_its_own_waypoint_numbers(world: str, logged: str) -> None:
+    recording = renamed(made_up_recording([Drive(), Drive(start=0.4)], course=world), logged)
+    tracks, problems = find_courses(recording)
+    assert (tracks[logged].name, problems) == (world, ())
+    # Both waypoints around the car would do for a world with as many waypoints elsewhere.
+    found = tracks[logged].project(recording.steps[["X", "Y"]].to_numpy())
+    assert (np.isin(recording.steps["closest_waypoint"], (found.previous, found.next))).all()
+
+
+ALL_AROUND = [Drive(offset_m=side) for side in (-0.34, -0.2, 0.0, 0.2, 0.34)]
+
+
+@pytest.mark.parametrize("name", ["", "2024_reinvent_champ"])
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("world", ["2024_reinvent_champ_ccw", "2022_summit_speedway_ccw"])
+def test_a_world_recognised_by_its_shape_has_the_borders_of_the_log(
+    world: str, every: int, name: str
+) -> None:
+    """The two have one centre line; with every second number neither has the log's waypoints."""
+    recording = renamed(made_up_recording(ALL_AROUND, course=world), name)
+    steps = recording.steps.assign(closest_waypoint=recording.steps["closest_waypoint"] // every)
+    tracks, problems = find_courses(replace(recording, steps=steps))
+    assert tracks[name].width_m == pytest.approx(catalogue_track(world).width_m, abs=1e-3)
+    assert problems == ()
+
+
+def test_a_course_as_wide_as_no_world_of_its_shape_is_reported() -> None:
+    recording = renamed(made_up_recording(ALL_AROUND, course="Vegas_track"), "")
+    narrow = (
+        np.abs(catalogue_track("Vegas_track").project(recording.steps[["X", "Y"]].to_numpy()).offset_m) < 0.3
+    )
+    tracks, problems = find_courses(
+        replace(recording, steps=recording.steps.assign(all_wheels_on_track=narrow))
+    )
+    assert tracks[""].name == "Vegas_track"
+    assert "has the shape of Vegas_track but not its width: 4" in problems[0].reason
+
+
+@pytest.mark.parametrize(
+    ("file", "world"),
+    [
+        ("console_v5_baseline.tar.gz", "2022_reinvent_champ_ccw"),
+        ("console_v5_v3.tar.gz", "Spain_track"),
+        ("droa_v6_continuous.tar.gz", "reInvent2019_wide_cw"),
+        ("drfc_v5_2022_june_pro.log.gz", "2022_june_pro"),
+    ],
+)
+def test_a_recording_of_the_service_has_the_borders_of_its_world(
+    reference: Path, file: str, world: str
+) -> None:
+    tracks, problems = find_courses(renamed(read_recording(reference / "race_pace" / file), ""))
+    assert (tracks[""].name, problems) == (world, ())
 
 
 def test_a_course_driven_against_its_waypoints_is_turned_around() -> None:
@@ -55,7 +124,7 @@ def elsewhere(recording: Recording) -> Recording:
 def test_an_unknown_course_is_reported_and_drawn_from_the_recorded_positions() -> None:
     around = elsewhere(made_up_recording([Drive(offset_m=side) for side in (-0.2, 0.0, 0.2)]))
     (problem,) = find_courses(around)[1]
-    assert "'moon' is none of the service's 127 worlds (17.709 m long)" in problem.reason
+    assert "'moon' is none of the service's 134 worlds (17.709 m long)" in problem.reason
     assert "`--track ROUTE` takes the file of its route (.npy)" in problem.reason
     view, known = prepare(around), made_up_course()
     assert "drawn from recorded positions" in view.course.title

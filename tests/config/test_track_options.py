@@ -58,7 +58,7 @@ def test_every_official_name_is_understood_in_any_case():
 def test_an_official_name_is_a_track_of_several_and_of_a_sweep():
     assert list(tracks("track=[Ace Speedway,2022 re:Invent Championship]")) == [
         "2022_april_open",
-        "2022_reinvent_champ_ccw",
+        "2022_reinvent_champ",
     ]
     lines = expand_grid(["track=Oval_track,Ace Speedway"])
     assert [compose_experiment(line)[0].track.name for line in lines] == ["Oval_track", "2022_april_open"]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import shapely
 
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.deepracer.routes import is_first_of_equals, read_route, recognise, world_rows
@@ -64,8 +65,10 @@ def test_every_world_makes_a_course_with_all_its_rows(name):
     found = track.project(track.waypoints)
     assert np.isfinite(found.heading_rad).all()
     assert (np.diff(found.ndist[:-1]) >= 0).all()
-    assert track.road.geom_type == "Polygon"
-    assert len(track.road.interiors) == track.closed
+    # Where a border crosses itself within a millimetre, there are tiny further polygons and holes.
+    road = max(shapely.get_parts(track.road), key=shapely.area)
+    assert sum(shapely.area(shapely.Polygon(hole)) > 0.01 for hole in road.interiors) == track.closed
+    assert track.road.area - road.area < 1e-4
     assert track.on_road(track.points_at(np.linspace(0.001, 0.999, 1000))).all()
 
 
@@ -92,7 +95,7 @@ def test_a_world_has_the_coordinates_of_its_route_file(reference, name):
 
 def test_variants_stand_beside_the_world_they_are_of():
     families = [world.family for world in worlds().values()]
-    assert (len(families), len(leaders())) == (127, 63)
+    assert (len(families), len(leaders())) == (134, 68)
     assert sorted(families) == families
     assert leaders()[-3:] == ("reinvent_base", "thunder_hill_open", "thunder_hill_pro")
 
@@ -104,7 +107,8 @@ def test_variants_stand_beside_the_world_they_are_of():
         ("REINVENT_BASE", "reinvent_base"),
         ("arn:aws:deepracer:us-east-1::track/Spain_track", "Spain_track"),
         ("re:Invent 2018", "reinvent_base"),
-        ("2022 re:Invent Championship", "2022_reinvent_champ_ccw"),
+        ("2022 re:Invent Championship", "2022_reinvent_champ"),
+        ("Shanghai Sudu", "China_eval_track"),
         ("European Seaside Circuit - Buildings", "Monaco_building"),
         ("moon", None),
         ("", None),
@@ -115,5 +119,5 @@ def test_a_world_goes_by_its_name_and_by_its_official_one(called, name):
 
 
 def test_an_unknown_world_is_refused_in_one_line():
-    with pytest.raises(BadInput, match=r"^Oval: no such world \(did you mean Oval_track\?\); .* all 127$"):
+    with pytest.raises(BadInput, match=r"^Oval: no such world \(did you mean Oval_track\?\); .* all 134$"):
         world_track("Oval")

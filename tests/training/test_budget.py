@@ -77,7 +77,7 @@ def test_minutes_and_costs_are_summed_at_each_runs_own_price(run):
     assert minutes.used(0, 0, 300.0) == ("experiment_minutes", 0.5)
 
 
-@pytest.mark.parametrize("tracks", [0, 127], ids=["one track", "every track of the catalogue"])
+@pytest.mark.parametrize("tracks", [0, 134], ids=["one track", "every track of the catalogue"])
 def test_a_run_that_continues_or_was_killed_counts_with_its_last_whole_row_however_long(run, tracks):
     columns = {f"{metric}/{number:080d}": 100 / 3 for metric in TRACK_METRICS for number in range(tracks)}
     sibling(run, "continues", ended=False, env_steps=500, **columns)
