@@ -25,6 +25,8 @@ from .reward_replay import ReplayedRewards
 
 MOST_FILES = 400
 _BESIDE, _PAID = "Generations, runs and tracks", "What the reward pays for"
+_PICTURE = "lap_line"
+"""The figure beside the outcome."""
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "How it learned": (
         *(training.training_progress, training.learning_vs_lap_time, training.evaluations),
@@ -60,6 +62,13 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "The course": (driving_line.waypoint_map,),
 }
 """The figures of a recording without a training."""
+FIRST = (
+    *("replayed_laps", "runs_compared", "lap_line", "training_progress", "evaluations", "lap_time_histogram"),
+    *("sector_times", "speed_steering_by_waypoint", "off_track_risk", "racing_line", "reward_by_waypoint"),
+)
+"""Names of the figures that matter most: those that were asked for, then the result, then where time is lost."""
+MOST_FIRST = 6
+"""Figures that are open when the page is opened; the others are folded."""
 
 
 @dataclass(frozen=True)
@@ -119,25 +128,31 @@ def html(page: LogPage) -> str:
     view, recording = page.view, page.view.recording
     sections = draw_sections(page)
     plots = {chart.name: plot_of(chart) for some in sections.values() for chart in some}
-    outcome_rows, steps = _first_screen(page)
+    ranked = sorted(plots, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
+    first = ranked[:MOST_FIRST]
+    shown = {"The most important figures": [name for name in first if name != _PICTURE]}
+    for title, some in sections.items():
+        shown[title] = [chart.name for chart in some if chart.name not in first]
+    title, outcome_rows, steps = _first_screen(page)
     files = [readable(str(file)) for file in recording.files]
     settings = sorted((recording.hyperparameters or {}).items())
     return render(
         __package__,
         "log_report.html.j2",
         list(plots.values()),
+        title=title,
         name=view.name,
         headline=headline(view),
         outcome=outcome_rows,
         steps=steps,
-        picture=plots.get("lap_line"),
+        picture=plots[_PICTURE] if _PICTURE in first else None,
         findings=[_finding(one, plots) for one in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
         replay=page.replay,
         candidates=candidate_rows(view),
         laps=best_laps(view),
         strip=page.strip,
-        sections=[(title, [plots[chart.name] for chart in some]) for title, some in sections.items()],
+        sections=[(title, [plots[name] for name in names]) for title, names in shown.items() if names],
         captions={chart.name: chart.caption for some in sections.values() for chart in some},
         iterations=iteration_rows(view),
         facts=facts(view),
@@ -150,19 +165,22 @@ def html(page: LogPage) -> str:
     )
 
 
-def _first_screen(page: LogPage) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """Return the result of a training in names and values, and the next steps: commands, each with what it does.
+def _first_screen(page: LogPage) -> tuple[str, list[tuple[str, str]], list[tuple[str, str]]]:
+    """Return the title, the result in names and values, and the next steps: commands, each with what it does.
 
-    Our commands do not take checkpoints of the service: the next step with those is to submit one of them.
+    The title is the experiment's name, of a log that of its file. Our commands do not take checkpoints of the service:
+    the next step with those is to submit one of them.
     """
     folder = run_folder(page.view)
     try:
         run = read_head(folder) if folder is not None else None
         if run is not None:
-            return outcome(run), next_steps(run.path, run.summary) if run.summary else []
+            steps = next_steps(run.path, run.summary) if run.summary else []
+            return str(run.config.get("name") or page.view.name), outcome(run), steps
     except BadInput:
         pass  # the page lists which files could not be read
-    return facts(page.view), [("", one.sentence) for one in page.findings if one.rule == "submit"]
+    submit = [("", one.sentence) for one in page.findings if one.rule == "submit"]
+    return page.view.name, facts(page.view), submit
 
 
 def _finding(one: Finding, plots: Mapping[str, Plot]) -> dict[str, Any]:

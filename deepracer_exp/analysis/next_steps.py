@@ -36,7 +36,7 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
             for name, value, form in known
             if value is not None
         ]
-        found.append(("Evaluated, the best", f"checkpoint {result.iteration:06d}"))
+        found.append(("Best checkpoint", f"{result.iteration:06d}"))
     elif run.summary:
         found.append(("Evaluated", "never"))
     ended = (

@@ -31,13 +31,18 @@
         toImageButtonOptions: { filename: box.dataset.plot, scale: 2 },
       });
       box.dataset.state = "drawn";
+      box.dispatchEvent(new Event("drawn"));
     } catch (error) {
       box.dataset.state = "failed";
       box.textContent = `This figure could not be drawn: ${error}`;
       throw error;
     }
   };
-  const again = () => boxes.filter((box) => box.dataset.state === "drawn").forEach((box) => draw(box));
+  // A folded figure has no width: it is drawn when it comes into sight.
+  const again = () => boxes.filter((box) => box.dataset.state === "drawn").forEach((box) => {
+    if (box.checkVisibility()) draw(box);
+    else delete box.dataset.state;
+  });
   const watch = () => {
     const inSight = new IntersectionObserver(
       (entries) => entries.filter((one) => one.isIntersecting).forEach((one) => one.target.dataset.state || draw(one.target)),
@@ -61,7 +66,8 @@
         const script = document.createElement("script");
         script.textContent = source;
         document.head.append(script);
-        boxes.filter((box) => box.getBoundingClientRect().top < innerHeight).forEach((box) => draw(box));
+        boxes.filter((box) => box.checkVisibility() && box.getBoundingClientRect().top < innerHeight)
+          .forEach((box) => draw(box));
         watch();
       })
       .finally(() => { frame.contentDocument.close(); frame.remove(); });
@@ -85,6 +91,18 @@
   parts.forEach((part) => part.addEventListener("toggle", () => {
     history.replaceState({ open: parts.map((one) => one.open) }, "");
   }));
+
+  // A link leads into what is folded, too.
+  const unfoldAround = (hash) => {
+    for (let one = document.getElementById(hash.slice(1)); one; one = one.parentElement) {
+      if (one.localName === "details") one.open = true;
+    }
+  };
+  unfoldAround(location.hash);
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest('a[href^="#"]');
+    if (link) unfoldAround(link.hash);
+  });
 
   const contents = document.querySelector(".contents > details"), desk = matchMedia("(min-width: 1081px)");
   const unfold = () => { contents.open = desk.matches; };

@@ -88,7 +88,14 @@ def packed(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode("ascii")
 
 
-def render(package: str, template: str, plots: Sequence[Plot], is_live: bool = False, **values: Any) -> str:
+def render(
+    package: str,
+    template: str,
+    plots: Sequence[Plot],
+    is_live: bool = False,
+    scripts: Sequence[str] = (),
+    **values: Any,
+) -> str:
     """Return a page that extends `page.html.j2`; all values are escaped, and it can load nothing.
 
     A live page alone may ask its own server for `version`, and is loaded again when that has changed.
@@ -98,6 +105,7 @@ def render(package: str, template: str, plots: Sequence[Plot], is_live: bool = F
         template: its file; its sections are the macro `part`, which enters them into `contents`.
         plots: all figures of the page.
         is_live: it is served, with its version in the block `version`.
+        scripts: files beside the template that the page runs after its own.
         values: for the template.
     """
     environment = jinja2.Environment(
@@ -111,14 +119,15 @@ def render(package: str, template: str, plots: Sequence[Plot], is_live: bool = F
     )
     # The colour of a figure for CSS.
     environment.filters["themed"] = lambda color: f"light-dark({color}, {DARK.get(color.lower(), color)})"
-    script = (files(__package__) / "page.js").read_text(encoding="utf-8")
+    own = [(__package__, "page.js"), *((package, name) for name in scripts)]
+    texts = [(files(place) / name).read_text(encoding="utf-8") for place, name in own]
     return environment.get_template(template).render(
-        policy=_policy(script, get_plotlyjs()) + ("; connect-src 'self'" if is_live else ""),
+        policy=_policy(*texts, get_plotlyjs()) + ("; connect-src 'self'" if is_live else ""),
         contents=[],
         plots=plots,
         dark=Markup(json.dumps(DARK)),  # our own colours
         plotly=_packed_plotly() if plots else "",
-        script=Markup(script),  # our own file
+        scripts=[Markup(text) for text in texts],  # our own files
         **values,
     )
 

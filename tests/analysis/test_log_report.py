@@ -58,12 +58,12 @@ def html(path) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def test_the_page_begins_with_the_findings_and_each_leads_to_a_figure_that_is_there(html, view):
+def test_the_page_begins_with_outcome_and_findings_and_each_leads_to_a_figure_that_is_there(html, view):
     read = Html(html)
     found = findings(view)
     order = [read.text.rindex(" ".join(one.sentence.split())) for one in found]
     assert order == sorted(order)
-    assert next(name for name in read.ids if not name.startswith("figure")) == "findings"
+    assert [name for name in read.ids if not name.startswith("figure")][:2] == ["outcome", "findings"]
     assert order[-1] < read.text.rindex("Candidates for submission")
     assert set(read.links) <= set(read.ids)
     assert {f"figure-{one.figure}" for one in found} <= set(read.ids)
@@ -147,12 +147,31 @@ def test_the_policy_of_the_page_refuses_scripts_and_addresses(path, tab):
     assert tab.evaluate("fetch('data:,x').then(() => 'sent', () => 'refused')") == "refused"
 
 
+VISIBLE = "[...document.querySelectorAll('[data-plot]')].filter(box => box.checkVisibility())"
+
+
 @needs_chromium
 def test_figures_are_drawn_when_they_come_into_sight(path, tab):
     tab.open(path, height=500)
-    assert tab.evaluate("document.querySelector('[data-plot=waypoint_map]').dataset.state === undefined")
-    tab.evaluate("document.querySelector('[data-plot=waypoint_map]').scrollIntoView()")
-    tab.wait_for("document.querySelector('[data-plot=waypoint_map]').dataset.state === 'drawn'")
+    box = f"{VISIBLE}.at(-1)"
+    assert tab.evaluate(f"{box}.dataset.state === undefined")
+    tab.evaluate(f"{box}.scrollIntoView()")
+    tab.wait_for(f"{box}.dataset.state === 'drawn'")
+
+
+@needs_chromium
+def test_six_figures_are_open_and_the_others_are_drawn_to_size_when_unfolded(path, html, tab):
+    assert html.count("data-plot=") == len(set(re.findall(r'data-plot="(\w+)"', html))) > 20
+    tab.open(path)
+    assert tab.evaluate(f"{VISIBLE}.length") == 6
+    assert tab.evaluate("document.documentElement.scrollHeight") < 8_000
+    tab.draw_all()  # printing draws what is folded as wide as a sheet
+    box = "document.querySelector('[data-plot=waypoint_map]')"
+    assert tab.evaluate(f"!{box}.checkVisibility()")
+    tab.prefer("dark")
+    tab.evaluate("document.querySelector('a[href=\"#figure-waypoint_map\"]').click()")
+    tab.wait_for(f"{box}.checkVisibility() && {box}.layout.paper_bgcolor !== '#ffffff'")
+    tab.wait_for(f"{box}.layout.width === {box}.clientWidth && {box}.clientHeight === {box}.layout.height")
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,10 @@ def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_
     printed = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]
     assert len(printed) >= 3
     assert all(" ".join(line.split()) in text for line in printed)
-    assert 'id="figure-reward_terms"' in (run_dir / "report.html").read_text()
+    page = (run_dir / "report.html").read_text()
+    assert 'id="figure-reward_terms"' in page
+    assert "<h1>tiny</h1>" in page
+    assert f"<title>tiny: {run_dir.name}</title>" in page
 
 
 def test_simulated_laps_stand_beside_those_of_logs(run_dir, call, tmp_path):

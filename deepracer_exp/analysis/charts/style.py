@@ -12,8 +12,15 @@ INK, FAINT, PALE, PAPER = "#22262b", "#6b727d", "#b9bfc8", "#ffffff"
 ROAD_FILL, ROAD_EDGE, ROAD_CENTER, GRID, SPINE = "#e6e9ed", "#8d949e", "#a9b0b9", "#e9ecef", "#cdd2d8"
 VEIL = "rgba(255,255,255,0.7)"
 """Behind text that stands on data."""
-DIVERGING = "PuOr"
-"""Readers who do not see red or green can distinguish its ends."""
+DIVERGING = (
+    *("#7f3b08", "#b35806", "#e08214", "#fdb863", "#f7f7f7"),
+    *("#b2abd2", "#8073ac", "#542788", "#2d004b"),
+)
+"""PuOr (ColorBrewer): readers who do not see red or green can distinguish its ends."""
+_DARK_DIVERGING = (
+    *("#ffb45c", "#e0893a", "#a8632b", "#6b4a35", "#3a3f46"),
+    *("#57507f", "#7d70c0", "#a394ea", "#cabfff"),
+)
 SCALE = (
     *("#440154", "#482878", "#3e4a89", "#31688e", "#26828e"),
     *("#1f9e89", "#35b779", "#6dcd59", "#b4de2c", "#dde318"),
@@ -40,6 +47,7 @@ DARK = {
     "#882255": "#c25586",
     "#332288": "#8a7ae6",
     **dict(zip(SCALE, _DARK_SCALE, strict=True)),
+    **dict(zip(DIVERGING, _DARK_DIVERGING, strict=True)),
 }
 """Replacements for the colours of a figure on a dark page; all others can be seen on both."""
 WIDTH, NARROW_WIDTH = 1040.0, 400.0
