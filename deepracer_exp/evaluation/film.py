@@ -1,9 +1,9 @@
-"""A lap of an evaluation, recorded step by step, and the encoder of its film."""
+"""A lap of an evaluation, recorded step by step, its poses between the steps, and the encoder of its film."""
 
 import io
 from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from .evaluator import Evaluator
 from .race_protocol import Attempt, RaceProtocol
 from .result import USUAL, Evaluation
 
+FRAMES_PER_S = 30.0
 _LINGER_S = 1.0
 """The last frame is shown this long."""
 _COLUMNS = [PACKED[name] for name in ("X", "Y", "yaw", "steer", "speed_mps", "progress")]
@@ -44,7 +45,7 @@ class Lap:
     steering_rad: NDArray[np.float64]
     speed_mps: NDArray[np.float64]
     progress: NDArray[np.float64]
-    """Per cent."""
+    """Per cent of this lap."""
     time_s: NDArray[np.float64]
     """Since its start, penalties included."""
 
@@ -53,8 +54,33 @@ class Lap:
 
     def share(self, step: int) -> float:
         """Return the share of the lap driven before a step."""
-        # A flying lap starts with the last pose of the previous one, which has that lap's progress.
-        return float(np.clip(self.progress[step] / 100, 0.0, 1.0)) if self.time_s[step] > 0 else 0.0
+        return float(np.clip(self.progress[step] / 100, 0.0, 1.0))
+
+
+def in_frames(lap: Lap, control_hz: float) -> tuple[Lap, NDArray[np.intp]]:
+    """Return a lap's poses `FRAMES_PER_S` times a second, between those of its steps, and the step before each.
+
+    `control_hz` is how many steps the lap has in a second. Where the car was put back onto the track it does not drive.
+    """
+    at = np.append(np.arange(0.0, len(lap) - 1, control_hz / FRAMES_PER_S), len(lap) - 1)
+    step = at.astype(np.intp)
+    after = np.minimum(step + 1, len(lap) - 1)
+    part = np.where(lap.time_s[after] - lap.time_s[step] > 1.5 / control_hz, 0.0, at - step)
+
+    def between(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values[step] + part * (values[after] - values[step])
+
+    shown = replace(
+        lap,
+        x_m=between(lap.x_m),
+        y_m=between(lap.y_m),
+        yaw_rad=between(np.unwrap(lap.yaw_rad)),
+        steering_rad=between(lap.steering_rad),
+        speed_mps=between(lap.speed_mps),
+        progress=between(lap.progress),
+        time_s=between(lap.time_s),
+    )
+    return shown, step
 
 
 class LapRecorder:
@@ -104,6 +130,7 @@ class LapRecorder:
         track = setup.courses[trial.course].tracks[0]
         _, rows = self.rows(attempt)
         x_m, y_m, yaw_deg, steering_deg, speed_mps, progress = rows[:, _COLUMNS].T
+        time_s = rows[:, -1] - attempt.begin_s
         return Lap(
             attempt=attempt,
             track=track,
@@ -113,8 +140,9 @@ class LapRecorder:
             yaw_rad=np.radians(yaw_deg),
             steering_rad=np.radians(steering_deg),
             speed_mps=speed_mps,
-            progress=progress,
-            time_s=rows[:, -1] - attempt.begin_s,
+            # A flying lap starts with the last pose of the one before, which has that lap's progress.
+            progress=np.where(time_s > 0, progress, 0.0),
+            time_s=time_s,
         )
 
 
@@ -150,10 +178,9 @@ def write_film(
     frames: Iterable[NDArray[np.uint8]],
     count: int,
     size: tuple[int, int],
-    frames_per_s: float,
     err: Console,
 ) -> None:
-    """Encode `count` frames, (height, width, 3), as an .mp4; the last one is shown for a second.
+    """Encode `count` frames, (height, width, 3), as an .mp4 of `FRAMES_PER_S`; the last one is shown for a second.
 
     `size` is their width and height, multiples of 16 as video codecs want them.
 
@@ -162,12 +189,12 @@ def write_film(
     """
     from imageio_ffmpeg import write_frames  # not everything that records laps films them
 
-    writer = write_frames(str(file), size, fps=frames_per_s, quality=8, macro_block_size=16)
+    writer = write_frames(str(file), size, fps=FRAMES_PER_S, quality=8, macro_block_size=16)
     with writing(file, failure=RunFailed), closing(writer):
         writer.send(None)
         for frame in with_progress(frames, "rendering", count, console=err, transient=True):
             writer.send(frame)
-        for _ in range(round(_LINGER_S * frames_per_s)):
+        for _ in range(round(_LINGER_S * FRAMES_PER_S)):
             writer.send(frame)
 
 

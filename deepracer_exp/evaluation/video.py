@@ -15,7 +15,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
 from deepracer_exp.tracks.track import Track
 
-from .film import Lap, png, write_film
+from .film import FRAMES_PER_S, Lap, in_frames, png, write_film
 
 View = Literal["chase", "top"]
 
@@ -29,12 +29,12 @@ _HEAD = 0.2
 _BORDER_M, _DASH_M, _DASH_WIDTH_M = 0.05, 0.15, 0.025
 _DASH_COLOR = "#f5a623"
 _MARK_RGBA = (1.0, 0.75, 0.0, 0.55)
-_SMOOTHING = 0.25
-"""Share of a heading change that the chase camera follows per step."""
+_SMOOTHING = 0.13
+"""Share of a heading change that the chase camera follows per frame."""
 
 
 def render_lap(lap: Lap, car: CarConfig, view: View) -> Iterator[NDArray[np.uint8]]:
-    """Render the steps of a lap with MuJoCo, (HEIGHT, WIDTH, 3) each; poses are given, nothing is simulated."""
+    """Render a lap in frames with MuJoCo, (HEIGHT, WIDTH, 3) each; poses are given, nothing is simulated."""
     model, camera = _build(lap.track, car, view), mujoco.MjvCamera()
     data = mujoco.MjData(model)
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -49,7 +49,7 @@ def render_lap(lap: Lap, car: CarConfig, view: View) -> Iterator[NDArray[np.uint
     # Recorded poses are of the front point; the joints move the centre of mass.
     to_com_m = car.com_x_m - car.front_point_m
     com_x_m, com_y_m = lap.x_m + to_com_m * np.cos(lap.yaw_rad), lap.y_m + to_com_m * np.sin(lap.yaw_rad)
-    turned_rad = np.cumsum(lap.speed_mps) / car.control_hz / car.wheel_radius_m
+    turned_rad = np.cumsum(lap.speed_mps) / FRAMES_PER_S / car.wheel_radius_m
     azimuth_rad = float(lap.yaw_rad[0])
     with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
         for at, yaw_rad in enumerate(lap.yaw_rad.tolist()):
@@ -165,8 +165,9 @@ def write_video(file: Path, view: View, lap: Lap, car: CarConfig, err: Console) 
     Raises:
         RunFailed: the file cannot be written.
     """
-    frames = (_overlay(picture, lap, at) for at, picture in enumerate(render_lap(lap, car, view)))
-    write_film(file, frames, len(lap), (WIDTH, HEIGHT), car.control_hz, err)
+    shown, _ = in_frames(lap, car.control_hz)
+    frames = (_overlay(picture, shown, at) for at, picture in enumerate(render_lap(shown, car, view)))
+    write_film(file, frames, len(shown), (WIDTH, HEIGHT), err)
 
 
 def _overlay(picture: NDArray[np.uint8], lap: Lap, at: int) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
 """The command `watch`: a film of what a policy sees, where it looks, what it decides and where it drives."""
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from deepracer_exp.analysis.charts.run_pictures import SPEED
+from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig, LidarConfig, ObservationConfig
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
@@ -25,7 +27,7 @@ from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 
 from .evaluator import Evaluator
-from .film import Lap, drive_best_lap, write_film
+from .film import Lap, drive_best_lap, in_frames, write_film
 from .sight import degrees, picture_of, saliency, under_heat
 from .video import draw_track, extent
 
@@ -39,7 +41,7 @@ _FINER = 2
 
 
 class Frames:
-    """Draws the frames of a lap.
+    """Draws the frames of a lap: the car moves in each, what it saw and decided changes with its steps.
 
     On the left what the cameras see, enlarged without smoothing, and below it the same under its saliency, each frame
     scaled to its own highest value; on the right the view from above, with the rays of a LIDAR that hit something, and
@@ -53,14 +55,11 @@ class Frames:
         policy: nn.Module,
         actions: ActionSpace,
         observation: ObservationConfig,
-        front_point_m: float,
+        car: CarConfig,
     ) -> None:
-        """Draw what stays the same.
-
-        `acted` is what the policy read and wrote in the n steps of the lap, [n]; `front_point_m` that of the car,
-        ahead of its origin.
-        """
-        self._lap, self._acted, self._policy, self._camera = lap, acted, policy, observation.camera
+        """Draw what stays the same; `acted` is what the policy read and wrote in the n steps of the lap, [n]."""
+        self._shown, self._step = in_frames(lap, car.control_hz)
+        self._acted, self._policy, self._camera = acted, policy, observation.camera
         self._left = 0 if self._camera is None else _EYE[0]
         self._decision: _Probabilities | _Distribution = (
             _Probabilities(actions, acted["logits"].softmax(-1).numpy(), WIDTH - self._left)
@@ -68,21 +67,23 @@ class Frames:
             else _Distribution(actions.low, actions.high, WIDTH - self._left)
         )
         lidar, room = observation.lidar, (WIDTH - self._left, HEIGHT - _BOARD_HEIGHT - _ACTIONS_HEIGHT)
-        seen = None if lidar is None else rays(lap, acted["lidar"].numpy(), lidar, front_point_m)
-        self._map = _Map(lap, room, seen)
+        seen = None if lidar is None else rays(lap, acted["lidar"].numpy(), lidar, car.front_point_m)
+        self._map = _Map(self._shown, room, seen)
+
+    def __len__(self) -> int:
+        return len(self._shown)
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
-        for at in range(len(self._lap)):
-            yield self._frame(at)
-
-    def _frame(self, at: int) -> NDArray[np.uint8]:
-        frame = Image.new("RGB", (WIDTH, HEIGHT), _PAGE)
-        if self._camera is not None:
-            self._draw_sight(frame, self._acted[at], self._camera)
-        frame.paste(_board(self._lap, at, WIDTH - self._left), (self._left, 0))
-        frame.paste(self._map.draw(at), (self._left, _BOARD_HEIGHT))
-        frame.paste(self._decision.draw(at, self._acted[at]), (self._left, HEIGHT - _ACTIONS_HEIGHT))
-        return np.asarray(frame)
+        for step, frames in itertools.groupby(range(len(self)), self._step.__getitem__):
+            still = Image.new("RGB", (WIDTH, HEIGHT), _PAGE)
+            if self._camera is not None:
+                self._draw_sight(still, self._acted[step], self._camera)
+            still.paste(self._decision.draw(step, self._acted[step]), (self._left, HEIGHT - _ACTIONS_HEIGHT))
+            for at in frames:
+                frame = still.copy()
+                frame.paste(_board(self._shown, at, WIDTH - self._left), (self._left, 0))
+                frame.paste(self._map.draw(at, step), (self._left, _BOARD_HEIGHT))
+                yield np.asarray(frame)
 
     def _draw_sight(self, frame: Image.Image, acted: TensorDict, camera: CameraConfig) -> None:
         picture = picture_of(acted, camera)
@@ -151,6 +152,7 @@ class _Map:
     """The track from above with the driven line, coloured by speed, the car and what its LIDAR reads."""
 
     def __init__(self, lap: Lap, size: tuple[int, int], rays: NDArray[np.float64] | None) -> None:
+        """Draw the track; the lap is in frames, the rays in steps."""
         low, high = extent(lap.track)
         scale = float(np.min(np.array(size) / (high - low)))
         road = draw_track(lap.track, _FINER * scale)
@@ -167,17 +169,17 @@ class _Map:
         self._colors = [tuple(color) for color in (255 * SPEED(shares)[:, :3]).astype(int).tolist()]
         self._drawn = 0
 
-    def draw(self, at: int) -> Image.Image:
-        """Return the view at a step; steps are drawn in their order."""
+    def draw(self, at: int, step: int) -> Image.Image:
+        """Return the view of a frame after a step; frames are drawn in their order."""
         pen = ImageDraw.Draw(self._canvas)
-        for step in range(self._drawn + 1, at + 1):
-            ends = [(self._x[step - 1], self._y[step - 1]), (self._x[step], self._y[step])]
-            pen.line(ends, fill=self._colors[step], width=4 * _FINER)
+        for frame in range(self._drawn + 1, at + 1):
+            ends = [(self._x[frame - 1], self._y[frame - 1]), (self._x[frame], self._y[frame])]
+            pen.line(ends, fill=self._colors[frame], width=4 * _FINER)
         self._drawn = at
         now = self._canvas.copy()
         if self._rays is not None:
             pen = ImageDraw.Draw(now, "RGBA")
-            sensor, *ends = self._rays[at].tolist()
+            sensor, *ends = self._rays[step].tolist()
             for x, y in ends:
                 if x == x:  # not NaN
                     pen.line((*sensor, x, y), fill=_RAY, width=_FINER)
@@ -282,6 +284,6 @@ def film_run(run: StoredRun, config: EvaluateConfig, file: Path | None, out: Con
         with writing(file.parent, failure=RunFailed):
             file.parent.mkdir(exist_ok=True)
     setup = evaluator.race.setup
-    frames = Frames(lap, acted, policy, setup.actions, setup.observation, setup.car.front_point_m)
-    write_film(file, frames, len(lap), (WIDTH, HEIGHT), setup.car.control_hz, err)
+    frames = Frames(lap, acted, policy, setup.actions, setup.observation, setup.car)
+    write_film(file, frames, len(frames), (WIDTH, HEIGHT), err)
     out.print(f"  film  {file}", soft_wrap=True, highlight=False)

@@ -26,7 +26,7 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, write_film
+from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, in_frames, write_film
 from deepracer_exp.evaluation.live import LivePage, track_lines
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
@@ -34,6 +34,7 @@ from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames, rays
 from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import MOUNT_X_M
 from deepracer_exp.sim.scenery import wall_ring
+from deepracer_exp.tracks.track import Track
 
 STEREO = CameraConfig(width=80, height=60, color="rgb", frames=2, stereo_m=0.06, field_of_view_deg=65)
 MONO = CameraConfig(width=80, height=60, color="grey", frames=2, stereo_m=0, field_of_view_deg=65)
@@ -107,17 +108,18 @@ def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
     ],
     ids=["pictures", "continuous", "features", "lidar", "pictures and lidar"],
 )
-def test_a_film_has_a_frame_a_step_and_shows_another_picture_in_each(circle, protocol, overrides):
+def test_a_film_has_thirty_frames_a_second_and_shows_another_picture_in_each(circle, protocol, overrides):
     experiment = compose_experiment([f"track.file={circle}", *overrides])[0]
     policy, lap, acted = driven(experiment, protocol("three_trials", trials=2, time_s=0.4))
     assert len(lap) == len(acted) == 7  # the prepare step and six more
     actions = build_action_space(experiment.action_space)
-    frames = list(Frames(lap, acted, policy, actions, experiment.observation, 0.14))
+    frames = list(Frames(lap, acted, policy, actions, experiment.observation, experiment.car))
+    assert len(frames) == 13  # two for each of the six steps at 15 Hz, and the last
     assert {frame.shape for frame in frames} == {(HEIGHT, WIDTH, 3)}
     assert all((one != other).any() for one, other in itertools.pairwise(frames))
     if experiment.observation.camera is not None:
         enlarged = 480 // experiment.observation.camera.width
-        shown = frames[4][0:360:enlarged, 0:480:enlarged]
+        shown = frames[9][0:360:enlarged, 0:480:enlarged]
         assert (shown[20:] == acted["pixels"][4, 0].numpy()[20:, :, None]).all(), (
             "smoothed, or of another step"
         )
@@ -138,12 +140,29 @@ def test_the_rays_of_a_film_end_at_the_walls(protocol, yaw_deg):
 
 def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
     frames = [np.full((32, 48, 3), 20 * at, np.uint8) for at in range(10)]
-    write_film(tmp_path / "lap.mp4", frames, len(frames), (48, 32), 15, Console(file=io.StringIO()))
+    write_film(tmp_path / "lap.mp4", frames, len(frames), (48, 32), Console(file=io.StringIO()))
     about, *written = read_frames(str(tmp_path / "lap.mp4"))
-    assert (about["fps"], about["size"]) == (15, (48, 32))
-    assert len(written) == 10 + 15
+    assert (about["fps"], about["size"]) == (30, (48, 32))
+    assert len(written) == 10 + 30
     shades = [np.frombuffer(one, np.uint8).mean() for one in written]
-    assert np.abs(np.array(shades) - [20 * min(at, 9) for at in range(25)]).max() < 6
+    assert np.abs(np.array(shades) - [20 * min(at, 9) for at in range(40)]).max() < 6
+
+
+@pytest.mark.parametrize(("control_hz", "frames"), [(15, 9), (30, 5), (20, 7), (60, 3)])
+def test_between_steps_a_filmed_car_drives_on_but_not_where_it_was_put_back(circle, control_hz, frames):
+    x_m = np.array([0.0, 0.1, 0.2, 5.0, 5.1])
+    time_s = np.arange(5) / control_hz + np.array([0, 0, 0, 2, 2])  # 2 s of penalty
+    nothing, yaw_rad = np.zeros(5), np.array([3.1, -3.1, -3.0, 0.0, 0.1])
+    lap = Lap(None, Track.from_file(circle), "", x_m, nothing, yaw_rad, nothing, nothing, 10 * x_m, time_s)
+    shown, step = in_frames(lap, control_hz)
+    assert len(shown) == len(step) == frames
+    assert (shown.x_m[-1], shown.time_s[-1]) == (5.1, time_s[-1])
+    assert not ((shown.x_m > 0.2 + 1e-9) & (shown.x_m < 5.0)).any()
+    assert np.diff(shown.time_s).min() > -1e-9
+    # Through the back of the circle, not around its front.
+    assert np.abs(np.diff(shown.yaw_rad[step < 2])).max(initial=0) < 0.2
+    if control_hz == 15:
+        assert shown.x_m[:4] == pytest.approx([0.0, 0.05, 0.1, 0.15])
 
 
 def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protocol):
