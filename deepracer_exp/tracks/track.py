@@ -24,6 +24,10 @@ PLAIN_FLOOR = FloorConfig(friction=1.0, road_color="#3d4148", ground_color="#547
 """The default floor."""
 MOST_OFF = 0.05
 """Share of waypoints that may lie off the road before the borders count as wrong."""
+_GRID_M = 1e-6
+"""Points of a course nearer to each other count as one when it is checked for crossings."""
+_FOLD_M = 0.1
+"""Length of a loop in a centre line up to which it is one of rounding; the world of 2019 has one of 4 mm."""
 _FIRST = np.zeros(1, np.intp)
 
 TrackIndex = NDArray[np.intp]
@@ -123,6 +127,7 @@ class Track:
         """
         rows = checked_rows(rows)
         closed = bool((rows[0] == rows[-1]).all())
+        _check_crossings(rows[:, :2])
         road = _road_area(rows[:, :2], rows[:, 2:4], rows[:, 4:], closed)
         counter_clockwise = not closed or bool(shapely.is_ccw(shapely.LinearRing(rows[:, :2])))
         if reversed:
@@ -327,6 +332,22 @@ def _frozen(array: np.ndarray) -> np.ndarray:
     return array
 
 
+def _check_crossings(center: np.ndarray) -> None:
+    """Refuse a centre line (n, 2) that crosses or touches itself: a position there has two values of progress.
+
+    Raises:
+        BadInput: it does.
+    """
+    line = shapely.LineString(center)
+    pieces = shapely.get_parts(shapely.line_merge(shapely.unary_union(line, grid_size=_GRID_M)))
+    longest = pieces[shapely.length(pieces).argmax()]
+    if line.length - longest.length > _FOLD_M:
+        x, y = longest.coords[0]
+        raise BadInput(
+            f"the centre line crosses itself at ({x:.2f}, {y:.2f}); accepted is one that passes each place once"
+        )
+
+
 def _road_area(center: np.ndarray, inner: np.ndarray, outer: np.ndarray, closed: bool) -> BaseGeometry:
     """Return the road between two borders as AWS builds it (deepracer-simapp, track_geom).
 
@@ -350,5 +371,11 @@ def _road_area(center: np.ndarray, inner: np.ndarray, outer: np.ndarray, closed:
 
 
 def _area(ring: np.ndarray) -> BaseGeometry:
+    """Return the polygons that a border encloses, without the lines and points that it touches itself in."""
     polygon = shapely.Polygon(ring)
-    return polygon if polygon.is_valid else shapely.make_valid(polygon)
+    if polygon.is_valid:
+        return polygon
+    parts = shapely.get_parts(
+        shapely.get_parts(shapely.make_valid(polygon))
+    )  # of a collection of collections
+    return shapely.multipolygons(parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON])

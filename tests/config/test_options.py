@@ -57,7 +57,7 @@ def test_a_conf_folder_of_something_else_does_no_harm(here, own):
     [
         ("reinvent", "reinvent_base"),
         ("OVAL", "Oval_track"),
-        ("champ", "2022_reinvent_champ_ccw"),
+        ("champ", "2022_reinvent_champ"),
         ("reinvnt_wod", "reinvent_wood"),
         ("moon", None),
         ("", None),

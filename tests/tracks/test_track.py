@@ -1,3 +1,4 @@
+import contextlib
 from bisect import bisect_right
 
 import numpy as np
@@ -182,6 +183,57 @@ def test_a_closed_course_of_rows_keeps_its_closing_point(ring):
     assert (track.width_m, track.is_clockwise, track.title) == (pytest.approx(1.0), False, "ring")
     with pytest.raises(ValueError, match="read-only"):
         track.waypoints[0] = 0.0
+
+
+def eight(rows: int = 100, turn: float = 0.0) -> np.ndarray:
+    """Return route rows of a figure of eight, closed exactly, whose crossing is at the origin."""
+    angle = np.linspace(0.0, 2 * np.pi, rows + 1) + turn
+    center = np.column_stack([2 * np.sin(angle), np.sin(2 * angle)])
+    ahead = np.column_stack([2 * np.cos(angle), 2 * np.cos(2 * angle)])
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1)[:, None]
+    route = np.column_stack([center, center + 0.2 * left, center - 0.2 * left])
+    route[-1] = route[0]
+    return route
+
+
+@pytest.mark.parametrize(
+    ("turn", "closed"), [(0.0, True), (0.01, True), (1.6, True), (0.0, False), (1.6, False)]
+)
+def test_a_course_that_crosses_itself_is_refused_with_the_place(turn, closed):
+    for rows in (eight(turn=turn), eight(turn=turn)[::-1]):
+        with pytest.raises(
+            BadInput, match=r"^the centre line crosses itself at \(-?0\.0\d, -?0\.0\d\); accepted is"
+        ):
+            Track.from_route(rows if closed else rows[:-1], "eight")
+
+
+def test_a_course_that_returns_along_itself_is_refused(ring):
+    half = ring[:31]
+    with pytest.raises(BadInput, match="the centre line crosses itself"):
+        Track.from_route(np.concatenate([half, half[-2::-1]]), "back and forth")
+
+
+def test_the_recorded_figure_of_eight_is_refused_in_one_line(reference):
+    with pytest.raises(BadInput, match=r"figure_of_eight.npy: .* crosses itself at \(-?0.00, -?0.00\)"):
+        Track.from_file(reference / "inputs/figure_of_eight.npy")
+
+
+@given(
+    shifts=st.lists(st.floats(-3.0, 3.0).map(lambda m: round(m, 1)), min_size=12, max_size=12),
+    closed=st.booleans(),
+)
+def test_whatever_borders_a_route_has_it_is_a_course_or_refused(shifts, closed):
+    angle = np.linspace(0.0, 2 * np.pi, 13)[:12]
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    rows = np.column_stack([3.0 * around, 2.5 * around + np.resize(shifts[:6], (12, 2)), 3.5 * around])
+    rows[:, 4] += shifts
+    rows = np.concatenate([rows, rows[:1]]) if closed else rows
+    track = None
+    with contextlib.suppress(BadInput):
+        track = Track.from_route(rows, "mine")
+    if track is not None:
+        assert np.isfinite(track.project(track.waypoints).ndist).all()
+        assert 0 <= track.on_road(track.waypoints).mean() <= 1
 
 
 def test_swapped_borders_and_a_centre_line_outside_of_them_are_refused(ring):
