@@ -18,7 +18,7 @@ from deepracer_exp.addresses import redact, without_passwords
 from deepracer_exp.commands import analyze, evaluate, files, runs, train
 from deepracer_exp.commands.arguments import refuse_old_spellings
 from deepracer_exp.errors import BadInput, RunFailed, nearest
-from deepracer_exp.lifeline import die_with_parent
+from deepracer_exp.lifeline import die_with_parent, guard_imports
 
 _COMMANDS = (train, runs, evaluate, analyze, files)
 """In the order of `--help`."""
@@ -40,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     args = argparse.Namespace()
     if arguments is None:
+        guard_imports()
         sys.argv[1:] = without_passwords(sys.argv[1:])  # the run's folder keeps them
     try:
         args = parse(sys.argv[1:] if arguments is None else arguments)

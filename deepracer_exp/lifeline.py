@@ -20,6 +20,22 @@ from multiprocessing.connection import wait
 from typing import Any
 
 _IS_LINUX = sys.platform == "linux"
+_SAFE_PATH = "PYTHONSAFEPATH"
+_GIVEN_SAFE_PATH = os.environ.get(_SAFE_PATH)
+
+
+def guard_imports() -> None:
+    """Have no Python that is started from now on import from the working folder.
+
+    With `-c` and `-m` Python looks there first: a fork server would import the user's `queue.py` in place of its own.
+    """
+    os.environ[_SAFE_PATH] = "1"
+
+
+def given_environment() -> dict[str, str]:
+    """Return the environment without what `guard_imports` has set, for a program of the user's own."""
+    given = {} if _GIVEN_SAFE_PATH is None else {_SAFE_PATH: _GIVEN_SAFE_PATH}
+    return {name: value for name, value in os.environ.items() if name != _SAFE_PATH} | given
 
 
 def kill_when_closed(pipe: int, target: int) -> None:

@@ -8,6 +8,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from deepracer_exp.addresses import take_over
+from deepracer_exp.config.acting import take_over_named
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.sim.batch import cores
@@ -84,6 +85,7 @@ def run_worker(config: WorkerConfig, token: str, log: str) -> None:
     if it does not answer.
     """
     take_over(config.addresses)
+    take_over_named(config.named)
     # A session of its own: Ctrl-C in the terminal goes to the driver, which asks its workers to end.
     os.setsid()
     with open(log, "a", buffering=1, encoding="utf-8") as file:

@@ -13,6 +13,7 @@ from deepracer_exp.config.dimension import Choice, Choices, Range, as_override, 
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.overrides import OPEN_MAPPINGS
+from deepracer_exp.config.own_class import allow
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.env.action_space import build_action_space
@@ -130,6 +131,7 @@ class _Trials:
 
     def __init__(self, request: SweepRequest, check: Check | None, found: Mapping[str, Choices | Range]):
         self._base, self._found = list(request.base), found
+        self._stored = request.stored
         self._on_the_car = request.protocol.real_car is not None
         self._from_scratch = check is None
         self._check = check or self._compose
@@ -181,6 +183,8 @@ class _Trials:
             if self._from_scratch and one.key not in groups() and holder is not None:
                 # Composing takes a hundred times as long as setting a value.
                 holder[one.key.rpartition(".")[2]] = override_value(line)
+                if not self._stored:
+                    allow(changed)
                 self._read(parse_experiment(changed))
             else:
                 self._values({**context, one.key: line})
@@ -200,7 +204,7 @@ class _Trials:
         return self._composed[overrides]
 
     def _compose(self, overrides: list[str]) -> Mapping[str, Any]:
-        experiment, composition = compose_experiment(overrides)
+        experiment, composition = compose_experiment(overrides, stored=self._stored)
         self._read(experiment)
         return composition.mapping
 

@@ -75,7 +75,7 @@ def load_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Stu
         # The total of the last start: it may have been raised since the study was begun.
         total = [f"sweep.trials={known.user_attrs['trials']}"] if "trials" in known.user_attrs else []
         whole = [*known.user_attrs.get("overrides", ()), *total, *overrides]
-    request = compose_sweep(whole)
+    request = compose_sweep(whole, stored=names_only)
     if not request.space:
         raise BadInput(
             f"study={request.study}: exists; to resume it, give only {', '.join(MAY_DIFFER)} beside its "

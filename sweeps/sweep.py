@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,6 +17,7 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
+from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
@@ -50,6 +52,8 @@ from .view import SweepView
 from .worker import Interrupted
 from .worker_config import WorkerConfig
 
+_log = logging.getLogger("deepracer_exp")
+
 _DONE_S, _INTERRUPTED_S = 30.0, 2.0
 """How long to wait for MLflow when a sweep is done, and when it was interrupted and can resume."""
 REPORT = "sweep.html"
@@ -75,11 +79,13 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     config = request.entry.sweep
     request = _without_rules(request, overrides)
     parent = _parent(request, runs_dir, known)
-    compose = partial(_composed, request.study, parent, runs_dir)
+    compose = partial(_composed, request.study, parent, runs_dir, request.stored)
     space = SearchSpace.from_request(request, (lambda lines: compose(lines)[1].mapping) if parent else None)
     build_sampler(config, space)
     build_pruner(config)
-    experiment, _ = compose(space.example())
+    experiment, composition = compose(space.example())
+    for note in composition.notes if request.stored else ():
+        _log.warning(note)
     if parent and protocol.real_car is not None:
         require_car(experiment)
     if not parent:
@@ -96,6 +102,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     with contextlib.closing(launcher):
         storage = open_storage(config.storage, runs_dir)
         study = open_study(request, overrides, space, parent, storage, runs_dir)
+        acting.remember()
         study_run, study_run_id = begin_study_run(request, space, store, storage, runs_dir)
         worker_config = WorkerConfig(
             study=request.study,
@@ -271,15 +278,15 @@ def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple
 
 
 def _composed(
-    study: str, parent: tuple[str, ...], runs_dir: Path, overrides: list[str]
+    study: str, parent: tuple[str, ...], runs_dir: Path, stored: bool, overrides: list[str]
 ) -> tuple[Experiment, Composition]:
     """Return the experiment of a trial with these overrides, of a clone if trials have a parent."""
     if not parent:
-        return compose_experiment(overrides)
+        return compose_experiment(overrides, stored=stored)
 
     from deepracer_exp.training.clone import prepare_clone
 
-    clone = prepare_clone([*parent, *overrides, f"name={study}"], runs_dir, None)
+    clone = prepare_clone([*parent, *overrides, f"name={study}"], runs_dir, None, stored=stored)
     return clone.experiment, clone.composition
 
 

@@ -301,7 +301,8 @@ class TrialRun(Callback):
         if known is not None and (lost := self._lost_again(known)) is not None:
             self._record(lost)
             return lost
-        outcome = None if known is None else self._resumed(Path(known["run_dir"]))
+        # By its name: a study never leads to a folder elsewhere.
+        outcome = None if known is None else self._resumed(self._config.folder / Path(known["run_dir"]).name)
         if outcome is None:
             outcome = self._trained(index, overrides)
         if outcome.status == INTERRUPTED:
@@ -372,8 +373,8 @@ class TrialRun(Callback):
 
     def _composed(self, overrides: list[str]) -> tuple[Experiment, Composition, Start | None]:
         if not self._config.parent:
-            return *compose_experiment(overrides), None
-        clone = prepare_clone([*self._config.parent, *overrides], self._config.runs_dir, None)
+            return *compose_experiment(overrides, stored=True), None
+        clone = prepare_clone([*self._config.parent, *overrides], self._config.runs_dir, None, stored=True)
         return clone.experiment, clone.composition, clone.start
 
     def _evaluated(self, folder: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import psutil
 
 from deepracer_exp.addresses import taken_out
+from deepracer_exp.config import acting
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.tracking.store import Store
@@ -34,6 +35,8 @@ class WorkerConfig:
     """Evaluations of a trial before its end, None where that depends on the trial."""
     cores: int
     """Per worker."""
+    named: Mapping[str, str] = field(default_factory=acting.named, repr=False)
+    """What the user of the sweep has named of what acts, see `acting`."""
     addresses: Mapping[str, str] = field(default_factory=taken_out, repr=False)
     """Addresses of servers and databases with their passwords, by the redacted form the other fields hold."""
 

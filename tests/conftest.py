@@ -1,5 +1,6 @@
 """The command line, called in this process or started as a process of its own."""
 
+import atexit
 import contextlib
 import functools
 import gc
@@ -10,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +39,10 @@ settings.load_profile("same")
 
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# What the tests train with is no part of the account that runs them.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="deepracer_exp-account-")
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 REFERENCE = Path(__file__).parents[2] / "shared" / "reference"
 """What the real service recorded."""

@@ -14,7 +14,7 @@ import yaml
 
 from deepracer_exp import load_policy
 from deepracer_exp.analysis.next_steps import command_line, next_steps
-from deepracer_exp.config import own_class
+from deepracer_exp.config import acting, own_class
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
 from deepracer_exp.config.own_class import build_own
@@ -48,9 +48,10 @@ def write_examples(folder: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _forgotten(monkeypatch):
-    """Begin like a new command, which has imported none of these classes."""
-    monkeypatch.setattr(own_class, "_allowed", set())
+def _forgotten(monkeypatch, tmp_path_factory):
+    """Begin like a new command of another account, which has used none of these classes."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("account")))
+    monkeypatch.setattr(acting, "_named", {})
     monkeypatch.setattr(sys, "path", list(sys.path))
     for name in [name for name in sys.modules if name.startswith("my_")]:
         monkeypatch.delitem(sys.modules, name)
@@ -117,7 +118,7 @@ def test_the_lines_to_paste_name_the_classes_again(run, tmp_path):
     steps = [line for line, _ in next_steps(copy, json.loads((copy / "summary.json").read_text()))]
     assert len(steps) == 4
     for line in steps:
-        own_class._allowed.clear()
+        acting._named.clear()
         command, *words = shlex.split(line)[1:]
         if "--video" not in words:  # needs a renderer
             extra = SHORT if command == "evaluate" else ("budget.env_steps=1024",) * (command == "clone")
@@ -135,7 +136,7 @@ def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path)
     write_examples(tmp_path)
     options = (*IN_PROCESS, *OWN, "tracking=my_tracker:JsonTracker")
     half = call_in(tmp_path, "train", *options, "budget.env_steps=2048").folder
-    own_class._allowed.clear()
+    acting._named.clear()
     ended = call_in(tmp_path, "resume", half.name, *NAMED, "budget.env_steps=4096")
     assert ended.code == 0, ended.stderr
     pd.testing.assert_frame_equal(metrics(half), metrics(run))
@@ -266,7 +267,7 @@ def test_an_entry_point_is_an_option_that_stored_runs_may_use(tmp_path, monkeypa
     try:
         assert "resnet" in options("network")
         experiment, _ = compose_experiment(["network=resnet", "network.kwargs.width=8"])
-        own_class._allowed.clear()
+        acting._named.clear()
         net = build_own(experiment.network, "network.target", torch.nn.Module, 3, 2)
         assert net(torch.zeros(3)).shape == (2,)
     finally:

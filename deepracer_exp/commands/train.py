@@ -7,7 +7,7 @@ import traceback
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput, reading
-from deepracer_exp.runs.files import TRACKING, read_config
+from deepracer_exp.runs.files import TRACKING
 
 from .arguments import (
     add_command,
@@ -182,7 +182,7 @@ def _resume(args: argparse.Namespace) -> int:
     try:
         refuse_ended(run_dir, experiment.budget, overrides)
     except RunEnded as error:
-        return _deliver(run_dir, stores.uri, error)
+        return _deliver(run_dir, getattr(experiment.tracking, "uri", None), error)
     import_own_classes(experiment)
     print_start()
     start_workers_early(experiment.collector.forks)
@@ -201,10 +201,10 @@ def _deliver(run_dir: Path, uri: str | None, ended: Exception) -> int:
     """Deliver the points of an ended run that MLflow lacks; if there are none, raise that the run has ended."""
     from deepracer_exp.tracking.delivery import deliver, is_delivered
 
-    runs_dir, own_uri = run_dir.parent.parent, read_config(run_dir)["tracking"].get("uri")
-    if not (run_dir / TRACKING).exists() or is_delivered(run_dir, uri or own_uri, runs_dir):
+    runs_dir = run_dir.parent.parent
+    if not (run_dir / TRACKING).exists() or is_delivered(run_dir, uri, runs_dir):
         raise ended
-    points = deliver(run_dir, uri or own_uri, runs_dir)
+    points = deliver(run_dir, uri, runs_dir)
     if not points:
         raise ended
     print(f"{ended}\n  delivered {points:,} points that MLflow lacked")

@@ -31,7 +31,7 @@ from deepracer_exp.deepracer.worlds import find_world
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import read_yaml
 
-from . import custom_files
+from . import acting, custom_files
 from .custom_files import FileOverrides, file_overrides, read_custom_files
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
@@ -76,20 +76,23 @@ class Composition:
         )
 
 
-def compose_experiment(overrides: Sequence[str]) -> tuple[Experiment, Composition]:
+def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tuple[Experiment, Composition]:
     """Compose `conf/train.yaml` with the overrides and validate the result.
 
     Args:
         overrides: Hydra override expressions without sweeps, e.g. ``track=Oval_track``; paths and addresses need
             no quotes. ``custom_files=DIR`` uses the values of DeepRacer's files in a folder; they override defaults and
             experiments, and every other override has priority over them.
+        stored: whether a study holds them; the user's own words otherwise.
 
     Raises:
-        BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
+        BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted; or code
+            is not the user's own (`acting`).
     """
-    composition = compose_entry("train", overrides)
+    composition = compose_entry("train", overrides, stored=stored)
     experiment = parse_experiment(composition.mapping)
     _check_names(experiment.evaluation)
+    acting.refuse_reward(composition.mapping, "the study")
     import_own_classes(experiment)
     return experiment, composition
 
@@ -120,8 +123,8 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     return parse_config(composition.mapping, ExportConfig), composition
 
 
-def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
-    """Compose an entry point's YAML with the overrides into plain Python values.
+def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False) -> Composition:
+    """Compose an entry point's YAML with the overrides into plain Python values; `stored` as of `compose_experiment`.
 
     Raises:
         BadInput: an override cannot be parsed or names something unknown, or a file cannot be used.
@@ -162,14 +165,18 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
     elif several is not None:
         several.move_to_track(mapping)
         choices[TRACK] = f"[{','.join(several.names)}]"
-    allow(mapping)
+    # Option files of the user may contain addresses, too.
+    mapping, left_out = without_passwords(mapping), list[str]()
+    if stored:
+        left_out = acting.take_over(mapping, "the study")
+    else:
+        allow(mapping)
     return Composition(
         overrides=tuple(overrides),
         choices={group: option for group, option in choices.items() if group in groups(entry)},
-        # Option files of the user may contain addresses, too.
-        mapping=without_passwords(mapping),
+        mapping=mapping,
         names=files.names,
-        notes=files.notes,
+        notes=(*files.notes, *left_out),
     )
 
 

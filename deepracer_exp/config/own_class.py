@@ -1,7 +1,7 @@
 """Classes of your own in the configuration, by `package.module:Class` or by an entry point.
 
-Code is imported only if this command, an option file or a script names its class, or an installed package registers it.
-A stored run names its classes too, but only as text: a copied or downloaded run loads nothing by itself.
+Code is imported only if the user names its class or has trained with it before (`acting`), or an installed package
+registers it. A stored run names its classes only as text: a copied or downloaded run loads nothing by itself.
 """
 
 import importlib
@@ -19,6 +19,8 @@ from pydantic import Discriminator, Field
 
 from deepracer_exp.errors import BadInput, reading
 
+from . import acting
+
 GROUPS = ("network", "algorithm", "lr_schedule", "observation", "stopping", "tracking")
 """Groups whose option may be a class of your own. Entry points are registered under `deepracer_exp.GROUP`."""
 OF_POLICY = ("network", "observation")
@@ -26,7 +28,6 @@ OF_POLICY = ("network", "observation")
 _REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
 Reference = Annotated[str, Field(pattern=rf"^{_REFERENCE}$")]
 _GIVEN = re.compile(rf"(?:{'|'.join(GROUPS)})\.target=({_REFERENCE})")
-_allowed: set[str] = set()
 
 Base = TypeVar("Base")
 
@@ -72,14 +73,14 @@ def registered(group: str) -> dict[str, str]:
 
 
 def allow(values: Any) -> None:
-    """Allow the import of every class that values of the user's own command or option files name."""
-    _allowed.update(_references(values))
+    """Note that the user's own command or option files name what acts among these values: classes and the rest."""
+    acting.name([*map(acting.class_of, _references(values)), *acting.acting(values)])
 
 
 def allow_given(overrides: Sequence[str]) -> list[str]:
     """Allow the classes of overrides `GROUP.target=package.module:Class` and return the other overrides."""
     given = {line: found[1] for line in overrides if (found := _GIVEN.fullmatch(line))}
-    _allowed.update(given.values())
+    acting.name([acting.class_of(target) for target in given.values()])
     return [line for line in overrides if line not in given]
 
 
@@ -107,12 +108,13 @@ def load_class(target: str, key: str) -> type:
         key: the configuration's key, for messages.
 
     Raises:
-        BadInput: only a stored run names it, or it cannot be imported.
+        BadInput: only a stored run or study names it, or it cannot be imported.
     """
-    if target not in _allowed and not _is_registered(target):
+    if not _is_registered(target) and not acting.class_of(target).is_own:
         raise BadInput(
-            f"{key}={target}: named by a stored run, which imports no code by itself; if you trust the class, repeat "
-            f"{key}={target} on the command line, or install a package that registers it as an entry point"
+            f"{key}={target}: named by a stored run, which imports no code by itself, and not a class that you have "
+            f"trained with, or changed since; if you trust it, repeat {key}={target} on the command line, or install a "
+            "package that registers it as an entry point"
         )
     # At the end: a file of the working folder never replaces an installed module.
     if (folder := str(Path.cwd())) not in sys.path:
@@ -158,8 +160,9 @@ def _is_registered(target: str) -> bool:
 
 def _references(values: Any) -> Iterator[str]:
     if isinstance(values, dict):
-        if isinstance(values.get("target"), str):
-            yield values["target"]
+        target = values.get("target")
+        if isinstance(target, str) and re.fullmatch(_REFERENCE, target):
+            yield target
         values = list(values.values())
     if isinstance(values, list):
         for value in values:

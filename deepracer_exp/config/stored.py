@@ -7,7 +7,7 @@ from typing import Any
 
 from deepracer_exp.errors import BadInput, nearest
 
-from . import custom_files
+from . import acting, custom_files
 from .compose import Composition, compose_entry
 from .options import groups
 from .overrides import OPEN_MAPPINGS, parse_single
@@ -19,23 +19,29 @@ ABSENT = "\N{EN DASH}"
 
 
 def with_overrides(
-    config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str]
+    config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str], *, stored: bool = False
 ) -> Composition:
-    """Change a stored configuration.
+    """Change a stored configuration; values that act and are not the user's own are left out (`acting.take_over`).
 
     Args:
         config: all values, as in config.yaml.
         choices: the options the values came from, by group.
         overrides: of whole groups (``track=Oval_track``), which are composed again, and of single values.
+        stored: whether a study holds the overrides; the user's own words otherwise.
+
+    Returns:
+        The changed values; a note for each value that was left out and is not among the overrides.
 
     Raises:
         BadInput: an override cannot be parsed, names something unknown or would replace the whole experiment.
     """
     # The parts of an observation are a list: naming one again changes no value.
     parts = [override for override in overrides if override.startswith("observation.target=")]
-    allow_given(parts)
+    if not stored:
+        allow_given(parts)
     parsed = [parse_single(override) for override in overrides if override not in parts]
     values = copy.deepcopy(dict(config))
+    left_out = acting.take_over(values, "the stored run")
     chosen = [one for one in parsed if one.key_or_group in groups() and not one.is_delete()]
     for one in parsed:
         if one.key_or_group in _WHOLE:
@@ -45,7 +51,7 @@ def with_overrides(
             )
     new: dict[str, str] = {}
     if chosen:
-        composed = compose_entry("train", [one.input_line or "" for one in chosen])
+        composed = compose_entry("train", [one.input_line or "" for one in chosen], stored=stored)
         for one in chosen:
             values[one.key_or_group] = composed.mapping[one.key_or_group]
             new[one.key_or_group] = composed.choices[one.key_or_group]
@@ -54,8 +60,19 @@ def with_overrides(
             if one.is_delete() or one.package is not None:
                 raise BadInput(f"{one.input_line}: accepted here: GROUP=OPTION or KEY=VALUE")
             _set(values, one.key_or_group, one.value())
+    keys = [one.key_or_group for one in parsed]
+    if stored:
+        left_out += acting.take_over(values, "the study")
+    else:
+        for one in parsed:
+            allow({one.key_or_group.rpartition(".")[2]: one.value()})
+        acting.name([one for one in acting.acting(values) if _touches(keys, one.key)])
     return Composition(
-        overrides=tuple(overrides), choices={**choices, **new}, mapping=values, names={}, notes=()
+        overrides=tuple(overrides),
+        choices={**choices, **new},
+        mapping=values,
+        names={},
+        notes=tuple(line for line in left_out if not _touches(keys, line.partition("=")[0])),
     )
 
 
@@ -90,8 +107,12 @@ def _set(values: dict[str, Any], key: str, value: Any) -> None:
         node = node[part]
     if not isinstance(node, dict) or (leaf not in node and ".".join(path) not in OPEN_MAPPINGS):
         raise _unknown(key, key, node)
-    allow({leaf: value})
     node[leaf] = value
+
+
+def _touches(overridden: Sequence[str], key: str) -> bool:
+    """Return whether one of the overridden keys is a key, its group, or a part of it."""
+    return any(f"{key}.".startswith(f"{one}.") or one.startswith(f"{key}.") for one in overridden)
 
 
 def _unknown(key: str, at: str, node: Any) -> BadInput:

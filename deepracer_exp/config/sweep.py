@@ -139,6 +139,8 @@ class SweepRequest:
     optional: frozenset[str]
     """Keys of the space of `sweep=NAME` whose group the command line sets: they are dropped where the chosen options do
     not have them."""
+    stored: bool = False
+    """Whether the overrides are those that a study holds; the user's own words otherwise."""
 
     @property
     def study(self) -> str:
@@ -163,10 +165,10 @@ class SweepRequest:
             BadInput: it is not a path.
         """
         given = [line for line in self.base if key_of(line) == "runs_dir"]
-        return Path(compose_experiment(given[-1:])[0].runs_dir)
+        return Path(compose_experiment(given[-1:], stored=self.stored)[0].runs_dir)
 
 
-def compose_sweep(overrides: Sequence[str]) -> SweepRequest:
+def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepRequest:
     """Split overrides into those of the sweep, those of every trial's training, and the search space.
 
     An override of the training replaces the entry of `sweep=NAME` for the same key, whether it sets or searches the
@@ -175,6 +177,7 @@ def compose_sweep(overrides: Sequence[str]) -> SweepRequest:
     Args:
         overrides: ``study=``, ``parent=``, ``debug=``, ``sweep=``, ``sweep.*=`` and ``sweep/executor=`` are for the
             sweep, all others for the training.
+        stored: whether a study holds them; the user's own words otherwise.
 
     Raises:
         BadInput: an override cannot be parsed, or one for the sweep has an unknown key or a value that is not accepted.
@@ -183,7 +186,7 @@ def compose_sweep(overrides: Sequence[str]) -> SweepRequest:
     own = [override for override in overrides if _is_of_the_sweep(override)]
     for override in own:
         _check_own(override)
-    composition = compose_entry(_ENTRY, own)
+    composition = compose_entry(_ENTRY, own, stored=stored)
     entry = parse_config(composition.mapping, SweepEntry)
     check_option("evaluation", entry.sweep.protocol, "sweep.protocol")
     train = _TrainOverrides()
@@ -198,7 +201,7 @@ def compose_sweep(overrides: Sequence[str]) -> SweepRequest:
     chosen = set(typed_keys) & set(groups())
     ready = set(entry.sweep.space) - set(typed_keys)
     optional = frozenset(key for key in ready if key.partition(".")[0] in chosen)
-    return SweepRequest(entry, composition, tuple(train.base), train.space, optional)
+    return SweepRequest(entry, composition, tuple(train.base), train.space, optional, stored)
 
 
 class _TrainOverrides:

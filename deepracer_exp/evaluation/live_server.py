@@ -1,5 +1,6 @@
 """The server of a live page: one page and its version, for this machine only."""
 
+import re
 import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 from deepracer_exp.errors import BadInput
 
 HOST = "127.0.0.1"
+_NAMES = (HOST, "localhost", "[::1]")
+"""Of this machine. Through a tunnel the port is another one."""
 
 
 class LiveServer(ThreadingHTTPServer):
@@ -48,6 +51,10 @@ class _Answer(BaseHTTPRequestHandler):
     server: LiveServer
 
     def do_GET(self) -> None:
+        # A page of somebody else whose name leads here (DNS rebinding) could read the answer.
+        if re.sub(r":\d+$", "", self.headers.get("Host", "")) not in _NAMES:
+            self.send_error(421, "accepted: " + " or ".join(_NAMES))
+            return
         version, page = self.server.shown
         answers = {"/": (page, "text/html"), "/version": (version, "text/plain")}
         text, kind = answers.get(self.path, ("no such page\n", "text/plain"))

@@ -3,12 +3,15 @@
 import hashlib
 import json
 import re
+import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 
 HASHES = "hashes.json"
+MANIFEST = "manifest.json"
 LINKS = ("best", "last")
 _PINNED = "pinned.json"
 
@@ -35,6 +38,35 @@ def verify(folder: Path) -> None:
         raise BadInput(f"{folder}: corrupt: {changed[0][0]} is not as it was written")
 
 
+def restore_links(folder: Path) -> None:
+    """Make `best` and `last` links again where a copy has followed them, or holds them as text.
+
+    `cp -rL`, object stores and archives without links turn each into a second copy of its checkpoint. A folder that
+    cannot be written stays as it is, and so does a copy that equals no checkpoint of another name.
+    """
+    for label in LINKS:
+        path = folder / label
+        if path.is_symlink() or not path.exists():
+            continue
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            if path.is_file():
+                name = path.read_text(encoding="utf-8")
+            else:
+                manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+                name = f"{int(manifest['metadata']['iteration']):06d}"
+            if not re.fullmatch(r"\d{6,9}", name):
+                continue
+            if path.is_file():
+                path.unlink()
+            elif not (folder / name).exists():
+                path.rename(folder / name)
+            elif checkpoint_sha256(path) == checkpoint_sha256(folder / name):
+                shutil.rmtree(path)
+            else:
+                continue
+            path.symlink_to(name, target_is_directory=True)
+
+
 def find_checkpoint(folder: Path, name: str) -> Path:
     """Return the folder of a checkpoint, or the link to it; it may be a missing `last` if there are other checkpoints.
 
@@ -45,6 +77,7 @@ def find_checkpoint(folder: Path, name: str) -> Path:
     """
     if not re.fullmatch(r"best|last|\d{1,9}", name):
         raise BadInput(f"checkpoint={name}: a checkpoint is best, last or the number of an iteration")
+    restore_links(folder)
     path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
     kept = kept_checkpoints(folder)
     if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
@@ -64,7 +97,7 @@ def kept_checkpoints(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
-    # `best` is a real folder if links were followed when the run was copied.
+    # `best` is a real folder in a copy that cannot be written, see `restore_links`.
     known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
     return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
 

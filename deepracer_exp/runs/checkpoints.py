@@ -20,15 +20,25 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .checkpoint_files import HASHES, find_checkpoint, kept_checkpoints, pinned, verify, write_hashes
+from .checkpoint_files import (
+    HASHES,
+    MANIFEST,
+    find_checkpoint,
+    kept_checkpoints,
+    pinned,
+    restore_links,
+    verify,
+    write_hashes,
+)
 from .files import CHECKPOINTS
 
 logger = logging.getLogger("deepracer_exp")
 
 AGENT, TRAINING = "agent", "training"
 """Components: the networks with what improves them, and what a resumed training needs besides."""
-_MANIFEST = "manifest.json"
 _STATE = {"state.json", "state.tdz"}
+_MOST_BYTES = 2**32
+"""Of a checkpoint; the largest known have tens of megabytes."""
 _MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
 
 
@@ -98,13 +108,15 @@ def check(path: Path, *, resumable: bool = False) -> Path:
     if links:
         raise BadInput(f"{links[0]}: is a link; the files of a checkpoint must be in its own folder")
     files = {file.name for file in entries if not file.is_dir()}
-    foreign = sorted(files - _STATE - {_MANIFEST, HASHES})
+    foreign = sorted(files - _STATE - {MANIFEST, HASHES})
     if foreign:
         raise BadInput(
             f"{path}: contains {foreign[0]}; accepted: the tensors and JSON files of a checkpoint; a pickle is "
             "never loaded"
         )
-    for name in (_MANIFEST, HASHES):
+    if (total := sum(entry.stat().st_size for entry in entries)) > _MOST_BYTES:
+        raise BadInput(f"{path}: has {total:,} bytes; accepted: up to {_MOST_BYTES // 2**30} GiB")
+    for name in (MANIFEST, HASHES):
         if name not in files:
             raise BadInput(f"{path}: has no {name}: incomplete, or written by an older version")
     verify(path)
@@ -198,14 +210,21 @@ def _load(path: Path, component: str, target: Any, problem: str) -> dict[str, An
 
 
 def _check_archive(file: Path) -> None:
-    """Refuse an archive with anything but tensors."""
+    """Refuse an archive with anything but tensors, or one that takes more memory than it has bytes."""
+    size = file.stat().st_size
     try:
         with zipfile.ZipFile(file) as archive:
             foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
+            unpacked = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, EOFError) as error:
         raise BadInput(f"{file}: corrupt: {error}") from error
     if foreign:
         raise BadInput(f"{file}: contains {foreign[0]}, which is not a tensor; a pickle is never loaded")
+    # Ours are not compressed, and no two tensors share bytes.
+    if unpacked > size:
+        raise BadInput(
+            f"{file}: {size:,} bytes that unpack to {unpacked:,}; accepted: tensors that are not compressed"
+        )
 
 
 def _one_line(error: Exception) -> str:
@@ -238,6 +257,7 @@ class CheckpointStore:
         self._keep, self._every = keep, every or 1
         for path in self.folder.glob(".*"):
             _remove(path)
+        restore_links(self.folder)
         pinned(self.folder)
 
     def save(

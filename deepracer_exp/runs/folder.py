@@ -17,6 +17,7 @@ from typing import Any
 import psutil
 from filelock import FileLock, Timeout
 
+from deepracer_exp.addresses import redact, without_passwords
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write
@@ -102,7 +103,8 @@ class RunFolder:
                 "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
             },
             "reward": {"name": reward.name, "path": str(reward.path), "sha256": reward.sha256},
-            "command": sys.argv[1:],
+            # Of a script, too, whose arguments nobody has looked at.
+            "command": [redact(without_passwords(word)) for word in sys.argv[1:]],
         }
         self.write(PROVENANCE, json.dumps(provenance, indent=2) + "\n")
         self.write(CONFIG, composition.yaml())

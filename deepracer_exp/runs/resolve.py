@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter
 
+from deepracer_exp.config import acting
 from deepracer_exp.config.experiment import Experiment, safe_name
 from deepracer_exp.config.stored import config_differences
 from deepracer_exp.errors import BadInput, nearest, reading
@@ -17,7 +18,7 @@ from deepracer_exp.files import atomic_write, read_json_as
 from deepracer_exp.tracking.registry import Registered, is_alias, look_up
 from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
-from .checkpoint_files import LINKS, checkpoint_sha256, verify
+from .checkpoint_files import LINKS, checkpoint_sha256, restore_links, verify
 from .files import BEST, BEST_OF_SWEEP, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
 from .result import RunResult, read_result
 
@@ -36,7 +37,7 @@ class StoredRun:
 
     @cached_property
     def experiment(self) -> Experiment:
-        """Its configuration.
+        """Its configuration, without values that act and are not the user's own (`config.acting`).
 
         Raises:
             BadInput: it cannot be read, or was written by another version.
@@ -44,6 +45,7 @@ class StoredRun:
         from deepracer_exp.config.parse import parse_experiment
 
         mapping = read_config(self.path)
+        acting.take_over(mapping, self.path.name)
         try:
             return parse_experiment(mapping)
         except BadInput as error:
@@ -52,6 +54,7 @@ class StoredRun:
     @property
     def checkpoints(self) -> Path:
         """The folder of its checkpoints."""
+        restore_links(self.path / CHECKPOINTS)
         return self.path / CHECKPOINTS
 
     def choose_checkpoint(self, given: str | None) -> str:

@@ -66,16 +66,20 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
     if store.artifact_location:
         command += ["--default-artifact-root", store.artifact_location]
     environment = {
-        **os.environ,
+        # It is the server: a page of a store that somebody else has filled gets no password of the user's own.
+        **{name: value for name, value in os.environ.items() if not name.startswith("MLFLOW_TRACKING_")},
+        "PYTHONSAFEPATH": "1",
         "MLFLOW_BACKEND_STORE_URI": store.uri,  # not on the command line, where `ps` shows the password
         "MLFLOW_DISABLE_TELEMETRY": "true",
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",  # six more processes, for judging chats
     }
     url = f"http://{_HOST}:{port}"
-    # Its state is in a database, which loses nothing when the server is killed.
+    # Its state is in a database, which loses nothing when the server is killed. uvicorn imports from the working folder
+    # first, whatever Python is told.
+    options_of = {"env": environment, "cwd": "/", "stdin": subprocess.DEVNULL}
     with (
         tempfile.TemporaryFile() as output,
-        running(command, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output) as server,
+        running(command, stdout=output, stderr=output, **options_of) as server,
     ):
         _wait_until_it_answers(url, server, output)
         yield url, server

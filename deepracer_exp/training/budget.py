@@ -19,7 +19,7 @@ from deepracer_exp.analysis.next_steps import command_line, run_word
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.lifeline import running
+from deepracer_exp.lifeline import given_environment, running
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_object
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, INTERRUPTED
 
@@ -196,7 +196,8 @@ class Alerts:
     def _run(self, command: tuple[str, ...], message: str, run_dir: Path) -> None:
         try:
             line, pipe = [*command, message, str(run_dir.resolve())], subprocess.PIPE
-            with running(line, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe) as done:
+            environment, null = given_environment(), subprocess.DEVNULL
+            with running(line, env=environment, stdin=null, stdout=pipe, stderr=pipe) as done:
                 _, said = done.communicate(timeout=_PATIENCE_S)
         except OSError as error:
             _log.info("budget.alert_command cannot be run: %s", error.strerror or error)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.agents.actor_critic import ActorCritic
+from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.parse import parse_experiment
@@ -38,47 +39,52 @@ class Clone:
     """Notes for the user, a line each."""
 
 
-def prepare_clone(overrides: Sequence[str], runs_dir: Path, tracking_uri: str | None) -> Clone:
+def prepare_clone(
+    overrides: Sequence[str], runs_dir: Path, tracking_uri: str | None, *, stored: bool = False
+) -> Clone:
     """Read the parent and its checkpoint, and change its configuration; the checkpoint is pinned.
 
     Args:
         overrides: `run=` (required), perhaps `checkpoint=`, and what differs from the parent.
         runs_dir: where the parent is.
         tracking_uri: where ids and aliases are looked up; None: in `runs_dir`.
+        stored: whether a study holds the overrides; the user's own words otherwise.
 
     Raises:
-        BadInput: the parent or its checkpoint cannot be used, or what the overrides ask for does not fit its networks.
+        BadInput: the parent or its checkpoint cannot be used, what the overrides ask for does not fit its networks, or
+            its reward function is not the user's own.
     """
     given = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
     changes = [override for override in overrides if override.split("=", 1)[0] not in _OWN]
     parent = resolve(given["run"], runs_dir, tracking_uri)
     name = parent.choose_checkpoint(given.get("checkpoint"))
-    stored = read_checkpoint(parent.experiment, parent.checkpoints, name)
-    composition = _changed(parent, changes)
+    checkpoint = read_checkpoint(parent.experiment, parent.checkpoints, name)
+    composition = _changed(parent, changes, stored)
     experiment = parse_experiment(composition.mapping)
+    acting.refuse_reward(composition.mapping, parent.path.name)
     refuse_other_networks(parent.experiment, experiment)
     above = read_lineage(parent.path)
     lineage = Lineage(
         parent=parent.path.name,
         parent_dir=str(parent.path.resolve()),
         parent_run_id=read_run_id(parent.path),
-        checkpoint=stored.path.name,
-        sha256=checkpoint_sha256(stored.path),
+        checkpoint=checkpoint.path.name,
+        sha256=checkpoint_sha256(checkpoint.path),
         generation=1 + (above.generation if above else 0),
         registered=parent.registered,
     )
-    pin(parent.path / CHECKPOINTS, stored.path.name, f"cloned into {experiment.name}")
+    pin(parent.path / CHECKPOINTS, checkpoint.path.name, f"cloned into {experiment.name}")
     return Clone(
         experiment,
         composition,
-        (stored.networks, lineage),
-        tuple(_notes(parent, experiment, stored.path.name)),
+        (checkpoint.networks, lineage),
+        (*_notes(parent, experiment, checkpoint.path.name), *composition.notes),
     )
 
 
-def _changed(parent: StoredRun, changes: Sequence[str]) -> Composition:
+def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composition:
     names = read_object(parent.path / PROVENANCE).get("names", {})
-    composition = with_overrides(read_config(parent.path), names, changes)
+    composition = with_overrides(read_config(parent.path), names, changes, stored=stored)
     keys = {change.lstrip("+").split("=", 1)[0] for change in changes}
     if not keys & {"algorithm", "algorithm.lr"}:
         composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER

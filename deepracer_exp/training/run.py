@@ -19,10 +19,11 @@ from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.collectors.ray_cluster import check_collector
+from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.own_class import own_classes
-from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
@@ -165,6 +166,16 @@ def read_files(experiment: Experiment) -> RaceSetup:
         BadInput: a file is missing or malformed, or values contradict.
     """
     setup = build_setup(experiment)
+    _try(experiment, setup)
+    return setup
+
+
+def _try(experiment: Experiment, setup: RaceSetup) -> None:
+    """Run the reward function's module once, let the car stand, and look for the device.
+
+    Raises:
+        BadInput: one of them cannot be used.
+    """
     RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     with reading(f"car {experiment.car.name}", "dimensions, masses and settings of a car that can stand"):
         CarBatch(setup.car, 1, 1)
@@ -175,7 +186,6 @@ def read_files(experiment: Experiment) -> RaceSetup:
         raise BadInput(
             f"device={experiment.device}: PyTorch finds {count(gpus, 'GPU')} here; accepted: {', '.join(names)}"
         )
-    return setup
 
 
 def memory_of_pictures(experiment: Experiment) -> str | None:
@@ -248,6 +258,7 @@ def _begin(
         if isinstance(error, Exception) and (reason := _own_error(error, experiment)):
             raise BadInput(reason) from error
         raise
+    acting.remember()
     for note in composition.notes:
         logger.info(note)
     if teacher is not None:
@@ -299,11 +310,14 @@ def _reopen(
     composition.mapping["runs_dir"] = str(run_dir.parent.parent)
     experiment = parse_experiment(composition.mapping)
     refuse_ended(run_dir, experiment.budget, overrides)
-    setup = read_files(experiment)
+    import_own_classes(experiment)
+    setup = build_setup(experiment)
     memory = memory_of_pictures(experiment)
     checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
     state = read_training(checkpoint)
     refuse_changes(run_dir, state, composition.mapping, setup)
+    acting.refuse_reward(composition.mapping, run_dir.name)
+    _try(experiment, setup)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
     folder = RunFolder(run_dir)
@@ -331,6 +345,9 @@ def _reopen(
     folder.rewind(rows)
     trainer.checkpoints.rewind(iteration, (state["best"] or {}).get("iteration"))
     folder.write(CONFIG, composition.yaml())
+    acting.remember()
+    for note in composition.notes:
+        logger.warning(note)
     where = f"resumes after iteration {iteration}" if iteration else "had no checkpoint yet: begins again"
     logger.info(where)
     _printing(console)(f"{run_dir.name}: {where}")

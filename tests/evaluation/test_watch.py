@@ -204,14 +204,25 @@ def test_the_live_page_is_served_to_this_machine_alone():
         threading.Thread(target=server.serve_forever, daemon=True).start()
         assert server.server_address[0] == "127.0.0.1"
 
-        def get(path: str) -> tuple[int, str]:
+        def get(path: str, **headers: str) -> tuple[int, str]:
             asked = http.client.HTTPConnection(*server.server_address, timeout=10)
-            asked.request("GET", path)
+            asked.request("GET", path, headers=headers)
             answer = asked.getresponse()
             return answer.status, answer.read().decode()
 
         assert [get("/"), get("/version")] == [(200, "<p>laps</p>"), (200, "7")]
         assert get("/../config.yaml")[0] == 404
+        for name in ("localhost", "127.0.0.1:80", "[::1]:9000"):  # through a tunnel
+            assert get("/version", Host=name) == (200, "7")
+        for name in (
+            "",
+            "evil.example",
+            "evil.example:80",
+            "localhost.evil.example",
+            "127.0.0.1.evil.example",
+        ):
+            status, said = get("/", Host=name)
+            assert (status, "laps" in said) == (421, False), name
         with pytest.raises(BadInput, match=f"--port {server.server_port}: .*in use"):
             LiveServer(server.server_port)
         server.shutdown()
@@ -221,7 +232,7 @@ def test_a_browser_that_leaves_before_it_has_the_page_is_no_error(capfd):
     with LiveServer(0) as server:
         server.shown = ("1", "laps " * 2_000_000)
         with socket.create_connection(server.server_address) as browser:
-            browser.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            browser.sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
             browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset at once
         server.process_request_thread(*server.get_request())
     assert capfd.readouterr().err == ""

@@ -1,5 +1,6 @@
 """What is read if a checkpoint is not as it was written."""
 
+import copy
 import functools
 import json
 import os
@@ -184,10 +185,31 @@ def test_checkpoints_are_compared_by_iteration_not_as_words(folder):
     assert intact_checkpoint(folder, "best").name == "1000000"
 
 
-def test_a_run_copied_with_its_links_followed_still_has_a_best(folder, tmp_path):
-    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    assert not (copy / "best").is_symlink()
-    assert intact_checkpoint(copy, "best") == copy / "best"
+@pytest.mark.parametrize("how", ["links followed", "only the links' copies", "links as text"])
+def test_a_run_copied_without_its_links_has_them_again(folder, tmp_path, how):
+    copied = Path(shutil.copytree(folder, tmp_path / "moved" / "checkpoints"))
+    for label, name in (("best", "000020"), ("last", "000040")):
+        assert not (copied / label).is_symlink()
+        if how == "links as text":
+            shutil.rmtree(copied / label)
+            (copied / label).write_text(name)
+        elif how == "only the links' copies":
+            shutil.rmtree(copied / name)
+    assert intact_checkpoint(copied, "best") == copied / "000020"
+    store = CheckpointStore(tmp_path / "moved", keep=4)
+    store.save(make_agent(50), {"iteration": 50, "env_steps": 1}, STATE, best=True)
+    for label in ("best", "last"):
+        assert (copied / label).readlink() == Path("000050")
+
+
+def test_a_best_that_is_no_copy_of_its_checkpoint_stays_as_it_is(folder, tmp_path):
+    copied = Path(shutil.copytree(folder, tmp_path / "copy"))
+    for manifest in ("{", "[]", '{"metadata": {"iteration": "../../up"}}', '{"metadata": {"iteration": -1}}'):
+        (copied / "best" / "manifest.json").write_text(manifest)
+        write_hashes(copied / "best")
+        assert intact_checkpoint(copied, "last") == copied / "000040"
+        assert (copied / "best").is_dir()
+        assert not (copied / "best").is_symlink()
 
 
 def test_unfinished_and_auxiliary_folders_are_not_checkpoints(folder):
@@ -241,6 +263,30 @@ def test_a_pickle_in_a_well_hashed_archive_is_refused_unread(folder):
     file.write_bytes(pickle.dumps(Trap()))
     write_hashes(folder / "000010")
     assert "corrupt" in refusal(folder, "10")
+
+
+@pytest.mark.parametrize("how", ["compressed", "shared"])
+def test_an_archive_that_unpacks_to_more_than_it_has_is_refused_unread(folder, how):
+    file = own(folder / "000010", "state.tdz")
+    if how == "compressed":
+        with zipfile.ZipFile(file, "a", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("tensor_900.memmap", bytes(2**26))
+    else:  # two entries lead to the same bytes
+        with zipfile.ZipFile(file, "a") as archive:
+            one = next(member for member in archive.infolist() if member.filename.startswith("tensor"))
+            for number in range(900, 990):
+                again = copy.copy(one)
+                again.filename = f"tensor_{number}.memmap"
+                archive.filelist.append(again)
+                archive._didModify = True
+    write_hashes(folder / "000010")
+    assert "unpack to" in refusal(folder, "10")
+
+
+def test_a_checkpoint_of_gigabytes_is_refused_before_it_is_read(folder):
+    file = own(folder / "000010", "state.tdz")
+    os.truncate(file, 2**33)  # a sparse file
+    assert "accepted: up to 4 GiB" in refusal(folder, "10")
 
 
 def test_the_weights_are_those_of_the_replacement(folder):

@@ -1,0 +1,185 @@
+"""Values that act: those that run code or a program, or decide where something is sent.
+
+One rule decides which of them a command takes over from a stored run, a study or a trial: those that its user names
+now, on the command line, in an option file or in a script, and those that a run or study of this account has used
+before. Code counts by its contents, everything else by its text. docs/security.md explains it to users.
+"""
+
+import contextlib
+import hashlib
+import importlib.machinery
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.addresses import without_passwords
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_bytes
+
+REWARD = "reward.file"
+_PLAIN_TRACKING = {"kind": "mlflow", "uri": None}
+"""Taken in place of a stored tracking that is not the user's own."""
+_ALERTS = ("alert_command", "alert_webhook")
+_named: dict[str, str] = {}
+"""What this command's user has named: the text of each value, and its mark in the record of this account."""
+
+
+@dataclass(frozen=True)
+class Acting:
+    """A value that acts."""
+
+    key: str
+    text: str
+    """How it is named."""
+    contents: tuple[Path, ...] = ()
+    """The files of its code."""
+
+    @property
+    def mark(self) -> str:
+        """Its name in the record of this account: a hash of the text, of code that of the contents."""
+        digest = hashlib.sha256(f"{self.key}\0{'' if self.key == REWARD else self.text}\0".encode())
+        for file in self.contents:
+            try:
+                digest.update(read_bytes(file, "a Python file"))
+            except BadInput:  # where it is needed, it is refused
+                digest.update(os.fsencode(file))
+        return digest.hexdigest()
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the user has named it, now or before."""
+        if f"{self.key}={self.text}" in _named:
+            return True
+        record = _record()
+        return record is not None and (record / self.mark).exists()
+
+
+def acting(config: Mapping[str, Any]) -> Iterator[Acting]:
+    """Return the values that act among those of an experiment or a sweep, except classes."""
+    file = _part(config, "reward").get("file")
+    if isinstance(file, str):
+        yield reward_file(file)
+    budget = _part(config, "budget")
+    for name in _ALERTS:
+        if isinstance(budget.get(name), str):
+            yield Acting(f"budget.{name}", budget[name])
+    tracking = _part(config, "tracking")
+    if tracking.get("kind") == "wandb" or tracking.get("uri") is not None:
+        yield Acting("tracking", _text(tracking))
+    executor = _part(_part(config, "sweep"), "executor")
+    if executor.get("kind", "local") != "local":
+        yield Acting("sweep.executor", _text(executor))
+
+
+def class_of(target: str) -> Acting:
+    """Return the class `package.module:Class` as a value that acts; nothing is imported."""
+    return Acting("target", target, tuple(_files_of(target.partition(":")[0])))
+
+
+def reward_file(file: str) -> Acting:
+    """Return a file with a reward function as a value that acts."""
+    path = Path(file).absolute()
+    return Acting(REWARD, str(path), (path,))
+
+
+def name(values: Sequence[Acting]) -> None:
+    """Note that the user names these values now."""
+    for one in values:
+        _named[f"{one.key}={one.text}"] = one.mark
+
+
+def named() -> dict[str, str]:
+    """Return what was named in this process, for `take_over_named` in one that works for it."""
+    return dict(_named)
+
+
+def take_over_named(values: Mapping[str, str]) -> None:
+    """Take over what was named in the process that this one works for."""
+    _named.update(values)
+
+
+def remember() -> None:
+    """Record for this account what was named, once a run or a study has begun with it."""
+    record = _record()
+    if record is None or not _named:
+        return
+    # Without a home that can be written, the values are named again each time.
+    with contextlib.suppress(OSError):
+        record.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for mark in _named.values():
+            (record / mark).touch(mode=0o600)
+
+
+def take_over(config: dict[str, Any], where: str) -> list[str]:
+    """Leave out of a stored configuration what acts and is not the user's own; return a line for each such value.
+
+    Code stays as text: `refuse_reward` and `load_class` decide about it before it is run.
+
+    Args:
+        config: all values, changed in place.
+        where: what stores them, for the lines.
+    """
+    left_out = []
+    for one in list(acting(config)):
+        if one.is_own or one.key == REWARD:
+            continue
+        group, _, key = one.key.partition(".")
+        if group == "tracking":
+            config[group] = dict(_PLAIN_TRACKING)
+        elif group == "budget":
+            config[group] = {**config[group], key: None}
+        else:
+            config[group] = {**config[group], key: {"kind": "local"}}
+        left_out.append(
+            f"{one.key}={without_passwords(one.text)}: not taken over from {where}: you have not used it before; give "
+            f"{one.key} yourself to use it"
+        )
+    return left_out
+
+
+def refuse_reward(config: Mapping[str, Any], where: str) -> None:
+    """Refuse to run a reward function that only a stored configuration names.
+
+    Raises:
+        BadInput: the message says how the user names it.
+    """
+    file = _part(config, "reward").get("file")
+    if isinstance(file, str) and not reward_file(file).is_own:
+        raise BadInput(
+            f"{REWARD}={file}: named by {where}, and not a reward function that you have trained with, or changed "
+            f"since; read it, and if you trust it, give {REWARD}={file}"
+        )
+
+
+def _part(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    part = config.get(key)
+    return part if isinstance(part, Mapping) else {}
+
+
+def _text(group: Mapping[str, Any]) -> str:
+    return json.dumps(group, sort_keys=True)
+
+
+def _record() -> Path | None:
+    """Return the folder of this account's record: an empty file for each value; None: it has no home."""
+    with contextlib.suppress(RuntimeError):
+        base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        return Path(base) / "deepracer_exp" / "named"
+    return None
+
+
+def _files_of(module: str) -> Iterator[Path]:
+    """Return the files that the import of a module runs first: those of its packages and its own."""
+    path: Sequence[str] | None = [*sys.path, str(Path.cwd())]
+    parts = module.split(".")
+    for depth in range(len(parts)):
+        spec = importlib.machinery.PathFinder.find_spec(".".join(parts[: depth + 1]), path)
+        if spec is None:
+            return
+        if spec.has_location and spec.origin is not None:
+            yield Path(spec.origin)
+        path = list(spec.submodule_search_locations or ())
