@@ -19,6 +19,7 @@ from deepracer_exp.commands import analyze, evaluate, files, runs, train
 from deepracer_exp.commands.arguments import refuse_old_spellings
 from deepracer_exp.errors import BadInput, RunFailed, nearest
 from deepracer_exp.lifeline import die_with_parent, guard_imports
+from deepracer_exp.scratch import own_scratch
 
 _COMMANDS = (train, runs, evaluate, analyze, files)
 """In the order of `--help`."""
@@ -46,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         args = parse(sys.argv[1:] if arguments is None else arguments)
     except BadInput as error:
         sys.exit(_fail(error, BadInput.exit_code, args))
+    if arguments is None:
+        own_scratch()
     if arguments is None and getattr(args, "runs_rewards", False):
         sys.exit(supervised(lambda: _call(args)))
     sys.exit(_call(args))

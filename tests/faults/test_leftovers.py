@@ -1,0 +1,74 @@
+"""What a killed command leaves outside of its run folder is cleared away by the next one."""
+
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import command
+
+pytestmark = pytest.mark.slow
+SHM = Path("/dev/shm")
+
+
+@pytest.fixture
+def scratch():
+    """Yield an empty folder for temporary files, with a path short enough for sockets."""
+    folder = Path(tempfile.mkdtemp(prefix="s-", dir="/tmp"))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def left(scratch: Path) -> set[str]:
+    """Return what lies there, without the one cache that PyTorch keeps for all processes."""
+    return {one.name for one in scratch.iterdir() if not one.name.startswith("torchinductor_")}
+
+
+def semaphores(names: set[str]) -> list[str]:
+    """Return the semaphores of commands, by the names of their folders."""
+    return [file.name for file in SHM.glob("sem.*") if any(name in file.name for name in names)]
+
+
+def test_the_next_command_clears_what_kill_9_has_left(start, scratch):
+    training = start(
+        "train",
+        "experiment=tiny",
+        "tracking=off",
+        "collector=sync",
+        "collector.processes=2",
+        "budget.env_steps=10000000",
+        env={"TMPDIR": str(scratch)},
+    )
+    training.wait_for_iterations(2)
+    names = left(scratch)
+    assert names, "nothing to be left"
+    assert all(name.startswith("deepracer_exp-") for name in names), names
+
+    def another() -> None:
+        environment = os.environ | {"TMPDIR": str(scratch)}
+        subprocess.run(command("runs"), cwd=training.cwd, env=environment, check=True, capture_output=True)
+
+    another()
+    assert left(scratch) == names, "the folder of a living command is gone"
+    for process in training.processes():
+        process.kill()
+    training.popen.wait()
+    assert left(scratch) == names
+    another()
+    assert not left(scratch)
+    assert not semaphores(names)
+
+
+def test_a_command_that_ends_leaves_nothing(start, scratch):
+    options = ("train", "experiment=tiny", "collector=sync", "collector.processes=2")
+    training = start(*options, "budget.env_steps=100000000", env={"TMPDIR": str(scratch)})
+    training.wait_for_iterations(1)
+    names = left(scratch)
+    training.popen.send_signal(signal.SIGTERM)
+    assert training.end().code == 143
+    assert not left(scratch)
+    assert not semaphores(names)
