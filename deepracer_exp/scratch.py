@@ -4,7 +4,6 @@ They lie in a folder of the command's own, or carry its name, so that the next c
 has left.
 """
 
-import atexit
 import fcntl
 import multiprocessing
 import os
@@ -12,6 +11,7 @@ import shutil
 import sys
 import tempfile
 from contextlib import suppress
+from multiprocessing import util
 from pathlib import Path
 
 _PREFIX = "deepracer_exp-"
@@ -36,7 +36,8 @@ def own_scratch() -> None:
         # Locked as long as this process or one that it forked lives; a command that cleared it away at this moment has
         # left nothing to lock.
         fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        # After multiprocessing has removed its own (-100), and in this process, not in one that it forked.
+        util.Finalize(None, shutil.rmtree, (folder, True), exitpriority=-200)
         tempfile.tempdir = str(folder)
         if sys.platform == "linux":  # elsewhere the name is too long
             multiprocessing.current_process()._config["semprefix"] = f"/{folder.name}"  # type: ignore[attr-defined]
