@@ -12,6 +12,7 @@ import optuna
 import pytest
 import sqlalchemy as sa
 
+from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput, RunFailed
 from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage, patiently, resolve_database
@@ -119,6 +120,25 @@ def test_a_database_of_another_program_is_refused_and_left_as_it_is(url):
     assert "a database of their own" in refused(open_storage, url, Path())
     assert sa.inspect(engine).get_table_names() == ["alembic_version"]
     engine.dispose()
+
+
+@pytest.mark.parametrize("where", ["PGPASSWORD", "PGPASSFILE", "oc.env"])
+def test_a_password_need_not_stand_on_the_command_line(postgres_server, where, monkeypatch, tmp_path):
+    whole = postgres_server.new_database()
+    address = sa.make_url(whole).set(password=None).render_as_string(hide_password=False)
+    if where == "PGPASSWORD":
+        monkeypatch.setenv("PGPASSWORD", postgres_server.password)
+    elif where == "PGPASSFILE":  # or ~/.pgpass
+        file = tmp_path / "pgpass"
+        word = postgres_server.password.replace("\\", r"\\").replace(":", r"\:")
+        file.write_text(f"127.0.0.1:*:*:racer:{word}\n")
+        file.chmod(0o600)
+        monkeypatch.setenv("PGPASSFILE", str(file))
+    else:
+        monkeypatch.setenv("STUDY_DB", whole)
+        address = compose_sweep(["sweep.storage=${oc.env:STUDY_DB}"]).entry.sweep.storage
+    assert postgres_server.password not in address
+    optuna.create_study(study_name=where, storage=open_storage(address, Path()))
 
 
 def test_no_password_is_shown_by_a_storage_nor_by_a_server_that_refuses(postgres_server):
