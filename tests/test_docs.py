@@ -123,6 +123,7 @@ def folder(tmp_path_factory):
 def test_every_command_shown_is_accepted(words, folder, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("HOME", str(folder))
+    monkeypatch.setenv("STUDY_DB", "postgresql+psycopg://racer@host/study")
     words = [re.sub(r"~/deepracer-for-cloud/custom_files", "DIR", word) for word in words]
     words = [word.replace("track=NAME", "track=Oval_track") for word in words]
     args = parse(words)

@@ -99,7 +99,7 @@ def test_a_run_of_a_stranger_runs_no_command_and_sends_nothing_to_its_server(
     assert listener[1] == []
     if command in ("clone", "resume"):
         assert ended.code == 0, ended.stderr
-        for key in ("budget.alert_command", "tracking"):
+        for key in ("budget.alert_command", "tracking.uri"):
             assert f"{key}=" in ended.stderr
         assert "not taken over" in ended.stderr
         (made,) = (one for one in ended.folders if command == "resume" or one != run)

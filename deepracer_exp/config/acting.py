@@ -8,7 +8,6 @@ before. Code counts by its contents, everything else by its text. docs/security.
 import contextlib
 import hashlib
 import importlib.machinery
-import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -55,7 +54,10 @@ class Acting:
         if f"{self.key}={self.text}" in _named:
             return True
         record = _record()
-        return record is not None and (record / self.mark).exists()
+        if record is None or not (record / self.mark).exists():
+            return False
+        name([self])  # for the processes that work for this one, perhaps on other machines
+        return True
 
 
 def acting(config: Mapping[str, Any]) -> Iterator[Acting]:
@@ -68,11 +70,13 @@ def acting(config: Mapping[str, Any]) -> Iterator[Acting]:
         if isinstance(budget.get(name), str):
             yield Acting(f"budget.{name}", budget[name])
     tracking = _part(config, "tracking")
-    if tracking.get("kind") == "wandb" or tracking.get("uri") is not None:
-        yield Acting("tracking", _text(tracking))
+    if tracking.get("uri") is not None:
+        yield Acting("tracking.uri", str(tracking["uri"]))
+    if tracking.get("kind") == "wandb":
+        yield Acting("tracking.project", f"{tracking.get('entity')}/{tracking.get('project')}")
     executor = _part(_part(config, "sweep"), "executor")
     if executor.get("kind", "local") != "local":
-        yield Acting("sweep.executor", _text(executor))
+        yield Acting("sweep.executor.address", str(executor.get("address")))
 
 
 def class_of(target: str) -> Acting:
@@ -127,7 +131,7 @@ def take_over(config: dict[str, Any], where: str) -> list[str]:
     for one in list(acting(config)):
         if one.is_own or one.key == REWARD:
             continue
-        group, _, key = one.key.partition(".")
+        group, key, *_ = one.key.split(".")
         if group == "tracking":
             config[group] = dict(_PLAIN_TRACKING)
         elif group == "budget":
@@ -135,8 +139,8 @@ def take_over(config: dict[str, Any], where: str) -> list[str]:
         else:
             config[group] = {**config[group], key: {"kind": "local"}}
         left_out.append(
-            f"{one.key}={without_passwords(one.text)}: not taken over from {where}: you have not used it before; give "
-            f"{one.key} yourself to use it"
+            f"{one.key}={without_passwords(one.text)}: not taken over from {where}, because you have not used it "
+            "before; repeat it to use it"
         )
     return left_out
 
@@ -158,10 +162,6 @@ def refuse_reward(config: Mapping[str, Any], where: str) -> None:
 def _part(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     part = config.get(key)
     return part if isinstance(part, Mapping) else {}
-
-
-def _text(group: Mapping[str, Any]) -> str:
-    return json.dumps(group, sort_keys=True)
 
 
 def _record() -> Path | None:
