@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
+from .waiting import PATIENCE_S
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason="chromium is not installed (apt-get install chromium)"
 )
-PATIENCE_S = 150.0
-"""For a page on a machine that may be busy."""
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -84,9 +84,7 @@ class Tab:
         """Wait until an expression is true."""
         give_up_at = time.monotonic() + PATIENCE_S
         while not self.evaluate(condition):
-            assert time.monotonic() < give_up_at, (
-                f"not within {PATIENCE_S:.0f} s: {condition}; {self.complaints}"
-            )
+            assert time.monotonic() < give_up_at, f"no {condition}; {self.complaints}"
             time.sleep(0.05)
 
     def picture(self, path: Path, selector: str = "html") -> Path:

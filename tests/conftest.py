@@ -28,6 +28,7 @@ from deepracer_exp.errors import BadInput
 
 from .browser import chromium, tab
 from .postgres import postgres, postgres_server
+from .waiting import PATIENCE_S
 
 __all__ = ["chromium", "postgres", "postgres_server", "tab"]
 
@@ -55,8 +56,6 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(50_000, 20, 20)
 
 
-PATIENCE_S = 240.0
-"""For what must happen, on a machine that may be busy."""
 _MARK = "DEEPRACER_EXP_STARTED_BY"
 """Variable of the environment that a command hands on to all that it starts."""
 

@@ -4,10 +4,8 @@ import os
 import pwd
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
-import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +13,8 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-PATIENCE_S = 120.0
+from .ports import find_port
+from .waiting import PATIENCE_S, wait_until
 
 
 class Postgres:
@@ -28,9 +27,7 @@ class Postgres:
         self._user = pwd.getpwnam("postgres") if os.getuid() == 0 else None
         self._programs = programs
         self.folder = Path(tempfile.mkdtemp(prefix="sweeps-pg-", dir="/tmp"))
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
+        self.port = find_port()
         words = self.folder / "password"
         words.write_text(self.password)
         if self._user:
@@ -87,15 +84,16 @@ class Postgres:
                 ],
                 cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log, **self._as_user(),
             )  # fmt: skip
-        until = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                self.execute("SELECT 1")
-                return
-            except sa.exc.OperationalError:
-                assert time.monotonic() < until, (self.folder / "log").read_text()
-                assert self._process.poll() is None, (self.folder / "log").read_text()
-                time.sleep(0.05)
+        wait_until(self._answers, "answer of PostgreSQL")
+
+    def _answers(self) -> bool:
+        assert self._process is not None
+        assert self._process.poll() is None, (self.folder / "log").read_text()
+        try:
+            self.execute("SELECT 1")
+        except sa.exc.OperationalError:
+            return False
+        return True
 
     @property
     def runs(self) -> bool:

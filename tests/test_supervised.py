@@ -4,9 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
+import psutil
 import pytest
+
+from tests.waiting import wait_until
 
 HEAD = """
 import os, signal, sys, time
@@ -81,13 +83,5 @@ def test_the_child_dies_with_its_supervisor() -> None:
     child = int(process.stdout.readline())
     process.kill()
     process.wait()
-    give_up_at = time.monotonic() + 10
-    while time.monotonic() < give_up_at:
-        try:
-            os.kill(child, 0)
-        except ProcessLookupError:
-            break
-        time.sleep(0.02)
-    else:
-        pytest.fail("it lives on")
+    wait_until(lambda: not psutil.pid_exists(child), "end of the child")
     process.communicate()

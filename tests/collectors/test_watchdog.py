@@ -7,6 +7,7 @@ import pytest
 
 from deepracer_exp.collectors import watchdog
 from deepracer_exp.collectors.watchdog import Watchdog
+from tests.waiting import PATIENCE_S, wait_until
 
 
 @pytest.fixture
@@ -44,13 +45,6 @@ def beats(tmp_path):
     return lambda: np.memmap(tmp_path / "beats", np.int64, "r+")
 
 
-def _wait_until(condition) -> None:
-    give_up_at = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < give_up_at
-        time.sleep(0.02)
-
-
 def _keep_beating(counters, workers, dog) -> None:
     """Let workers make steps until another one is ended."""
 
@@ -58,7 +52,7 @@ def _keep_beating(counters, workers, dog) -> None:
         counters[workers] += 1
         return bool(dog.verdict)
 
-    _wait_until(is_over)
+    wait_until(is_over)
 
 
 def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, processes):
@@ -69,7 +63,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
-    processes[0].join(60)
+    processes[0].join(PATIENCE_S)
     assert processes[0].exitcode == -signal.SIGKILL
     assert processes[1].is_alive()
 
@@ -79,7 +73,7 @@ def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats):
     beats()[:] = 10
     dog.expect()
     dog.delivered(0)
-    _wait_until(lambda: dog.verdict)
+    wait_until(lambda: dog.verdict)
     assert list(dog.verdict) == [1]
 
 

@@ -2,10 +2,11 @@
 
 import json
 import threading
-import time
 
 import numpy as np
 import pytest
+
+from tests.waiting import wait_until
 
 
 @pytest.mark.parametrize("size_kib", [150, 200, 300, 500])
@@ -69,12 +70,8 @@ def test_a_folder_that_vanishes_during_the_training_ends_the_run_with_one_line(
     train_here, tmp_path, tracking
 ):
     def vanish() -> None:
-        give_up_at = time.monotonic() + 120
-        while time.monotonic() < give_up_at:
-            for metrics in tmp_path.glob("runs/*/*/metrics.jsonl"):
-                metrics.parent.rename(tmp_path / "gone")
-                return
-            time.sleep(0.01)
+        files = wait_until(lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration")
+        files[0].parent.rename(tmp_path / "gone")
 
     threading.Thread(target=vanish).start()
     ended = train_here("budget.env_steps=100000000", f"tracking={tracking}")

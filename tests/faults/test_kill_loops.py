@@ -17,8 +17,9 @@ import psutil
 import pytest
 
 from deepracer_exp.runs.files import read_metrics, read_object
+from tests.waiting import PATIENCE_S
 
-from .test_killed_sweeps import PATIENCE_S, Sweep, assert_every_trial_is_accounted_for_once, claims
+from .test_killed_sweeps import Sweep, assert_every_trial_is_accounted_for_once, claims
 
 KILLS = int(os.environ.get("FAULT_TIMES", "1"))
 GONE_S = 10.0

@@ -3,13 +3,13 @@
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.tracking.metrics import metric_name
+from tests.waiting import wait_until
 
 
 @pytest.mark.slow
@@ -48,9 +48,7 @@ def test_a_store_whose_creation_was_killed_is_created_again(tmp_path):
     killed = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert killed.stdout is not None
     killed.stdout.readline()
-    give_up_at = time.monotonic() + 120
-    while not list(tmp_path.glob(".mlflow.db.new*")) and time.monotonic() < give_up_at:
-        time.sleep(0.005)
+    wait_until(lambda: list(tmp_path.glob(".mlflow.db.new*")), "new store")
     killed.kill()
     killed.wait()
     assert not (tmp_path / "mlflow.db").exists()

@@ -18,6 +18,7 @@ import pytest
 from deepracer_exp.runs.files import read_metrics, read_object
 from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage
+from tests.waiting import PATIENCE_S
 
 TIMES = range(int(os.environ.get("FAULT_TIMES", "1")))
 TRIALS, ITERATIONS = 3, 6
@@ -27,7 +28,6 @@ SWEEP = (
     *("algorithm.lr=tag(log,interval(1e-5,1e-3))", "sweep.protocol=three_trials", "sweep.rerank=0"),
     *(f"sweep.trials={TRIALS}", "sweep.lease_s=6"),
 )
-PATIENCE_S = 240.0
 SOON_S = 20.0
 """Ten seconds, on a machine that may be busy."""
 

@@ -15,10 +15,10 @@ import sqlalchemy as sa
 from deepracer_exp.commands.startup import start_workers_early
 from sweeps.claims import TrialClaims
 from sweeps.storage import resolve_database
+from tests.waiting import PATIENCE_S
 
 from .studies import season
 
-PATIENCE_S = 120.0
 MYSQL = "SWEEPS_TEST_MYSQL"
 """Names a variable with the URL of a MySQL server whose user may make databases; the tests run on it, too."""
 

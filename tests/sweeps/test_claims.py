@@ -6,6 +6,7 @@ import time
 import sqlalchemy as sa
 
 from sweeps.claims import TrialClaims, TrialResult
+from tests.waiting import wait_until
 
 from .racer import claim_all
 
@@ -62,10 +63,7 @@ def test_a_lease_expires_by_itself_and_not_before(claims):
     assert claims.renew(late, lease_s)
     claim = claims.all()[0]
     assert claim.progress == {"completion": 12.5}
-    until = time.monotonic() + 60.0
-    while (heir := claims.claim("heir", 1, HOUR_S)) is None:
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    heir = wait_until(lambda: claims.claim("heir", 1, HOUR_S), "claim")
     assert time.monotonic() - began > 0.95 * lease_s
     assert (heir.index, heir.attempt) == (claim.index, 2)
 

@@ -15,11 +15,11 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.tracking.store import Store
 from sweeps.ray_launcher import refuse_files
+from tests.waiting import PATIENCE_S
 
 from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, claims  # noqa: TID252
 
 pytestmark = pytest.mark.timeout(600)
-PATIENCE_S = 280.0
 """Longer than that of other tests: three processes import PyTorch one after the other."""
 _MEMORY = 80 * 2**20
 """Bytes of shared memory a node has for objects."""

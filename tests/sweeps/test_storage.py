@@ -18,6 +18,7 @@ from sweeps.claims import TrialClaims
 from sweeps.storage import open_storage, patiently, resolve_database
 from sweeps.study import load_study
 from tests.conftest import refused
+from tests.waiting import PATIENCE_S, wait_until
 
 from .racer import make_trials
 
@@ -164,10 +165,7 @@ def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
     TrialClaims(storage.engine, "study").claim("one", 1, HOUR_S)
     name = sa.make_url(url).database
     count = f"SELECT count(*) FROM pg_stat_activity WHERE datname = '{name}'"
-    until = time.monotonic() + 60.0
-    while postgres_server.execute(count)[0][0]:
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_until(lambda: not postgres_server.execute(count)[0][0], "end of the connections")
 
 
 def test_a_stopped_process_holds_a_row_of_postgresql_for_a_minute_at_most(postgres_server):
@@ -196,7 +194,7 @@ def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
         time.sleep(0.5)
         assert not any(one.done() for one in waiting)
         postgres.start()
-        assert [one.result(120.0) for one in waiting] == [True, True, "COMPLETE", 1]
+        assert [one.result(PATIENCE_S) for one in waiting] == [True, True, "COMPLETE", 1]
     assert claims.all()[0].trial_id == trial._trial_id
 
 

@@ -2,10 +2,8 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +18,8 @@ from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.tracker import MLflowTracker
+from tests import waiting
+from tests.ports import find_port
 
 
 @pytest.fixture(scope="session")
@@ -67,21 +67,13 @@ def points(client: MlflowClient, run_id: str | None, column: str = "completion")
 
 
 @pytest.fixture
-def wait_until() -> Callable[[Callable[[], bool]], None]:
-    def wait(is_true: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 60
-        while not is_true():
-            assert time.monotonic() < deadline, "never became true"
-            time.sleep(0.02)
-
-    return wait
+def wait_until() -> Callable[[Callable[[], object]], object]:
+    return waiting.wait_until
 
 
 @pytest.fixture
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    return find_port()
 
 
 class Server:
@@ -106,14 +98,14 @@ class Server:
             self._command, env=environment, start_new_session=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        deadline = time.monotonic() + 90
-        while True:
-            try:
-                urllib.request.urlopen(f"{self.uri}/health", timeout=5).close()
-                return
-            except OSError:
-                assert time.monotonic() < deadline, "the server never answered"
-                time.sleep(0.2)
+        waiting.wait_until(self._answers, "answer of the server")
+
+    def _answers(self) -> bool:
+        try:
+            urllib.request.urlopen(f"{self.uri}/health", timeout=5).close()
+        except OSError:
+            return False
+        return True
 
     def signal(self, signum: int) -> None:
         assert self._process is not None

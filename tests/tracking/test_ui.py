@@ -16,6 +16,7 @@ from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import existing_store
 from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.ui import running_ui, runs_page, serve_ui
+from tests.waiting import PATIENCE_S
 
 NAMES = {"track": "reinvent_base", "reward": "progress_per_step", "network": "mlp_small"}
 
@@ -90,6 +91,6 @@ def test_the_ui_ends_with_its_command_and_leaves_no_process(store, tmp_path, fre
     below = psutil.Process(command.pid).children(recursive=True)
     assert below
     command.send_signal(signum)
-    assert command.wait(30) == code
-    _, left = psutil.wait_procs(below, 10.0)
+    assert command.wait(PATIENCE_S) == code
+    _, left = psutil.wait_procs(below, PATIENCE_S)
     assert not left

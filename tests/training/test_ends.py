@@ -4,7 +4,6 @@ import os
 import shlex
 import signal
 import threading
-import time
 
 import pytest
 
@@ -17,6 +16,7 @@ from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.training.callbacks import write_pictures
 from deepracer_exp.training.stopping_replay import replay
+from tests.waiting import wait_until
 
 NOT_LEARNING = (
     *("stopping=entropy", "stopping.window=1", "stopping.converged=null", "stopping.collapsed=null"),
@@ -76,13 +76,13 @@ def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
 
 def ctrl_c_after(iterations, folder) -> None:
     """Send Ctrl-C to this process as soon as a run below a folder has as many iterations."""
-    give_up_at = time.monotonic() + 120
-    while time.monotonic() < give_up_at:
+
+    def recorded() -> bool:
         files = list(folder.glob("runs/*/*/metrics.jsonl"))
-        if files and files[0].read_text().count("\n") >= iterations:
-            os.kill(os.getpid(), signal.SIGINT)
-            return
-        time.sleep(0.01)
+        return bool(files) and files[0].read_text().count("\n") >= iterations
+
+    wait_until(recorded, f"{iterations} iterations")
+    os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.parametrize("end", ["budget", "ctrl-c"])

@@ -1,0 +1,19 @@
+"""Waiting for what must happen, however busy the machine is."""
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+Value = TypeVar("Value")
+
+PATIENCE_S = 240.0
+"""Below the time that pytest gives a test."""
+
+
+def wait_until(condition: Callable[[], Value], what: str = "it") -> Value:
+    """Wait until a condition holds and return it."""
+    give_up_at = time.monotonic() + PATIENCE_S
+    while not (value := condition()):
+        assert time.monotonic() < give_up_at, f"no {what} within {PATIENCE_S:g} s"
+        time.sleep(0.02)
+    return value
