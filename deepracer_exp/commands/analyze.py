@@ -20,6 +20,7 @@ from .arguments import (
     runs_and_overrides,
 )
 from .output import table_console, warnings_on_stderr
+from .replay import add_replay, check_replay, write_laps
 from .startup import check_policy
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ _ANALYZE_EPILOG = """\
   deepracer-exp analyze RUN --compare RUN logs/             compare how it and others learned
   deepracer-exp analyze RUN --reward racing_line            what another reward function would have paid for
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
+  deepracer-exp analyze RUN --compare logs/ --replay laps.html
+                                                            the fastest lap of each, driven beside each other
 
 The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
 read and why.
@@ -76,6 +79,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="reward function, of the zoo or a file, to replay on its steps",
     )
     parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
+    add_replay(parser, "its fastest lap and that of the first of --compare, or an ordinary one")
     _add_page(parser, "report.html of a run, else NAME-analysis.html")
 
     parser = add_command(
@@ -117,6 +121,7 @@ def _analyze(args: argparse.Namespace) -> int:
     place = _place(logs[0], stores)
     beside = [_place(what, stores) for what in args.compare if not is_override(what)]
     _check_output(args.output)
+    check_replay(args.replay)
     reward = None
     if args.reward is not None:
         from deepracer_exp.rewards.source import named_reward_source
@@ -124,6 +129,7 @@ def _analyze(args: argparse.Namespace) -> int:
         reward = named_reward_source(args.reward)
 
     from deepracer_exp.analysis.findings import findings
+    from deepracer_exp.analysis.lap_replay import laps_of_log
     from deepracer_exp.analysis.log_report import LogPage, write_page
     from deepracer_exp.analysis.log_tables import headline
     from deepracer_exp.analysis.log_view import prepare
@@ -144,13 +150,19 @@ def _analyze(args: argparse.Namespace) -> int:
         from deepracer_exp.evaluation.sight import run_glimpses
 
         view, strip = run_glimpses(view, place)
-    others = [_light(prepare(read_log(other))) for other in beside]
+    others, rival = [], None
+    for other in beside:
+        compared = prepare(read_log(other))
+        rival = rival or compared
+        others.append(_light(compared))
     replay = None if reward is None else replay_reward(view, reward, car)
     default = place / REPORT if is_own_run(place) else _page("analysis", recording.name)
     out = Path(args.output or default)
     found = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
         write_page(out, LogPage(view, found, others, replay, terms, strip))
+    if args.replay is not None:
+        write_laps(args.replay, laps_of_log(view, rival))
 
     print(f"{view.name}: {headline(view)}")
     for number, one in enumerate(found, 1):
@@ -160,6 +172,8 @@ def _analyze(args: argparse.Namespace) -> int:
     if view.problems:
         print(f"\n  {count(len(view.problems), 'problem')} while reading, the first: {view.problems[0]}")
     _end(out, args.open)
+    if args.replay is not None:
+        print(f"  laps  {args.replay}")
     return 0
 
 

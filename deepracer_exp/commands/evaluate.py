@@ -11,6 +11,7 @@ from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides, split_stores
 from .output import table_console, warnings_on_stderr
+from .replay import add_replay, check_replay, write_laps
 from .startup import check_policy
 
 if TYPE_CHECKING:
@@ -66,12 +67,16 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         runs_rewards=True,
         entry="evaluate",
     )
-    add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
+    add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE", many=True)
+    parser.usage = (
+        "%(prog)s [-h] [-o FILE] [--live] [--port PORT] [--replay PAGE.html] RUN [RUN | LOGS] [KEY=VALUE ...]"
+    )
     parser.add_argument(
         *("-o", "--output"), metavar="FILE", help="film to write (.mp4; default: films/ in the run's folder)"
     )
     parser.add_argument("--live", action="store_true", help="serve a page that follows the training")
     parser.add_argument("--port", type=port, help="port of the page (default: a free one)")
+    add_replay(parser, "its best lap and an ordinary one, or the best of another run or of logs")
 
     parser = add_command(
         commands,
@@ -149,7 +154,7 @@ def _policy(config: "EvaluateConfig") -> "StoredRun":
 
 
 def _checkpoints_given(args: argparse.Namespace) -> list[str]:
-    return [given for given in run_and_overrides(args)[1] if given.startswith("checkpoint=")]
+    return [given for given in runs_and_overrides(args)[1] if given.startswith("checkpoint=")]
 
 
 _WATCH_EPILOG = """\
@@ -157,6 +162,8 @@ _WATCH_EPILOG = """\
   deepracer-exp watch RUN checkpoint=last -o last.mp4
   deepracer-exp watch RUN evaluation.tracks=[Oval_track]    on another track
   deepracer-exp watch RUN --live                            a page that follows the training
+  deepracer-exp watch RUN --replay laps.html                a page: its best lap beside an ordinary one
+  deepracer-exp watch RUN RUN --replay laps.html            or beside the best lap of another run, or of logs
 
 The page shows the laps that the training evaluates its policy by; evaluation=NAME shows others.
 """
@@ -170,6 +177,8 @@ def _watch(args: argparse.Namespace) -> int:
         )
     if args.port is not None and not args.live:
         raise BadInput(f"--port {args.port}: accepted: only with --live")
+    if args.replay is not None:
+        return _replay_laps(args)
     if args.output is not None:
         _check_film("--output", Path(args.output))
     config, own_trials = _composed(args)
@@ -199,6 +208,46 @@ def _watch(args: argparse.Namespace) -> int:
         from deepracer_exp.evaluation.live import serve_live
 
         serve_live(stored, protocol, server)
+    return 0
+
+
+def _replay_laps(args: argparse.Namespace) -> int:
+    check_replay(args.replay)
+    if args.live or args.output is not None:
+        other = "--live" if args.live else f"--output {args.output}"
+        raise BadInput(f"--replay {args.replay}: accepted: without {other}")
+    runs, overrides = runs_and_overrides(args)
+    if not 1 <= len(runs) <= 2:
+        raise BadInput(
+            f"{' '.join(runs) or 'RUN'}: {len(runs)} given; accepted: a run, and another one or logs"
+        )
+    args.runs, args.overrides = runs[:1], overrides
+    config, own_trials = _composed(args)
+    run, rival, view = _policy(config), None, None
+    if runs[1:]:
+        from deepracer_exp.runs.files import is_run
+
+        place = Path(runs[1]).expanduser()
+        if place.exists() and not is_run(place):
+            from deepracer_exp.analysis.against_log import prepare_races
+            from deepracer_exp.deepracer.recording_reader import read_recording
+
+            view = prepare_races(read_recording(place))
+        else:
+            rival = check_policy(runs[1], config.runs_dir, config.tracking.uri, None)
+
+    from deepracer_exp.analysis.lap_replay import fastest_lap_of_log
+    from deepracer_exp.evaluation.driven_laps import drive_laps
+
+    protocol = run.experiment.evaluation if own_trials else config.evaluation
+    with warnings_on_stderr():
+        laps = drive_laps(run, config.checkpoint, protocol, ordinary=not runs[1:])
+        if view is not None:
+            laps.append(fastest_lap_of_log(view, laps[0]))
+        elif rival is not None:
+            laps += drive_laps(rival, None, protocol, beside=laps[0])
+    write_laps(args.replay, laps)
+    print(f"  laps  {args.replay}")
     return 0
 
 

@@ -25,6 +25,8 @@ from .arguments import (
     runs_and_overrides,
 )
 from .output import table_console
+from .replay import add_replay, check_replay, write_laps
+from .startup import check_policy
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,6 +45,7 @@ _EPILOG = """\
   deepracer-exp runs                                        list the runs, newest first
   deepracer-exp runs compare runs/default/*                 all runs of an experiment
   deepracer-exp runs compare RUN RUN -o better.html         draw their learning curves and lap times, too
+  deepracer-exp runs compare RUN RUN --replay laps.html     their fastest laps, driven beside each other
   deepracer-exp runs lineage RUN
   deepracer-exp runs promote RUN                            its best checkpoint, as EXPERIMENT@champion
   deepracer-exp runs promote best:default --alias rain      the best run of an experiment
@@ -97,6 +100,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     compare.add_argument(
         "-o", "--output", metavar="PAGE.html", help="draw learning curves and lap times on this page"
     )
+    add_replay(compare, "the fastest lap of each run's best checkpoint")
 
     lineage = add_command(
         actions,
@@ -222,6 +226,7 @@ def _compare(args: argparse.Namespace) -> int:
 
     if args.output is not None and Path(args.output).suffix != ".html":
         raise BadInput(f"--output {args.output}: accepted: the name of a page (.html)")
+    check_replay(args.replay)
     runs, overrides = runs_and_overrides(args)
     stores = read_stores(overrides)
     folders: dict[Path, None] = {}
@@ -237,6 +242,8 @@ def _compare(args: argparse.Namespace) -> int:
         raise BadInput(
             f"{count(len(folders), 'run')} given; accepted: 2 to {len(ascii_uppercase)} different ones"
         )
+    if args.replay is not None and len(folders) > 2:
+        raise BadInput(f"--replay {args.replay}: {len(folders)} runs given; accepted: two")
     records = [read_record(folder) for folder in folders]
     for record in records:
         if not record.rows:
@@ -257,6 +264,14 @@ def _compare(args: argparse.Namespace) -> int:
         console.print(table)
     if args.output is not None:
         console.print(f"\n{args.output}: learning curves", soft_wrap=True)
+    if args.replay is not None:
+        stored = [check_policy(str(folder), str(stores.runs_dir), stores.uri, None) for folder in folders]
+        from deepracer_exp.evaluation.driven_laps import drive_laps
+
+        protocol = stored[0].experiment.evaluation
+        (first,) = drive_laps(stored[0], None, protocol)
+        write_laps(args.replay, [first, *drive_laps(stored[1], None, protocol, beside=first)])
+        console.print(f"\n{args.replay}: the fastest laps of their best checkpoints", soft_wrap=True)
     return 0
 
 

@@ -1,7 +1,7 @@
 """A lap of an evaluation, recorded step by step, its poses between the steps, and the encoder of its film."""
 
 import io
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -154,11 +154,13 @@ def _within(
     return (now_s > before_s) & after_begin & before_end
 
 
-def best_attempt(evaluation: Evaluation) -> Attempt:
-    """Return the fastest lap on the usual conditions, or the one with the most progress if none is complete."""
-    return max(
-        evaluation.on(USUAL).attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress)
-    )
+def best_attempt(evaluation: Evaluation, trials: Container[int] | None = None) -> Attempt:
+    """Return the fastest lap on the usual conditions, or the one with the most progress if none is complete.
+
+    `trials` are those that count; None: all.
+    """
+    attempts = [one for one in evaluation.on(USUAL).attempts if trials is None or one.trial in trials]
+    return max(attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress))
 
 
 def drive_best_lap(evaluator: Evaluator, policy: nn.Module) -> tuple[Lap, TensorDict]:

@@ -26,9 +26,11 @@ def findings_told(page: Path) -> str:
 
 
 def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_on_the_page(run_dir, call):
-    ended = call("analyze", str(run_dir))
+    ended = call("analyze", str(run_dir), "--replay", "laps.html")
     assert ended.code == 0, ended.stderr
     assert f"page  {run_dir / 'report.html'}" in ended.stdout
+    assert "laps  laps.html" in ended.stdout
+    assert "an ordinary lap" in (ended.cwd / "laps.html").read_text()
     text = findings_told(run_dir / "report.html")
     assert "16,384 control steps" in text
     printed = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]

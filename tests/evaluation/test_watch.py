@@ -35,6 +35,7 @@ from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import MOUNT_X_M
 from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track
+from tests.page_html import Html
 
 STEREO = CameraConfig(width=80, height=60, color="rgb", frames=2, stereo_m=0.06, field_of_view_deg=65)
 MONO = CameraConfig(width=80, height=60, color="grey", frames=2, stereo_m=0, field_of_view_deg=65)
@@ -244,3 +245,21 @@ def test_the_film_is_put_into_the_folder_of_the_run(run_dir, call):
     (film,) = run_dir.glob("films/*.mp4")
     assert film.stem == (run_dir / "checkpoints" / "best").resolve().name
     assert film.name in ended.stdout
+
+
+def test_the_laps_of_two_runs_drive_beside_each_other(run_dir, call):
+    other = shutil.copytree(run_dir, run_dir.parent / "another", symlinks=True)
+    quick = ("evaluation.trials=2", "evaluation.time_s=2")
+    for arguments in (
+        ("watch", str(run_dir), str(other), "--replay", "laps.html", *quick),
+        ("runs", "compare", str(run_dir), str(other), "--replay", "compared.html"),
+    ):
+        ended = call(*arguments)
+        assert ended.code == 0, ended.stderr
+        page = ended.cwd / next(word for word in arguments if word.endswith(".html"))
+        text = Html(page.read_text(encoding="utf-8")).text
+        assert f"A {run_dir.name} the f" in text
+        assert "B another the f" in text
+        assert page.name in ended.stdout
+    call("watch", str(run_dir), "--replay", "laps.mp4").assert_refused("--replay laps.mp4", ".html")
+    call("watch", str(run_dir), "--live", "--replay", "laps.html").assert_refused("without --live")

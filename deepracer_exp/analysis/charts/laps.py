@@ -147,7 +147,7 @@ def lap_delta(view: LogView) -> Chart | None:
     if len(laps) < 2:
         return None
     fastest = int(laps.index[0])
-    ordinary = _ordinary_lap(view.episodes, fastest)
+    ordinary = ordinary_lap(view.episodes, fastest)
     delta = time_lost(view.steps, ordinary, fastest)
     unit, scale, sectors = "per cent", 100.0, []
     if view.course is not None:
@@ -192,7 +192,7 @@ def time_lost_panel(title: str, delta: pd.DataFrame, sectors: Sequence[Sector], 
     return Panel(title=title, y_label="s", layers=layers, y_range=y_range)
 
 
-def _ordinary_lap(episodes: pd.DataFrame, fastest: int) -> int:
+def ordinary_lap(episodes: pd.DataFrame, fastest: int) -> int:
     """Return the median lap: if there are enough, of those late laps that began where the fastest did."""
     others = episodes[episodes["lap_time_s"].notna()].drop(fastest)
     # A lap from another start stands still elsewhere, which would be most of the difference.

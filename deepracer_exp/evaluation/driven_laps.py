@@ -1,0 +1,82 @@
+"""Laps for a replay, driven by the policies of runs."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from deepracer_exp.analysis.lap_replay import ReplayedLap, is_same_start
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.errors import BadInput, count
+from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.resolve import StoredRun
+
+from .evaluator import Evaluator
+from .film import LapRecorder, best_attempt
+from .race_protocol import Attempt
+from .result import USUAL
+
+
+def drive_laps(
+    run: StoredRun,
+    checkpoint: str | None,
+    protocol: EvaluationConfig,
+    beside: ReplayedLap | None = None,
+    ordinary: bool = False,
+) -> list[ReplayedLap]:
+    """Race a run's checkpoint on the usual conditions and return its fastest lap, or the one that came farthest.
+
+    Args:
+        run: trained.
+        checkpoint: its name; None: the best.
+        protocol: of the race.
+        beside: the lap is one of those that began where this one did, if there are any.
+        ordinary: whether to add the median of the other complete laps, of those from the same start if there are any.
+
+    Raises:
+        BadInput: the checkpoint, a track or a condition cannot be used, or there is no other complete lap.
+        RunFailed: a car's state became NaN.
+    """
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(checkpoint))
+    torch.set_num_threads(1)
+    evaluator = Evaluator(run.experiment, replace(protocol, held_out=None))
+    recorder = LapRecorder(evaluator)
+    evaluation = evaluator(stored.networks.policy, recorder)
+    starts = np.array([trial.start_ndist for trial in evaluator.trials])
+    same = np.ones(len(starts), bool) if beside is None else is_same_start(starts, beside)
+    best = best_attempt(evaluation, {*np.flatnonzero(same if same.any() else ~same).tolist()})
+    chosen = [(best, "the fastest" if best.complete else "the farthest")]
+    if ordinary:
+        others = [one for one in evaluation.on(USUAL).attempts if one.complete and one is not best]
+        if not others:
+            laps = count(int(best.complete), "complete lap")
+            raise BadInput(
+                f"{run.path.name}, checkpoint {stored.path.name}: {laps} in {count(len(evaluator.trials), 'trial')}; "
+                "accepted: more evaluation.trials, or another run or log beside it to replay against"
+            )
+        near = [one for one in others if starts[one.trial] == starts[best.trial]]
+        chosen.append((_median(near or others), "an ordinary lap"))
+    return [
+        _replayed(recorder, one, run, f"{words} of checkpoint {stored.path.name}") for one, words in chosen
+    ]
+
+
+def _median(attempts: Sequence[Attempt]) -> Attempt:
+    return sorted(attempts, key=lambda one: one.time_s)[len(attempts) // 2]
+
+
+def _replayed(recorder: LapRecorder, attempt: Attempt, run: StoredRun, words: str) -> ReplayedLap:
+    lap = recorder.lap(attempt)
+    return ReplayedLap(
+        name=run.path.name,
+        words=words,
+        track=lap.track,
+        lap_time_s=attempt.time_s if attempt.complete else np.nan,
+        time_s=lap.time_s,
+        x_m=lap.x_m,
+        y_m=lap.y_m,
+        yaw_deg=np.degrees(lap.yaw_rad),
+        speed_mps=lap.speed_mps,
+        steering_deg=np.degrees(lap.steering_rad),
+    )
