@@ -113,6 +113,8 @@ def laps_on(course: Track, steps: pd.DataFrame, words: str, chosen: bool = False
     """Return laps on a course; the rows of each (`recording.STEP_COLUMNS`) are contiguous and in the order of time."""
     rows = steps[list(STEP_COLUMNS)].reset_index(drop=True)
     rows = add_derived(rows, course, DISCOUNT)
+    if "lap_clock_s" in steps:  # a metrics file may have set it
+        rows["lap_clock_s"] = steps["lap_clock_s"].to_numpy()
     return Laps(steps=rows, episodes=episode_table(rows), words=words, chosen=chosen)
 
 

@@ -130,6 +130,14 @@ def facts(view: LogView) -> list[tuple[str, str]]:
             space += f"; sensors {', '.join(recording.metadata.sensor) or NONE}"
         found.append(("Action space", space))
     driven = view.evaluation_episodes
+    races = driven if view.trained else driven.iloc[:0]
+    laps = int(view.episodes["lap_time_s"].notna().sum() + races["lap_time_s"].notna().sum())
+    if laps:
+        counted = "counted from the reset, one control step before the first row, to the last row"
+        timed = view.laps_timed
+        words = f"{timed:,} of {count(laps, 'lap')} as in the service's metrics file, the others {counted}"
+        words = counted if not timed else words if timed < laps else "as in the service's metrics file"
+        found.append(("Lap times", words))
     if len(driven):
         streams = count(driven["stream"].nunique(), "evaluation")
         found.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))

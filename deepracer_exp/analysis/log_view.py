@@ -20,7 +20,14 @@ from .log_course import (
     numbered_as_logged,
     was_driven_on,
 )
-from .tables import add_derived, candidates, episode_table, first_rows, iteration_table
+from .tables import (
+    add_derived,
+    candidates,
+    episode_table,
+    first_rows,
+    iteration_table,
+    timed_by_service,
+)
 
 DISCOUNT = Hyperparameters().discount_factor
 """For logs without hyperparameters: the service's default."""
@@ -54,6 +61,8 @@ class LogView:
     """Their iterations, `tables.ITERATION_COLUMNS`."""
     evaluation_episodes: pd.DataFrame
     """Episodes on the course of all other streams, with `stream`."""
+    laps_timed: int
+    """Complete laps whose time a metrics file gives; that of the others is counted from the rows."""
     problems: tuple[LogProblem, ...]
     """Those of the recording and of its courses."""
     discount: float
@@ -187,8 +196,8 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
             raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {known.name}")
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
-    trained, episodes = _episodes(steps, here & training, course, discount)
-    driven, raced = _episodes(steps, here & ~training, course, discount)
+    trained, episodes, timed = _episodes(recording, here & training, course, discount)
+    driven, raced, races_timed = _episodes(recording, here & ~training, course, discount)
     raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
     iterations = iteration_table(recording, trained, episodes)
     if not (here & training).any():
@@ -204,19 +213,21 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         episodes=episodes,
         iterations=iterations,
         evaluation_episodes=raced,
+        laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,
     )
 
 
 def _episodes(
-    steps: pd.DataFrame, wanted: NDArray[np.bool_], course: Track | None, discount: float
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the wanted rows, episode by episode and with derived columns, and the table of their episodes."""
-    rows = steps if wanted.all() else steps[wanted]
+    recording: Recording, wanted: NDArray[np.bool_], course: Track | None, discount: float
+) -> tuple[pd.DataFrame, pd.DataFrame, int]:
+    """Return the wanted rows with derived columns, the table of their episodes, and how many laps files time."""
+    rows = recording.steps if wanted.all() else recording.steps[wanted]
     streams, episodes = rows["stream"].astype("category").cat.codes.to_numpy(), rows["episode"].to_numpy()
     key = streams.astype(np.int64) * (int(episodes.max(initial=0)) + 1) + episodes
     if (np.diff(key) < 0).any():
         rows = rows.iloc[np.argsort(key, kind="stable")]
     rows = add_derived(rows.reset_index(drop=True), course, discount)
-    return rows, episode_table(rows)
+    rows, timed = timed_by_service(rows, recording.metrics)
+    return rows, episode_table(rows), timed

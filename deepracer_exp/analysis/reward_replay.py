@@ -9,6 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.deepracer.recording import TRAINING
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.rewards.guard import Guard, Misconduct
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
@@ -219,7 +220,7 @@ def replay_reward(
         reward=source.name,
         course=view.course,
         steps=steps,
-        laps=_laps(steps, episode),
+        laps=_laps(steps, episode, view),
         waypoints=_waypoints(steps[params.paid].assign(reversed=params.is_reversed[params.paid])),
     )
 
@@ -258,18 +259,15 @@ def _place(steps: pd.DataFrame, row: int) -> str:
     return f"{at['stream']}, episode {at['episode']}, step {at['steps']}"
 
 
-def _laps(steps: pd.DataFrame, episode: NDArray[np.int64]) -> pd.DataFrame:
+def _laps(steps: pd.DataFrame, episode: NDArray[np.int64], view: LogView) -> pd.DataFrame:
     begin = np.flatnonzero(np.diff(episode, prepend=-1) != 0)
     end = np.r_[begin[1:], len(steps)] - 1
-    tstamp = steps["tstamp"].to_numpy()
     episodes = steps.iloc[end][["stream", "iteration", "episode"]].reset_index(drop=True)
-    episodes["time_s"] = tstamp[end] - tstamp[begin]
+    keys = episodes.astype({"stream": str})
+    episodes["time_s"] = keys.merge(_lap_times(view), "left", ["stream", "episode"])["lap_time_s"]
     for name in ("reward", "new_reward"):
         episodes[name] = np.add.reduceat(steps[name].to_numpy(), begin)
-    # Generations without prepare rows may begin with step 2.
-    from_start = steps["steps"].to_numpy()[begin] <= 2
-    complete = np.maximum.reduceat(steps["progress"].to_numpy(), begin) >= 100.0
-    laps = episodes[complete & from_start & episodes["new_reward"].notna()].copy()
+    laps = episodes[episodes["time_s"].notna() & episodes["new_reward"].notna()].copy()
     for name, of, ascending in (
         ("rank", "reward", False),
         ("new_rank", "new_reward", False),
@@ -277,6 +275,13 @@ def _laps(steps: pd.DataFrame, episode: NDArray[np.int64]) -> pd.DataFrame:
     ):
         laps[name] = laps[of].rank(method="min", ascending=ascending).astype(int)
     return laps.sort_values("new_rank", kind="stable", ignore_index=True)
+
+
+def _lap_times(view: LogView) -> pd.DataFrame:
+    """Return `stream`, `episode` and `lap_time_s` of all episodes of a view."""
+    training = [view.episodes.assign(stream=TRAINING)] if view.trained else []
+    both = pd.concat([*training, view.evaluation_episodes])[["stream", "episode", "lap_time_s"]]
+    return both.astype({"stream": str})
 
 
 def _waypoints(paid: pd.DataFrame) -> pd.DataFrame:

@@ -111,25 +111,24 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     """
     begin = np.flatnonzero(first_rows(steps))
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
-    columns = {name: steps[name].to_numpy(np.float64) for name in ("progress", "lap_position", "tstamp")}
+    columns = {name: steps[name].to_numpy(np.float64) for name in ("progress", "lap_position", "lap_clock_s")}
     complete = np.maximum.reduceat(columns["progress"], begin) >= 100.0 if len(begin) else np.zeros(0, bool)
     laps = np.flatnonzero(complete & whole_from_start(steps))
     begin, end = begin[laps], end[laps]
     rows = end - begin + 1
     lap = np.repeat(np.arange(len(laps)), rows)
     row = np.arange(rows.sum()) + np.repeat(begin - np.cumsum(rows) + rows, rows)
-    # A flying lap begins with the last row of the lap before.
-    begin_s = columns["tstamp"][begin] - steps["delta_time_s"].to_numpy(np.float64)[begin]
-    lap_time_s = columns["tstamp"][end] - begin_s
+    lap_time_s = columns["lap_clock_s"][end]
     gone = np.clip(columns["progress"][row] / 100.0, 0.0, 1.0)
     # Every lap begins with a point of its own, so that nothing is interpolated between two laps.
     starts = np.cumsum(rows) - rows
     at = np.insert(np.maximum.accumulate(_APART * lap + gone), starts, _APART * np.arange(len(laps)))
-    time_s = np.insert(columns["tstamp"][row] - np.repeat(begin_s, rows), starts, 0.0)
+    time_s = np.insert(columns["lap_clock_s"][row], starts, 0.0)
     start = (columns["lap_position"][begin] - columns["progress"][begin] / 100.0) % 1.0
     relative = (bounds[None, :-1] - start[:, None]) % 1.0  # bound 1 is bound 0 again
     query = _APART * np.arange(len(laps))[:, None] + relative
     passed_s = np.interp(query.ravel(), at, time_s).reshape(relative.shape) if len(laps) else relative
+    passed_s[relative == 0.0] = 0.0  # the car stands there for a step
     next_s, next_at = np.roll(passed_s, -1, axis=1), np.roll(relative, -1, axis=1)
     spent_s = next_s - passed_s + np.where(next_at <= relative, lap_time_s[:, None], 0.0)
     return pd.DataFrame(spent_s, index=laps)

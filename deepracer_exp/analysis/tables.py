@@ -7,12 +7,14 @@ import pandas as pd
 from numba import njit
 from numpy.typing import NDArray
 
-from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.deepracer.recording import TRAINING, Recording
+from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.tracks.track import Track
 
 from .statistics import Values
 
 DERIVED_COLUMNS: Mapping[str, str] = {
+    "lap_clock_s": "s since the lap began, as the service counts a lap time (`rules.lap_clock_s`)",
     "delta_time_s": "s since the row before; 0 in an episode's first row except on a flying lap; likewise the others",
     "delta_dist_m": "m from the row before; 0 in an episode's first row",
     "track_speed_mps": "m/s, distance over time since the row before; NaN in an episode's first row",
@@ -30,6 +32,8 @@ DERIVED_COLUMNS: Mapping[str, str] = {
     "discounted_future_reward": "reward units, of this row and all later ones of the episode, discounted",
 }
 """Names of the columns that `add_derived` adds, with meaning and unit."""
+CONTROL_PERIOD_S = 1 / 15
+"""The service's, for recordings without two rows in succession."""
 FRONT_TO_REAR_AXLE_M = 0.14 + 0.081663
 """From the logged point back to the rear axle (deepracer-simapp: front point, rear wheels of the car's model)."""
 STILL_M = 0.01
@@ -49,7 +53,7 @@ EPISODE_COLUMNS: Mapping[str, str] = {
     "reward_if_complete": "reward * 100 / progress; NaN without progress",
     "ended": "whether its last row is the end of the episode, not just of the recording",
     "complete": "whether progress reached 100 per cent",
-    "lap_time_s": "time_s of a complete lap whose beginning is recorded; NaN of other episodes",
+    "lap_time_s": "s, lap_clock_s at the end of a complete lap whose beginning is recorded; NaN of other episodes",
     "status": "episode_status of its last row; lap_complete of a lap in a race; where the format has none, "
     "lap_complete, off_track or empty",
     "last_waypoint": "waypoint of its last row",
@@ -120,6 +124,7 @@ def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> p
     # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
     center_turned = _wrapped(_since(center_deg, first))
     return steps.assign(
+        lap_clock_s=_lap_clock(steps, stopped, first, delta_time_s),
         delta_time_s=delta_time_s,
         delta_dist_m=delta_dist_m,
         track_speed_mps=track_speed_mps,
@@ -134,6 +139,46 @@ def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> p
         offset_m=offset_m,
         discounted_future_reward=_discounted(np.nan_to_num(reward), first, discount),
     )
+
+
+def _lap_clock(
+    steps: pd.DataFrame, stopped: NDArray[np.bool_], first: NDArray[np.bool_], delta_time_s: Values
+) -> Values:
+    """Return the clock of a lap: the time before its first row was driven without a pause, the rest is recorded."""
+    begin, tstamp = np.flatnonzero(first), steps["tstamp"].to_numpy(np.float64)
+    period_s = float(np.median(delta_time_s[~stopped])) if not stopped.all() else CONTROL_PERIOD_S
+    # The generation that counts from 0 has no prepare rows either.
+    before_s = lap_clock_s(np.maximum(steps["steps"].to_numpy()[begin], 1), period_s)
+    began_s = tstamp[begin] - np.where(stopped[begin], before_s, delta_time_s[begin])
+    return tstamp - began_s[np.cumsum(first) - 1]
+
+
+def timed_by_service(steps: pd.DataFrame, metrics: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """Set the clocks of complete laps to the times that the service's metrics files give.
+
+    Args:
+        steps: rows of each episode contiguous, with the derived columns.
+        metrics: `recording.METRICS_COLUMNS`.
+
+    Returns:
+        The steps, and of how many laps the files give the time.
+    """
+    in_training = metrics["stream"].astype(str) == TRAINING
+    laps = metrics[(metrics["completion"] >= 100.0) & (in_training == (metrics["phase"] == "training"))]
+    if laps.empty or steps.empty:
+        return steps, 0
+    begin = np.flatnonzero(first_rows(steps))
+    counts = np.diff(np.append(begin, len(steps)))
+    end = begin + counts - 1
+    official = laps.drop_duplicates(["stream", "episode"]).astype({"stream": str})
+    keys = steps.iloc[end][["stream", "episode"]].astype({"stream": str})
+    known_s = keys.merge(official, how="left", on=["stream", "episode"])["time_s"].to_numpy(np.float64)
+    whole = (np.maximum.reduceat(steps["progress"].to_numpy(np.float64), begin) >= 100.0) & whole_from_start(
+        steps
+    )
+    late_s = np.where(whole, known_s - steps["lap_clock_s"].to_numpy()[end], np.nan)
+    moved = steps["lap_clock_s"].to_numpy() + np.repeat(np.nan_to_num(late_s), counts)
+    return steps.assign(lap_clock_s=moved), int(np.isfinite(late_s).sum())
 
 
 def _places(
@@ -218,7 +263,8 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
     """Summarise each episode in one row, `EPISODE_COLUMNS`, in the order of the steps.
 
     Steps, start, progress, time, distance, speed, reward and completeness are defined as in deepracer-utils 1.5.6
-    (logs/log_utils.py, `simulation_agg`).
+    (logs/log_utils.py, `simulation_agg`); its time does not include the step before the first row, which belongs to
+    a lap time.
 
     The rows of each episode are contiguous and in the order of time, with the derived columns.
     """
@@ -229,7 +275,7 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
         return how.reduceat(steps[name].to_numpy(np.float64), begin)
 
     progress, time_s, reward = combined("progress", np.maximum), combined("delta_time_s"), combined("reward")
-    number = steps["steps"].to_numpy()
+    number, clock_s = steps["steps"].to_numpy(), steps["lap_clock_s"].to_numpy()[end]
     complete = progress >= 100.0
     per_lap = np.divide(100.0, progress, out=np.full(len(begin), np.nan), where=progress > 0)
     first_row, last_row = (steps.iloc[at].reset_index(drop=True) for at in (begin, end))
@@ -254,7 +300,7 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
             "reward_if_complete": reward * per_lap,
             "ended": complete | ended,
             "complete": complete,
-            "lap_time_s": np.where(complete & whole_from_start(steps) & (time_s > 0), time_s, np.nan),
+            "lap_time_s": np.where(complete & whole_from_start(steps) & (time_s > 0), clock_s, np.nan),
             "status": status.mask(lap, "lap_complete").mask(off & ~complete, "off_track"),
             "last_waypoint": last_row["closest_waypoint"],
             "quarter": 1 + 4 * order // len(order),

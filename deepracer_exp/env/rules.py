@@ -51,6 +51,17 @@ def lap_progress(
     return p, np.where(p == 100.0, 0.0, p)
 
 
+def lap_clock_s(steps: ArrayLike, period_s: float) -> Floats:
+    """Return the clock of a lap at control steps that were driven without a pause, in s, of the shape of `steps`.
+
+    A lap time is its clock at the last step plus the penalties. The clock starts with the reset, as the service's
+    does, and the prepare step, step 1, is measured one period later (deepracer-simapp, markov/metrics/s3_metrics.py:
+    `elapsed_time_in_milliseconds` is `metric_time` minus `start_time`). A lap that follows another without a stop
+    starts with the last step of that.
+    """
+    return np.asarray(steps, np.float64) * period_s
+
+
 class EpisodeRules:
     """What ends an episode, for N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.deepracer.trace import EPISODE_STATUS, STATUS_CODE
+from deepracer_exp.env.rules import lap_clock_s
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
@@ -46,8 +47,8 @@ class Attempt:
 class RaceProtocol:
     """Applies a protocol to N cars, one trial each: which are put back, and which have finished.
 
-    The race clock of a trial starts with the prepare step; each control step advances it by its period, each penalty
-    by its seconds.
+    The race clock of a trial is that of `rules.lap_clock_s`, which starts with the reset before the prepare step; each
+    penalty advances it by its seconds.
 
     Attributes:
         running: unfinished trials, (N,), bool.
@@ -85,8 +86,8 @@ class RaceProtocol:
         Returns:
             The cars to put back on the centre line, at rest, and where, in per cent of the lap, (n,) each.
         """
-        driven_s = self._steps * self._period_s
         self._steps += 1
+        driven_s = lap_clock_s(self._steps, self._period_s)
         self.clock_s = np.where(self.running, driven_s + self._all_penalties_s, self.clock_s)
         late = self.running & (self.clock_s > self._config.time_s + _ROUNDING_S)
         for car in np.flatnonzero(late).tolist():

@@ -14,6 +14,7 @@ from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
 from deepracer_exp.deepracer.model_metadata import model_metadata_text
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.deepracer.sim_trace import LOG_LAYOUTS
+from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, count, writing
 
 from .aws_files import hyperparameters_of, services_metadata, write_files
@@ -50,7 +51,7 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     Raises:
         BadInput: no episode is finished, or the folder is not empty or cannot be written.
     """
-    numbered = _number(recording.steps)
+    numbered = _number(recording.steps, experiment.car.control_period_s)
     # The service's names of jobs: the time in 14 digits, a hyphen, the rest.
     dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", recording.name)
     job = f"{dated[1]}{dated[2]}-{dated[3]}" if dated else f"{'0' * 14}-{recording.name}"
@@ -96,7 +97,7 @@ class _Numbered:
     """Rows of episodes interrupted by the end of the training."""
 
 
-def _number(steps: pd.DataFrame) -> _Numbered:
+def _number(steps: pd.DataFrame, period_s: float) -> _Numbered:
     rows = steps.sort_values("episode", kind="stable")
     begin = np.flatnonzero(np.diff(rows["episode"].to_numpy(), prepend=-1) != 0)
     counts = np.diff(np.r_[begin, len(rows)])
@@ -106,7 +107,7 @@ def _number(steps: pd.DataFrame) -> _Numbered:
             "iteration": last_row["iteration"].to_numpy(),
             "steps": counts,
             "reward": np.add.reduceat(rows["reward"].to_numpy(), begin),
-            "begin_s": first_row["tstamp"].to_numpy(),
+            "begin_s": first_row["tstamp"].to_numpy() - lap_clock_s(first_row["steps"].to_numpy(), period_s),
             "end_s": last_row["tstamp"].to_numpy(),
             "progress": last_row["progress"].to_numpy(),
             "status": last_row["episode_status"].astype(str).to_numpy(),

@@ -9,6 +9,7 @@ import numpy as np
 
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
@@ -38,7 +39,7 @@ class Finished:
     lap: np.ndarray
     """Whether the lap was completed."""
     time_s: np.ndarray
-    """Seconds of driving, the prepare step not counted: the lap time where the lap was completed."""
+    """Seconds since the reset (`rules.lap_clock_s`): the lap time where the lap was completed."""
 
     def on(self, track: int) -> "Finished":
         """Return the episodes of one track."""
@@ -223,7 +224,7 @@ class RunMetrics:
             returns=ends[:, PACKED["episode_return"]],
             progress=ends[:, PACKED["progress"]],
             lap=ends[:, PACKED["episode_status"]] == STATUS_CODE["lap_complete"],
-            time_s=(ends[:, PACKED["steps"]] - 1) * self._step_s,
+            time_s=lap_clock_s(ends[:, PACKED["steps"]], self._step_s),
         )
         self.all.add(finished)
         for number, record in enumerate(self.tracks):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.deepracer.trace import STATUS_CODE
-from deepracer_exp.env.rules import RaceRules
+from deepracer_exp.env.rules import RaceRules, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.state import Measures
 from deepracer_exp.rewards.params import COLUMNS
@@ -92,7 +92,7 @@ def drive_laps(setup: RaceSetup, speed_mps: Floats, lateral_mps2: Floats) -> lis
     return [
         DrivenLap(
             speed_mps=float(speed_mps[i]),
-            time_s=float((ends[i] - 1) * car.control_period_s),
+            time_s=float(lap_clock_s(ends[i], car.control_period_s)),
             paid=Situations(
                 {key: column[1 : ends[i], i] for key, column in columns.items()}, rules.track_params[0]
             ),

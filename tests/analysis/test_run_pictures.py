@@ -77,7 +77,7 @@ def png(figure: Figure) -> bytes:
 @pytest.mark.parametrize(
     ("trace", "lap_time_s"),
     [
-        (drive(steps=151, status="lap_complete"), 150 / 15),
+        (drive(steps=150, status="lap_complete"), 10.0),
         (drive(steps=100, status="off_track"), math.nan),
         (drive(steps=100, status="in_progress"), math.nan),
         (drive(steps=100, status="lap_complete", first_step=80), math.nan),
@@ -96,12 +96,12 @@ def test_an_episode_continues_in_the_next_iteration() -> None:
         whole[40:].assign(iteration=6),
     ]
     table = episodes(pd.concat(split))
-    assert table.loc[0, "lap_time_s"] == pytest.approx(89 / 15)
+    assert table.loc[0, "lap_time_s"] == pytest.approx(90 / 15)
     assert table.loc[0, "iteration"] == 6
 
 
 def test_the_fastest_complete_lap_is_drawn_in_the_speeds_at_the_ends_of_its_segments() -> None:
-    lap = drive(steps=151, status="lap_complete", episode=1)
+    lap = drive(steps=150, status="lap_complete", episode=1)
     others = [
         drive(steps=200, status="lap_complete"),
         drive(steps=30, status="off_track", share=0.4, episode=2),
@@ -121,7 +121,7 @@ def test_each_track_has_its_own_best_episode_and_one_scale_of_speed_holds_for_al
     trace = pd.concat(
         [
             drive(steps=200, status="lap_complete", episode=0, track="a"),
-            drive(steps=151, status="lap_complete", episode=1, track="a", top_mps=3.0),
+            drive(steps=150, status="lap_complete", episode=1, track="a", top_mps=3.0),
             drive(steps=60, status="off_track", episode=2, share=0.3, track="b", top_mps=1.0),
             drive(steps=60, status="off_track", episode=3, share=0.2, track="b", top_mps=4.0),
         ]
@@ -129,7 +129,7 @@ def test_each_track_has_its_own_best_episode_and_one_scale_of_speed_holds_for_al
     figure = driven_lines(trace, {"a": circle_track(), "b": circle_track(), "c": circle_track()})
     assert words(figure)[1::2] == ["lap in 10.00 s", "30.0% of the lap, off track", "not driven"]
     lines = driven(figure)
-    assert [len(line.get_segments()) for line in lines] == [150, 59]
+    assert [len(line.get_segments()) for line in lines] == [149, 59]
     assert {line.get_clim() for line in lines} == {lines[0].get_clim()}
     assert lines[0].get_clim()[1] == 3.0
 

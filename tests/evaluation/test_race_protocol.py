@@ -33,24 +33,25 @@ def test_three_trials_ends_at_the_first_off_track(protocol):
     (attempt,) = race.attempts
     assert not race.running[0]
     assert backs == []
-    assert (attempt.end, attempt.progress, attempt.time_s) == ("off_track", 60, 3 * STEP_S)
+    assert (attempt.end, attempt.progress, attempt.time_s) == ("off_track", 60, 4 * STEP_S)
 
 
 def test_three_trials_ends_with_the_lap(protocol):
     race, _ = drive(protocol("three_trials"), [*steady(0, 50), DONE, *steady(1)])
     (attempt,) = race.attempts
     assert attempt.complete
-    assert attempt.time_s == 2 * STEP_S
+    assert attempt.time_s == 3 * STEP_S
     assert not race.running[0]
 
 
-@pytest.mark.parametrize(("time_s", "laps"), [(3.0, 2), (2.99, 1), (4.4, 2), (4.5, 3)])
+@pytest.mark.parametrize(("time_s", "laps"), [(3.5, 2), (3.49, 1), (4.9, 2), (5.0, 3)])
 def test_four_minutes_counts_only_laps_that_fit(protocol, time_s, laps):
     lap = [*steady(30, 60), DONE]
     race, _ = drive(protocol("four_minutes", time_s=time_s), [("prepare", 0), *lap * 5])
     assert sum(attempt.complete for attempt in race.attempts) == laps
     assert race.attempts[-1].end == "time_up"
-    assert {attempt.time_s for attempt in race.attempts[:-1]} == {3 * STEP_S}
+    # The clock starts with the reset, one step before the prepare step.
+    assert [attempt.time_s for attempt in race.attempts[:-1]] == [4 * STEP_S, *[3 * STEP_S] * (laps - 1)]
     assert sum(attempt.time_s for attempt in race.attempts) == pytest.approx(time_s)
 
 
@@ -82,7 +83,7 @@ def test_penalties_add_to_the_lap_and_to_the_race(protocol):
     race, _ = drive(protocol("aws_virtual"), [*story, DONE, *steady(50), DONE])
     first, second = race.attempts
     assert first.penalty_s == sum(PENALTY_S[fault] for fault in faults)
-    assert first.time_s == 7 * STEP_S + first.penalty_s
+    assert first.time_s == 8 * STEP_S + first.penalty_s
     assert first.resets == 3
     assert (second.penalty_s, second.time_s, second.begin_s) == (0, 2 * STEP_S, first.time_s)
 

@@ -112,7 +112,7 @@ def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
 def test_a_film_has_thirty_frames_a_second_and_shows_another_picture_in_each(circle, protocol, overrides):
     experiment = compose_experiment([f"track.file={circle}", *overrides])[0]
     policy, lap, acted = driven(experiment, protocol("three_trials", trials=2, time_s=0.4))
-    assert len(lap) == len(acted) == 7  # the prepare step and six more
+    assert len(lap) == len(acted) == 6  # the prepare step, a step after the reset, and five more
     actions = build_action_space(experiment.action_space)
     frames = list(Frames(lap, acted, policy, actions, experiment.observation, experiment.car))
     assert len(frames) == 13  # two for each of the six steps at 15 Hz, and the last

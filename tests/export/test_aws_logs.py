@@ -108,6 +108,15 @@ def test_deepracer_utils_counts_our_episodes(ours, log):
     assert episodes["unique_episode"].is_unique
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_metrics_file_counts_an_episode_from_its_reset(ours, exported, layout):
+    (file,) = (exported[layout][0] / "metrics").rglob("*.json")
+    items = [item for item in json.loads(file.read_text())["metrics"] if item["phase"] == "training"]
+    steps = ours.groupby(["iteration", "episode"], sort=True).size().to_numpy()
+    elapsed_ms = [item["elapsed_time_in_milliseconds"] for item in items]
+    np.testing.assert_allclose(elapsed_ms, steps * 1000 / 15, atol=1.0)
+
+
 def test_deepracer_utils_finds_hyperparameters_and_action_space(ours, log):
     per_iteration = ours.groupby("iteration")["episode"].nunique().max()
     assert log.hyperparameters()["num_episodes_between_training"] == per_iteration

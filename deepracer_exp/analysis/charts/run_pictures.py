@@ -16,6 +16,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
+from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.tracks.drawing import outline
 from deepracer_exp.tracks.track import Track
 
@@ -36,12 +37,13 @@ _LAYOUT = ConstrainedLayoutEngine(w_pad=0.15, h_pad=0.12)
 def episodes(trace: pd.DataFrame) -> pd.DataFrame:
     """Summarise each episode of a trace in one row, indexed by its number.
 
-    Columns: `car`, `status` and `iteration` of the last row, `progress` (highest, per cent), `lap_time_s` (simulated
-    time from the prepare row to the last; NaN unless the lap is complete and whole).
+    Columns: `car`, `status` and `iteration` of the last row, `progress` (highest, per cent), `lap_time_s`
+    (`rules.lap_clock_s`; NaN unless the lap is complete and whole).
     """
     table = trace.groupby("episode").agg(
         car=("car", "first"),
         first_step=("steps", "first"),
+        last_step=("steps", "last"),
         status=("episode_status", "last"),
         progress=("progress", "max"),
         iteration=("iteration", "last"),
@@ -50,8 +52,9 @@ def episodes(trace: pd.DataFrame) -> pd.DataFrame:
     )
     # An episode whose beginning is not in the trace would count as a very fast lap.
     whole = (table["status"] == "lap_complete") & (table["first_step"] == 1)
-    table["lap_time_s"] = (table["end_s"] - table["start_s"]).where(whole)
-    return table.drop(columns=["first_step", "start_s", "end_s"])
+    period_s = (table["end_s"] - table["start_s"]) / (table["last_step"] - table["first_step"])
+    table["lap_time_s"] = (lap_clock_s(table["last_step"], 1.0) * period_s).where(whole)
+    return table.drop(columns=["first_step", "last_step", "start_s", "end_s"])
 
 
 def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
