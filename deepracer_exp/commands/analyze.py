@@ -248,8 +248,10 @@ def _logs(what: str) -> Path | None:
     """Return an existing file or folder, None if there is none.
 
     Raises:
-        BadInput: it cannot be read.
+        BadInput: it is "", or cannot be read.
     """
+    if not what.strip():
+        raise BadInput(f"{what!r}: names nothing; accepted: logs of the service, or a run")
     with reading(what, "logs of the service, or a run"):
         path = Path(what).expanduser()
         if not path.exists():
