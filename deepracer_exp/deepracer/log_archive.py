@@ -4,9 +4,11 @@ import bz2
 import contextlib
 import gzip
 import lzma
+import os
 import re
 import stat
 import tarfile
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -24,6 +26,7 @@ _KIND = re.compile(r"(?:^|[-_.])(training|evaluation|leaderboard)(?=[-_.]|$)", r
 _FOLDERS = ("training", "evaluation", "leaderboard")
 _DRFC_EVALUATION = re.compile(r"evaluation-\d{14}")
 _WORKER = re.compile(r"(?:TrainingMetrics_|(?:worker|robomaker|simulation)[-_.]?)(\d{1,3})(?=\D|$)")
+_WORKER_FOLDER = re.compile(r"(?:worker[-_.]?)?(\d{1,3})")
 _STAMP = re.compile(r"\d{14}|\d{4}-\d\d-\d\dT[\d:.]+Z")
 _ENDINGS = re.compile(
     r"(?:-(?:robomaker|sagemaker|simulation|training))?(?:\.(?:log|txt|csv|json))?(?:\.\d+)?$"
@@ -31,8 +34,10 @@ _ENDINGS = re.compile(
 LOG = re.compile(r"(?:\.(?:log|txt|out|err)(?:\.\d{1,4})?|^(?:stdout|stderr))$", re.IGNORECASE)
 """Names of files that may be logs."""
 # The group matches for a single compressed file, not for an archive.
-_PACKED = re.compile(r"\.(?:tar|tgz|tbz2?|txz|tar\.(?:gz|bz2|xz)|(gz|bz2|xz))$", re.IGNORECASE)
+PACKED = re.compile(r"\.(?:zip|tar|tgz|tbz2?|txz|tar\.(?:gz|bz2|xz)|(gz|bz2|xz))$", re.IGNORECASE)
 _OPEN: Mapping[str, Any] = {"gz": gzip.open, "bz2": bz2.open, "xz": lzma.open}
+_ZIP = (b"PK\x03\x04", b"PK\x05\x06")
+"""How a zip archive begins, one without members as well."""
 _MARKS = {b"\x1f\x8b": "gz", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
 
 
@@ -99,6 +104,11 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     return tuple((1, int(piece)) if piece.isdigit() else (0, piece) for piece in pieces)
 
 
+def named_parts(path: Path) -> tuple[str, ...]:
+    """Return the parts of an absolute path as the user names it, not of the file that a link leads to."""
+    return Path(os.path.abspath(path)).parts  # noqa: PTH100 - `resolve` would follow links
+
+
 def place_of(parts: tuple[str, ...]) -> Place:
     """Return the job of a trace or log, by its folders and its name."""
     for at in range(len(parts) - 2, -1, -1):
@@ -106,8 +116,9 @@ def place_of(parts: tuple[str, ...]) -> Place:
             kind = parts[at].partition("-")[0]
             above = parts[:at]
             worker = 0
-            if kind == "training" and above and above[-1].isdigit() and len(above[-1]) <= 3:
-                worker, above = int(above[-1]), above[:-1]
+            numbered = _WORKER_FOLDER.fullmatch(above[-1]) if kind == "training" and above else None
+            if numbered:
+                worker, above = int(numbered[1]), above[:-1]
             return Place(kind, above, above[-1] if above else kind, worker)
     name = label(parts[-1])
     named = _KIND.search(parts[-1])
@@ -117,8 +128,12 @@ def place_of(parts: tuple[str, ...]) -> Place:
             if folder in _FOLDERS or _DRFC_EVALUATION.fullmatch(folder):
                 kind = folder.partition("-")[0]
                 break
+    if kind != "training":
+        return Place(kind, parts[:-1], name, 0)
+    if len(parts) > 1 and (of_folder := _WORKER_FOLDER.fullmatch(parts[-2])) and not parts[-2].isdigit():
+        return Place(kind, parts[:-2], name, int(of_folder[1]))
     numbered = _WORKER.search(parts[-1])
-    return Place(kind, parts[:-1], name, int(numbered[1]) if numbered and kind == "training" else 0)
+    return Place(kind, parts[:-1], name, int(numbered[1]) if numbered else 0)
 
 
 def label(name: str) -> str:
@@ -156,10 +171,10 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
             elif _is_packed(path):
                 found = LogFolder()
                 archives = opened.enter_context(contextlib.closing(_Archives()))
-                _unpack(found, path, (), path.resolve().parts[-3:-1], archives)
+                _unpack(found, path, (), named_parts(path)[-3:-1], archives)
                 yield found
             else:
-                yield LogFolder([_plain(path, path.resolve().parts[-3:])])
+                yield LogFolder([_plain(path, named_parts(path)[-3:])])
     except FileNotFoundError as error:
         raise BadInput(f"{path}: no such file or folder; accepted: {_ACCEPTED}") from error
     except (*READ_ERRORS, ValueError) as error:
@@ -184,7 +199,7 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
                 found.problems.append(LogProblem(str(entry), None, "a link; not followed"))
             elif entry.is_dir():
                 waiting.append(entry)
-            elif entry.is_file() and _PACKED.search(entry.name):
+            elif entry.is_file() and PACKED.search(entry.name):
                 packed.append(entry)
             elif entry.is_file():
                 found.files.append(_plain(entry, (*above, *entry.relative_to(root).parts)))
@@ -192,7 +207,7 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
     archives = opened.enter_context(contextlib.closing(_Archives()))
     for path in sorted(packed):
         folders = (*above, *path.relative_to(root).parts[:-1])
-        plain = path.with_name(_PACKED.sub("", path.name))
+        plain = path.with_name(PACKED.sub("", path.name))
         try:
             if plain.is_file():
                 found.problems.append(LogProblem(str(path), None, f"not read: {plain.name} lies beside it"))
@@ -210,7 +225,62 @@ def _plain(path: Path, parts: tuple[str, ...]) -> LogFile:
 def _is_packed(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(512)
-    return head.startswith(tuple(_MARKS)) or head[257:262] == b"ustar"
+    return head.startswith((*_MARKS, *_ZIP)) or head[257:262] == b"ustar"
+
+
+_Archive = tarfile.TarFile | zipfile.ZipFile
+
+
+@dataclass(frozen=True)
+class _Member:
+    """A member of an archive."""
+
+    name: str
+    size: int
+    """In bytes, unpacked."""
+    kind: str
+    """`file`, `link` or `other`."""
+    entry: tarfile.TarInfo | zipfile.ZipInfo
+
+    @classmethod
+    def of(cls, entry: tarfile.TarInfo | zipfile.ZipInfo) -> "_Member":
+        """Return the member that an archive lists as an entry."""
+        if isinstance(entry, tarfile.TarInfo):
+            kind = "file" if entry.isfile() else "link" if entry.islnk() or entry.issym() else "other"
+            return cls(entry.name, entry.size, kind, entry)
+        # Only archives made on Unix have a mode.
+        link = stat.S_ISLNK(entry.external_attr >> 16)
+        kind = "other" if entry.is_dir() else "link" if link else "file"
+        return cls(entry.filename, entry.file_size, kind, entry)
+
+
+def _open_archive(path: Path) -> _Archive:
+    with path.open("rb") as file:
+        zipped = file.read(4) in _ZIP
+    return zipfile.ZipFile(path) if zipped else tarfile.open(path, "r:*")
+
+
+def _entries(archive: _Archive) -> Iterator[_Member]:
+    """Yield the members in the order of the archive: going back would mean reading it again."""
+    if isinstance(archive, zipfile.ZipFile):
+        yield from map(_Member.of, archive.infolist())
+        return
+    while (entry := archive.next()) is not None:
+        yield _Member.of(entry)
+
+
+def _stream(archive: _Archive, member: _Member) -> IO[bytes]:
+    if isinstance(archive, tarfile.TarFile):
+        assert isinstance(member.entry, tarfile.TarInfo)
+        stream = archive.extractfile(member.entry)
+        if stream is None:
+            raise OSError(f"{member.name} is not a regular file")
+        return stream
+    assert isinstance(member.entry, zipfile.ZipInfo)
+    try:
+        return archive.open(member.entry)
+    except (RuntimeError, NotImplementedError) as error:  # encrypted, or packed in a way unknown to Python
+        raise OSError(str(error)) from error
 
 
 class _Archives:
@@ -218,16 +288,14 @@ class _Archives:
 
     def __init__(self) -> None:
         self._path: Path | None = None
-        self._archive: tarfile.TarFile | None = None
+        self._archive: _Archive | None = None
 
-    def open(self, path: Path, member: tarfile.TarInfo) -> IO[bytes]:
+    def open(self, path: Path, member: "_Member") -> IO[bytes]:
         """Open a member for reading; a member of another archive must have been read completely."""
         if self._archive is None or self._path != path:
             self.close()
-            self._path, self._archive = path, tarfile.open(path, "r:*")  # noqa: SIM115 - closed by the next `open` or by `close`
-        stream = self._archive.extractfile(member)
-        if stream is None:
-            raise OSError(f"{member.name} is not a regular file")
+            self._path, self._archive = path, _open_archive(path)
+        stream = _stream(self._archive, member)
         ending = _ending(member.name)
         return stream if ending is None else _OPEN[ending](stream)
 
@@ -253,7 +321,7 @@ def _unpack(
         OSError: it cannot be read, or is neither an archive nor compressed.
     """
     try:
-        with tarfile.open(path, "r:*") as archive:
+        with _open_archive(path) as archive:
             members = _members(path, archive, archives)
     except tarfile.ReadError:
         with path.open("rb") as file:
@@ -263,7 +331,7 @@ def _unpack(
             raise OSError("neither an archive nor compressed" if head else "empty") from None
         with opener(path) as stream:
             stream.read(1)
-        found.files.append(LogFile(path, (*beside, _PACKED.sub("", path.name)), opener, (path,)))
+        found.files.append(LogFile(path, (*beside, PACKED.sub("", path.name)), opener, (path,)))
         return
     if inside and not any(map(_may_hold_data, members.files)):
         found.problems += members.problems
@@ -280,9 +348,9 @@ def _unpack(
 
 def _lies_beside(path: Path, file: LogFile) -> bool:
     """Return whether a member of an archive is also unpacked beside it, with the same name and size."""
-    named = (_PACKED.sub("", path.name),)
+    named = (PACKED.sub("", path.name),)
     _, member = file.given
-    assert isinstance(member, tarfile.TarInfo)
+    assert isinstance(member, _Member)
     for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
         with contextlib.suppress(OSError):  # not there, or a name that no file system takes
             if path.parent.joinpath(*place).stat().st_size == member.size:
@@ -302,29 +370,29 @@ def _may_hold_data(file: LogFile) -> bool:
 
 def _ending(name: str) -> str | None:
     """Return the compression of a single file by its name; None for an archive and any other file."""
-    packed = _PACKED.search(name)
+    packed = PACKED.search(name)
     return packed[1].lower() if packed is not None and packed[1] else None
 
 
-def _members(path: Path, archive: tarfile.TarFile, archives: _Archives) -> LogFolder:
-    """List the members in the order of the archive: going back would mean reading it again."""
+def _members(path: Path, archive: _Archive, archives: _Archives) -> LogFolder:
+    """List the members."""
     found = LogFolder()
-    members: dict[tuple[str, ...], tarfile.TarInfo] = {}
+    members: dict[tuple[str, ...], _Member] = {}
     try:
-        while (member := archive.next()) is not None:
-            if member.isfile():
+        for member in _entries(archive):
+            if member.kind == "file":
                 parts = tuple(
                     part for part in PurePosixPath(member.name).parts if part not in ("/", "..", ".")
                 )
                 members.pop(parts, None)
                 members[parts] = member  # the later one counts, as in unpacking
-            elif member.islnk() or member.issym():
+            elif member.kind == "link":
                 found.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
     except (*READ_ERRORS, ValueError, OverflowError) as error:
         reason = f"cannot be read to its end ({reason_of(error)})"
         found.problems.append(LogProblem(str(path), None, reason))
     for parts, member in members.items():
         if parts:
-            plain = parts if _ending(parts[-1]) is None else (*parts[:-1], _PACKED.sub("", parts[-1]))
+            plain = parts if _ending(parts[-1]) is None else (*parts[:-1], PACKED.sub("", parts[-1]))
             found.files.append(LogFile(path.joinpath(*parts), plain, archives.open, (path, member)))
     return found

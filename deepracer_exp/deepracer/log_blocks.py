@@ -3,13 +3,14 @@
 import codecs
 import lzma
 import tarfile
+import zipfile
 import zlib
 from collections.abc import Iterator
 from typing import IO
 
 from deepracer_exp.files import LOG_BYTES
 
-READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError)
+READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
 """Errors of reading a file or a member of an archive."""
 SIZE = 2**23
 """Size of a block in bytes."""
