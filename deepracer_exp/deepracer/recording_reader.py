@@ -26,7 +26,7 @@ from .deduplicate import (
     rows_also_in,
     steps_of,
 )
-from .log_archive import LogFile, Place, label, log_folder, natural, place_of, same_job
+from .log_archive import PACKED, LogFile, Place, label, log_folder, named_parts, natural, place_of, same_job
 from .recording import (
     METRICS_COLUMNS,
     TRAINING,
@@ -58,7 +58,7 @@ def read_recording(path: Path) -> Recording:
     """
     with log_folder(path) as folder:
         parts = read_parts(folder)
-    name = path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".tgz")
+    name = PACKED.sub("", named_parts(path)[-1])
     recording = _Assembly(parts).recording(readable(name))
     if not (len(recording.steps) or len(recording.updates) or len(recording.metrics)):
         why = f" ({recording.problems[0]})" if recording.problems else ""
@@ -167,6 +167,8 @@ class _Assembly:
         """Add the drives of a log, unless they are known already from CSVs or another log."""
         file = files[0]
         place = place_of(file.parts)
+        if log.kind is not None and place.kind == TRAINING:
+            place = replace(place, kind=log.kind, worker=0)
         if place.kind == TRAINING:
             name = place.name.replace(str(place.worker), "#") if place.worker else place.name
             if log.job:
@@ -286,6 +288,7 @@ class _Assembly:
                 log.saved
                 or (log.checkpoints and log.steps.rows and place_of(files[0].parts).kind == TRAINING)
             )
+            and log.kind is None
             and self._round(files[0], self.roots[at]) == number
         ]
 

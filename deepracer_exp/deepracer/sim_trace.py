@@ -39,11 +39,16 @@ _EARLIEST_CLOCK_S = 1e8
 _WHOLE = {"episode": 2**31 - 1, "steps": 2**31 - 1, "closest_waypoint": 99_999}
 """Columns of whole numbers and their largest values."""
 _LARGEST_ACTION = 9_999
+# Beyond any track, clock and reward; sums and squares of larger numbers are infinite.
+_LARGEST = dict.fromkeys((*COMMON, *LATER), 1e9) | {"reward": 1e100, "tstamp": 1e12, "wall_clock": 1e12}
+"""Largest absolute values of the other columns."""
 _FLAGS = ("done", "all_wheels_on_track")
 _TRUE, _FALSE = ("True", "true", "1"), ("False", "false", "0")
 _STATUS = re.compile(r"[A-Za-z_ ]{0,40}")
 _CHUNK = 1024
 _HEADER = b"episode"
+MOST_REFUSED = 1000
+"""Lines without a row at the beginning of a file after which the rest is not read: that would take minutes."""
 MOST_STEPS = 4_000_000
 """Control steps of a recording that are held in memory: 74 hours of driving at 15 a second. A report of so many takes
 about 2.5 GB."""
@@ -99,6 +104,11 @@ class StepTables:
         return dropped
 
     @property
+    def found_rows(self) -> bool:
+        """Whether the file had any rows."""
+        return self.rows + self.left_out > 0
+
+    @property
     def found(self) -> bool:
         """Whether the file had any rows, or lines that should have been rows."""
         return bool(self._tables) or self.left_out > 0
@@ -109,8 +119,27 @@ class StepTables:
         return pa.concat_tables(self._tables) if self._tables else SCHEMA.empty_table()
 
 
+_LISTED_ACTION = re.compile(rb"(\[[^\[\],\n]*),")
+
+
+def with_one_value_an_action(rows: bytes) -> bytes:
+    """Return rows of a trace in which no comma separates the two numbers of a continuous action.
+
+    The console wrote `[-30.0, 1.2]` from November 2022 to June 2023, `[-30.0 1.2]` before and since.
+    """
+    return _LISTED_ACTION.sub(rb"\1 ", rows) if b"[" in rows else rows
+
+
 Refused = list[tuple[int | None, str]]
 """Line (None: from an unknown line on) and reason of what is not a row."""
+
+
+def is_hopeless(steps: "StepTables", refused: Refused) -> bool:
+    """Return whether a trace has no rows and so many lines that are none that the rest is not worth reading."""
+    return not steps.found_rows and len(refused) >= MOST_REFUSED
+
+
+REST_REFUSED = f"the rest is not read: none of the first {MOST_REFUSED:,} lines is a row"
 
 
 def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
@@ -131,13 +160,16 @@ def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
                 header = _column_names(line)
         if header is None:
             continue
-        data = block[at:]
+        data = with_one_value_an_action(block[at:])
         count = data.count(b"\n") + (not data.endswith(b"\n"))
         table = _read_fast(data, header, count) if data else SCHEMA.empty_table()
         if table is not None:
             steps.add(table)
         else:
             header = _read_csv_lines(steps, refused, data, number, header)
+            if is_hopeless(steps, refused):
+                refused.append((None, REST_REFUSED))
+                break
     if header is None:
         raise ValueError("empty" if not blocks.refused else blocks.refused[0][1])
     return steps, refused + blocks.refused
@@ -159,7 +191,7 @@ def _read_csv_lines(
     numbers: list[int] = []
 
     def flush() -> None:
-        table, bad = read_rows(lines, {len(header): header})
+        table, bad = read_rows(lines, {len(header): header}, may_stop=not steps.found_rows)
         steps.add(table)
         refused.extend((numbers[at], reason) for at, reason in bad)
         lines.clear()
@@ -183,7 +215,7 @@ def _read_csv_lines(
 
 
 def read_rows(
-    lines: Sequence[bytes], layouts: Layouts, before: int | None = None
+    lines: Sequence[bytes], layouts: Layouts, before: int | None = None, *, may_stop: bool = False
 ) -> tuple[pa.Table, list[tuple[int, str]]]:
     """Read the lines of a trace.
 
@@ -193,6 +225,7 @@ def read_rows(
         lines: comma-separated values, without what precedes them in a log.
         layouts: the columns by the number of values.
         before: how many values the line before the first had; None if there was none.
+        may_stop: stop at `MOST_REFUSED` lines if none of them is a row.
 
     Returns:
         Rows in the order of lines with the columns of `SCHEMA`; and of the lines that are not rows, the index among
@@ -218,6 +251,8 @@ def read_rows(
             table, bad = _read_slowly(chunk, layouts)
             refused += [(places[at], reason) for at, reason in bad]
         tables.append(table)
+        if may_stop and len(refused) >= MOST_REFUSED and not any(one.num_rows for one in tables):
+            break
     table = pa.concat_tables(tables) if tables else SCHEMA.empty_table()
     return table, sorted(refused)
 
@@ -305,10 +340,13 @@ def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Tab
                 return None
         elif name == "track_len":
             numbers = column.to_numpy()
-            if not ((numbers > 0) & (numbers < math.inf)).all():
+            if not ((numbers > 0) & (numbers <= _LARGEST[name])).all():
                 return None
-        elif pa.types.is_floating(kind) and name not in LATER and not np.isfinite(column.to_numpy()).all():
-            return None
+        elif pa.types.is_floating(kind):
+            numbers = column.to_numpy()
+            known = np.abs(numbers) <= _LARGEST[name]
+            if not (known | (np.isnan(numbers) & (name in LATER))).all():
+                return None
         columns.append(column if isinstance(column, pa.ChunkedArray) else pa.chunked_array([column]))
     return pa.Table.from_arrays(columns, schema=SCHEMA)
 
@@ -359,7 +397,8 @@ def _row(line: str, layouts: Layouts) -> dict[str, object]:
             row[name] = _value(name, value)
         elif name == _COUNTER_OR_CLOCK:
             number = _number("the value before the last", value)
-            row["wall_clock" if number >= _EARLIEST_CLOCK_S else "obstacle_crash_counter"] = number
+            named = "wall_clock" if number >= _EARLIEST_CLOCK_S else "obstacle_crash_counter"
+            row[named] = _value(named, value)
     return row
 
 
@@ -379,12 +418,13 @@ def _value(name: str, value: str) -> float | bool | str:
         if not (0 <= number <= _WHOLE[name] and number == math.floor(number)):
             raise ValueError(f"{name} is {_short(value)}; accepted: a whole number from 0 to {_WHOLE[name]}")
         return int(number)
-    if name not in LATER and not math.isfinite(number):
-        raise ValueError(f"{name} is {_short(value)}; accepted: a finite number")
+    if name == "action" and not abs(number) <= _LARGEST_ACTION:
+        raise ValueError(f"{name} is {_short(value)}; accepted: an action up to {_LARGEST_ACTION}")
+    if not abs(number) <= _LARGEST[name] and not (name in LATER and math.isnan(number)):
+        largest = _LARGEST[name]
+        raise ValueError(f"{name} is {_short(value)}; accepted: a number from {-largest:g} to {largest:g}")
     if name == "track_len" and number <= 0:
         raise ValueError(f"{name} is {_short(value)}; accepted: a length above 0")
-    if name == "action" and abs(number) > _LARGEST_ACTION:
-        raise ValueError(f"{name} is {_short(value)}; accepted: an action up to {_LARGEST_ACTION}")
     return number
 
 

@@ -5,11 +5,15 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .log_archive import LogFile
 from .log_blocks import Blocks
-from .sim_trace import LOG_LAYOUTS, StepTables, read_rows
+from .sim_trace import LOG_LAYOUTS, REST_REFUSED, StepTables, is_hopeless, read_rows, with_one_value_an_action
 
 MARKER = b"SIM_TRACE_LOG:"
 """Precedes the values of a control step; anything may stand before it."""
@@ -27,10 +31,14 @@ _SENSORS = re.compile(
     rb"Sensor list (\[[^\]\n]*\]), network (\w+), simapp_version ([\d.]+)"
     rb"(?:, training_algorithm (\w+), action_space_type (\w+))?(?: lidar_config (\{[^}\n]*\}))?"
 )
+# Settings that only evaluations have, and of these only races.
+_TRIALS = re.compile(rb"NUMBER_OF_TRIALS|JOB_TYPE'?: '?EVALUATION")
+_RACE = b"LEADERBOARD_TYPE"
 _WORKER = re.compile(rb"--rollout_idx (\d{1,3})")
 _JOB = re.compile(rb"S3 prefix: ([^\s\x1b]+)")
 _RESTORED = re.compile(rb"Restoring from path[^\n]*?(\d{1,9}_Step-\d{1,12})\.ckpt")
 _SAVED = re.compile(rb"Saving in path=\[[^\n]*?(\d{1,9}_Step-\d{1,12})\.ckpt")
+_NUMBERED = re.compile(r"[-_]\d{1,3}(?=\.(?:log|txt)$)")
 # The prefix docker puts before the lines of each of several containers.
 _TAG = re.compile(rb"(?m)^([^\s|]+) +\| [^\n]*SIM_TRACE_LOG:")
 _LONGEST_SETTINGS = 10_000
@@ -63,6 +71,8 @@ class TrainingLog:
     sensors: dict[str, Any] | None = None
     """Keys of a model_metadata.json, without the action space."""
     world: str | None = None
+    kind: str | None = None
+    """`evaluation` or `leaderboard`, as the settings in the log have it; None: they do not name such a job."""
     worker: int | None = None
     """Number of the simulation worker that wrote it, from 0."""
     job: str | None = None
@@ -157,12 +167,16 @@ def _read_checkpoints(log: TrainingLog, block: bytes) -> None:
 
 
 def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
-    lines = _TRACE.findall(block)
-    table, refused = read_rows(lines, LOG_LAYOUTS, before)
+    if is_hopeless(log.steps, log.refused):
+        return 0
+    lines = with_one_value_an_action(b"\n".join(_TRACE.findall(block))).split(b"\n")
+    table, refused = read_rows(lines, LOG_LAYOUTS, before, may_stop=not log.steps.found_rows)
     log.steps.add(table)
     if refused:
         starts = [found.start() for found in _TRACE.finditer(block)]
         log.refused += [(_line(block, starts[at], lines_before), reason) for at, reason in refused]
+        if is_hopeless(log.steps, log.refused):
+            log.refused.append((None, REST_REFUSED))
     return int(lines[-1].count(b",")) + 1
 
 
@@ -195,6 +209,8 @@ def _read_updates(log: TrainingLog, block: bytes, lines_before: int) -> None:
 def _read_job(log: TrainingLog, block: bytes) -> None:
     if log.worker is None and (worker := _WORKER.search(block)):
         log.worker = int(worker[1])
+    if log.kind is None and _TRIALS.search(block):
+        log.kind = "leaderboard" if _RACE in block else "evaluation"
     if log.job is None and (job := _JOB.search(block)):
         log.job = job[1].decode("utf-8", "replace").strip("/")
     if log.hyperparameters is None:
@@ -272,7 +288,7 @@ def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[
         of_file[file] = of_file.get(file, -1) + 1
         groups.setdefault((*file.parts[:-1], name, of_file[file]), []).append((file, log))
     joined = []
-    for pieces in groups.values():
+    for pieces in _with_numbered(groups):
         pieces.sort(key=_time_of_piece)
         whole = TrainingLog(
             steps=StepTables.joined([log.steps for _, log in pieces]),
@@ -281,6 +297,7 @@ def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[
             iteration_of={key: value for _, log in pieces for key, value in log.iteration_of.items()},
             hyperparameters=next((log.hyperparameters for _, log in pieces if log.hyperparameters), None),
             world=next((log.world for _, log in pieces if log.world), None),
+            kind=next((log.kind for _, log in pieces if log.kind), None),
             worker=next((log.worker for _, log in pieces if log.worker is not None), None),
             job=next((log.job for _, log in pieces if log.job), None),
             checkpoints=[one for _, log in pieces for one in log.checkpoints],
@@ -288,6 +305,30 @@ def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[
         )
         joined.append(([file for file, _ in pieces], whole))
     return joined
+
+
+def _places(log: TrainingLog) -> NDArray[np.int64]:
+    """Return episode and step of each row in one number."""
+    episode, step = (log.steps.whole[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
+    return (episode << 32) | step
+
+
+def _with_numbered(
+    groups: dict[tuple[str | int, ...], list[tuple[LogFile, TrainingLog]]],
+) -> list[list[tuple[LogFile, TrainingLog]]]:
+    """Join groups whose names differ by a number alone (`sim-trace-log-2.log`) if their episodes continue."""
+    alike: dict[tuple[str | int, ...], list[list[tuple[LogFile, TrainingLog]]]] = {}
+    for (*folders, name, at), pieces in groups.items():
+        alike.setdefault((*folders, _NUMBERED.sub("", str(name)), at), []).append(pieces)
+    found = []
+    for similar in alike.values():
+        whole = sorted((piece for pieces in similar for piece in pieces), key=_time_of_piece)
+        places = [_places(log) for _, log in whole]
+        continues = all(map(len, places)) and all(
+            later[0] > earlier.max() for earlier, later in pairwise(places)
+        )
+        found += [whole] if len(similar) > 1 and continues else similar
+    return found
 
 
 def _time_of_piece(piece: tuple[LogFile, TrainingLog]) -> tuple[int, int, int]:

@@ -3,6 +3,7 @@
 import io
 import json
 import tarfile
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -250,6 +251,14 @@ def write_archive(files: dict[str, str], path: Path) -> Path:
     with tarfile.open(path, "w:gz") as archive:
         for name in sorted(files, key=lambda name: name[::-1]):
             add_member(archive, f"model/{name}", files[name].encode())
+    return path
+
+
+def write_zip(files: dict[str, str], path: Path) -> Path:
+    """Write the files as a zip archive."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in files.items():
+            archive.writestr(f"model/{name}", text)
     return path
 
 

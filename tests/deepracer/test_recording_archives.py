@@ -4,12 +4,15 @@ import bz2
 import gzip
 import lzma
 import resource
+import stat
 import tarfile
+import zipfile
 from pathlib import Path
 
 import pytest
 
 from deepracer_exp.deepracer.recording_reader import read_recording
+from tests.conftest import refused
 
 from . import made_up_logs as made
 
@@ -35,6 +38,37 @@ def test_an_archive_reaches_nothing_outside_and_leaves_nothing_behind(tmp_path):
     assert len(recording.steps) == 12
     assert sum("a link" in problem.reason for problem in recording.problems) == 2
     assert all(file.is_relative_to(path) and ".." not in file.parts for file in recording.files)
+
+
+def test_a_zip_archive_is_read_as_any_other_and_its_links_are_not_followed(tmp_path):
+    path = made.write_zip(made.console(), tmp_path / "week one.ZIP")
+    whole = read_recording(made.write_archive(made.console(), tmp_path / "week.tar.gz"))
+    with zipfile.ZipFile(path, "a") as archive:
+        link = zipfile.ZipInfo("model/9-iteration.csv")
+        link.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(link, "/etc/passwd")
+    recording = read_recording(path)
+    assert recording.name == "week one"
+    assert recording.steps.equals(whole.steps)
+    assert recording.metrics.equals(whole.metrics)
+    (problem,) = recording.problems
+    assert str(problem) == f"{path}/model/9-iteration.csv: a link; not followed"
+    (tmp_path / "in a folder").mkdir()
+    path.rename(tmp_path / "in a folder" / path.name)
+    assert len(read_recording(tmp_path / "in a folder").steps) == len(whole.steps)
+
+
+@pytest.mark.parametrize("damage", ["cut", "encrypted", "empty"])
+def test_a_zip_archive_that_cannot_be_read_is_refused_in_one_line(damage, tmp_path):
+    path = made.write_zip(
+        {"0-iteration.csv": made.csv_text(made.drives([0]))} if damage != "empty" else {}, tmp_path / "a.zip"
+    )
+    raw = bytearray(path.read_bytes())
+    if damage == "encrypted":  # the flag in both of the archive's lists
+        raw[6] |= 1
+        raw[raw.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(raw[: len(raw) // 2] if damage == "cut" else raw)
+    assert refused(read_recording, path).startswith(str(path))
 
 
 def test_archives_in_a_folder_are_read_as_what_they_hold(tmp_path):

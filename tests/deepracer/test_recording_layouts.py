@@ -290,6 +290,78 @@ def test_links_are_not_followed(tmp_path):
     assert [problem.reason for problem in recording.problems] == ["a link; not followed"]
 
 
+@pytest.mark.parametrize("name", ["3-iteration.csv", "a-robomaker.log", "week.tar.gz", "week.zip"])
+def test_a_link_that_the_user_names_is_read_by_its_own_name(tmp_path, name):
+    blob = tmp_path / "blobs" / "1f0c"
+    blob.parent.mkdir()
+    csv = {"training-simtrace/3-iteration.csv": made.csv_text(made.drives([6, 7]))}
+    if name.startswith("week"):
+        (made.write_zip if name.endswith("zip") else made.write_archive)(csv, blob)
+    else:
+        blob.write_text(
+            made.csv_text(made.drives([6, 7])) if "csv" in name else made.log_text(made.drives([6, 7]))
+        )
+    link = tmp_path / name
+    link.symlink_to(blob)
+    recording = read_recording(link)
+    assert len(recording.steps) == 12
+    assert recording.name == name.removesuffix(".tar.gz").removesuffix(".zip")
+    assert set(recording.steps["iteration"]) == ({0} if name.endswith(".log") else {3})
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind"), [(["/LEADERBOARD_TYPE: COMMUNITY"], "leaderboard"), ([], "evaluation")]
+)
+def test_a_race_is_no_training_whatever_its_log_is_called(tmp_path, settings, kind):
+    text = "".join(f" * {line}\n" for line in ["/NUMBER_OF_TRIALS: 3", *settings]) + made.log_text(
+        made.drives([0])
+    )
+    (tmp_path / "robomaker.log").write_text(text)
+    recording = read_recording(tmp_path / "robomaker.log")
+    assert set(recording.steps["stream"]) == {"robomaker"}
+    assert not recording.checkpoints
+    # Beside a training it is an evaluation of it, and its rows are no iteration.
+    made.write_folder(made.drfc_single(), tmp_path)
+    both = read_recording(tmp_path)
+    assert len(made.training(both)) == made.ROWS["drfc_single"]
+    assert "robomaker" in set(both.steps["stream"])
+
+
+def test_numbers_of_the_logs_of_2019_are_no_iterations(tmp_path):
+    for number in range(12):
+        rows = made.drives([2 * number, 2 * number + 1], seed=number)
+        (tmp_path / f"sim-trace-log-{number}.log").write_text(made.log_text(rows, 15))
+    recording = read_recording(tmp_path)
+    assert not recording.rounds
+    steps = recording.steps
+    assert (steps["iteration"] == steps["episode"] // 20).all()
+    # Those whose episodes begin anew are trainings of their own.
+    (tmp_path / "sim-trace-log-12.log").write_text(made.log_text(made.drives([0, 1], seed=12), 15))
+    assert len(read_recording(tmp_path).rounds) > 1
+
+
+def test_folders_may_be_named_by_their_workers(tmp_path):
+    plain = made.write_folder(made.drfc_workers(), tmp_path / "plain")
+    named = {
+        name.replace("0/", "worker_0/").replace("1/", "worker_1/"): text
+        for name, text in made.drfc_workers().items()
+    }
+    folders = made.write_folder(named, tmp_path / "named")
+    assert set(read_recording(folders).steps["worker"]) == {0, 1}
+    for table in ("steps", "metrics"):
+        assert getattr(read_recording(folders), table).equals(getattr(read_recording(plain), table))
+    for worker in range(2):
+        rows = made.drives([0, 1], seed=worker)
+        made.write_folder({f"worker_{worker}/robomaker.log": made.log_text(rows)}, tmp_path / "text")
+    steps = read_recording(tmp_path / "text").steps
+    assert sorted(set(zip(steps["worker"], steps["episode"], strict=True))) == [
+        (0, 0),
+        (0, 1),
+        (1, 2),
+        (1, 3),
+    ]
+
+
 def test_a_name_that_is_no_utf_8_can_be_shown(tmp_path):
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/tr\xff\x1b[31m"))
     folder.mkdir()

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from deepracer_exp.deepracer import sim_trace
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
@@ -89,17 +90,60 @@ def test_the_radians_of_2019_become_degrees_and_later_degrees_stay(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "action", ["[-6.65667057  0.65535903]", "[ 5.  1.]", "[1.5875086159594005 1.7339787686700332]"]
+    "action",
+    ["[-6.65667057  0.65535903]", "[ 5.  1.]", "[1.5875086159594005 1.7339787686700332]", "[-30.0, 1.21]"],
 )
 def test_a_continuous_action_is_no_number(tmp_path, action):
     rows = ROWS.assign(action=action)
-    made.write_folder(
-        {"a.log": made.log_text(rows, 19), "b/0-iteration.csv": made.csv_text(rows, 19)}, tmp_path
-    )
-    for path in (tmp_path / "a.log", tmp_path / "b"):
+    # The service puts no value in quotes.
+    files = {
+        "a-robomaker.txt": made.log_text(rows),
+        "b/0-iteration.csv": made.csv_text(rows).replace('"', ""),
+    }
+    made.write_folder(files | {"quoted/0-iteration.csv": made.csv_text(rows, 19)}, tmp_path)
+    for path in (tmp_path / "a-robomaker.txt", tmp_path / "b", tmp_path / "quoted"):
         recording = read_recording(path)
-        assert len(recording.steps) == len(ROWS)
+        assert not recording.problems
         assert recording.steps["action"].isna().all()
+        assert recording.steps["episode_status"].astype(str).tolist() == ROWS["episode_status"].tolist()
+        np.testing.assert_allclose(recording.steps["reward"], ROWS["reward"], rtol=0, atol=6e-5)
+
+
+def test_a_continuous_action_cut_off_by_the_end_of_a_log_is_listed(tmp_path):
+    lines = made.log_text(ROWS.assign(action="[-30.0, 1.21]")).splitlines()[:-1]
+    for end in range(lines[-1].index("["), lines[-1].index("]")):
+        (tmp_path / "robomaker.log").write_text("\n".join([*lines[:-1], lines[-1][:end]]))
+        recording = read_recording(tmp_path)
+        assert len(recording.steps) == len(ROWS) - 1
+        assert [problem.line for problem in recording.problems] == [len(lines)]
+
+
+@pytest.mark.parametrize("name", ["0-iteration.csv", "a-robomaker.log"])
+def test_a_file_whose_first_rows_cannot_be_read_is_given_up_early_and_the_first_one_is_named(
+    tmp_path, name, monkeypatch
+):
+    read: list[int] = []
+    slowly = sim_trace._row
+    monkeypatch.setattr(sim_trace, "_row", lambda line, layouts: read.append(1) or slowly(line, layouts))
+    header, row = made.csv_text(ROWS).splitlines()[:2]
+    bad = f"{row},more,evenmore,most"
+    lines = [header, *[bad] * 200_000] if name.endswith(".csv") else [f"SIM_TRACE_LOG:{bad}"] * 200_000
+    (tmp_path / name).write_text("\n".join(lines))
+    first = 2 if name.endswith(".csv") else 1
+    assert f"{name}:{first}: 20 values; accepted: " in refused(read_recording, tmp_path / name)
+    assert len(read) < 2 * sim_trace.MOST_REFUSED
+    # Beside a file that can be read the rest is counted as one problem.
+    (tmp_path / "1-iteration.csv").write_text(made.csv_text(ROWS))
+    recording = read_recording(tmp_path)
+    assert len(recording.steps) == len(ROWS)
+    assert any("more that cannot be read" in problem.reason for problem in recording.problems)
+
+
+def test_a_file_that_begins_badly_is_read_from_where_it_can_be(tmp_path):
+    header, *rows = made.csv_text(ROWS).splitlines()
+    bad = [f"{rows[0]},more"] * (sim_trace.MOST_REFUSED - 1)
+    (tmp_path / "0-iteration.csv").write_text("\n".join([header, *bad, *rows]))
+    assert len(read_recording(tmp_path).steps) == len(ROWS)
 
 
 def test_generations_one_after_the_other_in_one_file_are_all_read(tmp_path):
@@ -150,6 +194,12 @@ def test_bad_rows_of_a_csv_are_listed_with_their_numbers(tmp_path):
         ("closest_waypoint", "2000000000", "a whole number from 0 to 99999"),
         ("action", "2000000000", "an action up to 9999"),
         ("track_len", "0.0", "a length above 0"),
+        ("X", "1e308", "a number from -1e+09 to 1e+09"),
+        ("Y", "-inf", "a number from -1e+09 to 1e+09"),
+        ("progress", "nan", "a number from -1e+09 to 1e+09"),
+        ("reward", "-1e308", "a number from -1e+100 to 1e+100"),
+        ("tstamp", "1e300", "a number from -1e+12 to 1e+12"),
+        ("pause_duration", "inf", "a number from -1e+09 to 1e+09"),
     ],
 )
 def test_values_that_no_track_and_no_policy_has_are_listed(tmp_path, column, value, accepted):
