@@ -1,12 +1,12 @@
 """Fit the simulated car to recorded drives.
 
-    python -m benchmarks.calibrate --traces PATH ... [--car NAME] [--output FILE.yaml] [--leave-one-out]
+    python -m benchmarks.calibrate --traces PATH ... [--car NAME] [--output FILE.yaml]
 
-Takes the folders, files and archives that `deepracer-exp analyze` reads. Every fourth iteration of each recording is
-held out: the car is fitted to the others, and its errors are reported for both. docs/fidelity.md explains the measure.
+Takes the folders, files and archives that `deepracer-exp analyze` reads, and reports the errors on what the car is
+fitted to. How well such a car predicts a recording that it was not fitted to says `benchmarks.fidelity
+--leave-one-out`. docs/fidelity.md explains the measure.
 """
 
-import argparse
 import dataclasses
 import re
 import sys
@@ -258,16 +258,14 @@ def interval(median: Median) -> str:
     return f"{number(median.error_m, 3)} ({median.interval_m[0]:.3f} to {median.interval_m[1]:.3f})"
 
 
-def off_by(found: Fit, windows: Windows) -> dict[str, Median]:
-    """Return the median errors at the ends of windows, by band."""
-    return by_band(errors(replay(found.car, windows, found.observer), windows).distance_m[:, -1], windows)
-
-
 def error_table(before: Fit, after: Fit, parts: dict[str, Windows]) -> str:
-    """Return the median errors by part and band of speed."""
+    """Return the median errors at the ends of windows by part and band of speed."""
     rows = []
     for part, windows in parts.items():
-        off = [off_by(one, windows) for one in (before, after)]
+        off = [
+            by_band(errors(replay(one.car, windows, one.observer), windows).distance_m[:, -1], windows)
+            for one in (before, after)
+        ]
         for band in (*BANDS, "all"):
             count = off[0][band].windows
             if count:
@@ -308,9 +306,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--output", type=Path, help="write the fitted car as an option file to this path")
     parser.add_argument(
-        "--leave-one-out", action="store_true", help="also fit without each recording, and measure on it"
-    )
-    parser.add_argument(
         "--evaluations", type=int, default=25, help="steps of the least squares solver, at most"
     )
     parser.add_argument("--windows", type=int, default=3000, help="windows to fit to, at most")
@@ -325,17 +320,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.output is not None:
         _require_writable(options.output)
     recorded = read_recorded(options.traces)
-    if options.leave_one_out and len(recorded) < 2:
-        raise BadInput(f"--leave-one-out: --traces has {len(recorded)} recording; accepted: two or more")
     name = _starting_car(options.car, recorded)
     car = car_named(name)
-    known, held = (join([one.part(held) for one in recorded]) for held in (False, True))
-    for part, windows in (("to fit to", known), ("to hold out", held)):
-        if len(windows) < LEAST_WINDOWS:
-            raise BadInput(
-                f"--traces {' '.join(map(str, options.traces))}: {len(windows)} windows of a second {part}; accepted: "
-                f"at least {LEAST_WINDOWS}, of two iterations or more"
-            )
+    known = join([one.windows["one_second"] for one in recorded])
+    if len(known) < LEAST_WINDOWS:
+        raise BadInput(
+            f"--traces {' '.join(map(str, options.traces))}: {len(known)} windows of a second; accepted: at least "
+            f"{LEAST_WINDOWS}"
+        )
     for one in recorded:
         print(describe(one))
     some = sample(known, options.windows, options.seed)
@@ -343,14 +335,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     before = fit(car, some, (), options.evaluations)
     found = fit(car, some, PARAMETERS, options.evaluations, before.observer)
     print(f"\n{parameter_table(car, found, PARAMETERS)}\n")
-    parts = {"fitted": known, "held out": held}
     for length in LENGTHS:
-        if length != "one_second":
-            parts = {"held out": join([one.part(True, length) for one in recorded])}
-        print(f"after {length.replace('_', ' ')}:\n{error_table(before, found, parts)}\n")
-    print(error_table(before, found, {one.name: one.part(True) for one in recorded}))
-    if options.leave_one_out:
-        _leave_one_out(recorded, before, found, options)
+        windows = join([one.windows[length] for one in recorded])
+        after = f"after {length.replace('_', ' ')}"
+        print(f"{error_table(before, found, {after: windows})}\n")
+    print(error_table(before, found, {one.name: one.windows["one_second"] for one in recorded}))
     if found.undetermined:
         print(f"not determined by the recordings, and as in car={name}: {', '.join(found.undetermined)}")
     fitted = [p for p in PARAMETERS if p.key not in found.undetermined]
@@ -360,19 +349,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         note = f"Fitted by benchmarks.calibrate to {', '.join(one.name for one in recorded)}."
         write_car(found.car, name, [p.key for p in fitted], options.output, note)
         print(f"\nwritten: {options.output}")
-
-
-def _leave_one_out(
-    recorded: Sequence[Recorded], before: Fit, found: Fit, options: argparse.Namespace
-) -> None:
-    """Report the error on each recording of a car that is fitted to the others."""
-    free = [p for p in PARAMETERS if p.key not in found.undetermined]
-    for one in recorded:
-        others = join([other.part(False) for other in recorded if other is not one])
-        some = sample(others, options.windows, options.seed)
-        without = fit(before.car, some, free, options.evaluations, before.observer)
-        print(f"\nfitted without {one.name}:")
-        print(error_table(before, without, {one.name: one.windows["one_second"]}), flush=True)
 
 
 def _require_writable(path: Path) -> None:

@@ -1,9 +1,10 @@
 """How far the simulated car is from recorded cars that were sent the same actions.
 
-    python -m benchmarks.fidelity --traces PATH ... [--held-out] [--car NAME] [--json FILE] [--figures DIR]
+    python -m benchmarks.fidelity --traces PATH ... [--leave-one-out] [--car NAME] [--json FILE] [--figures DIR]
 
 Takes the folders, files and archives that `deepracer-exp analyze` reads, of any generation; each is measured with the
-car of its version. docs/fidelity.md explains the measure.
+car of its version. With --leave-one-out it is measured with a car that is fitted to the other recordings of its
+version alone, which takes some minutes. docs/fidelity.md explains the measure.
 """
 
 import sys
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from benchmarks.calibrate import LEAST_WINDOWS, Fit, fit
+from benchmarks.calibrate import LEAST_WINDOWS, PARAMETERS, Fit, fit
 from benchmarks.recorded import (
     BANDS,
     LENGTHS,
@@ -35,8 +36,11 @@ from deepracer_exp.errors import BadInput
 Floats = NDArray[np.float64]
 MODELS = ("car", "formula", "bicycle")
 _FITTED_TO = 1500
-"""Windows to which observer and formula are fitted, at most."""
+"""Windows to which cars, observers and formulas are fitted, at most."""
 _EVALUATIONS = 12
+_BEGIN = {4: "deepracer_v5", 5: "deepracer_v4", 6: "deepracer_v5"}
+"""Where a fit with a recording left out begins: the car of another version, which has not seen the recording."""
+_FIT_EVALUATIONS = 25
 
 
 def bicycle(car: CarConfig, windows: Windows) -> Floats:
@@ -125,14 +129,13 @@ def fit_formula(car: CarConfig, windows: Windows) -> Formula:
 
 
 class Measured(NamedTuple):
-    """What predicts the recordings of one version."""
+    """What predicts a recording."""
 
     name: str
     """Of the car."""
     fitted: Fit
-    """The car with an observer fitted to the part that is not held out."""
+    """The car with an observer."""
     formula: Formula
-    """Fitted to the same part."""
 
     def predict(self, windows: Windows) -> dict[str, Floats]:
         """Return the poses that each of `MODELS` predicts, (M, steps, 3)."""
@@ -144,32 +147,56 @@ class Measured(NamedTuple):
         }
 
 
+Parts = Sequence[tuple[Recorded, Measured]]
+"""Recordings of one version, each with what predicts it."""
+
+
 def prepare(name: str, recorded: Sequence[Recorded]) -> Measured:
-    """Fit an observer to the car and recordings, and the formula.
+    """Fit an observer for the car, and the formula, to the recordings.
 
     Raises:
         BadInput: the recordings have no window.
     """
-    car = car_named(name)
-    known = join([one.part(False) for one in recorded])
-    if len(known) < LEAST_WINDOWS:
-        # One iteration only: there is no other part.
-        known = join([one.windows["one_second"] for one in recorded])
+    car, some = car_named(name), _known(recorded)
+    return Measured(name, fit(car, some, (), _EVALUATIONS, OBSERVER), fit_formula(car, some))
+
+
+def prepare_without(version: int, left_out: Recorded, recorded: Sequence[Recorded]) -> Measured:
+    """Fit a car with its observer, and the formula, to all recordings of a version but one.
+
+    Raises:
+        BadInput: the others have too few windows.
+    """
+    some = _known([one for one in recorded if one is not left_out])
+    if len(some) < LEAST_WINDOWS:
+        raise BadInput(
+            f"--leave-one-out: without {left_out.name} there are {len(some)} windows of version {version} to fit to; "
+            f"accepted: at least {LEAST_WINDOWS}"
+        )
+    begin = fit(car_named(_BEGIN[version]), some, (), _EVALUATIONS, OBSERVER)
+    fitted = fit(begin.car, some, PARAMETERS, _FIT_EVALUATIONS, begin.observer)
+    return Measured(f"fitted without {left_out.name}", fitted, fit_formula(begin.car, some))
+
+
+def _known(recorded: Sequence[Recorded]) -> Windows:
+    """Return the windows that are fitted to."""
+    known = join([one.windows["one_second"] for one in recorded])
     if not len(known):
         raise BadInput(
             f"--traces: {', '.join(one.name for one in recorded)}: no window of a second; accepted: one"
         )
-    some = sample(known, _FITTED_TO, 0)
-    return Measured(name, fit(car, some, (), _EVALUATIONS, OBSERVER), fit_formula(car, some))
+    return sample(known, _FITTED_TO, 0)
 
 
-def measure(measured: Measured, recorded: Sequence[Recorded], only_held_out: bool) -> dict[str, Any]:
-    """Return the median errors on recordings of one version, together and one by one."""
+def measure(parts: Parts) -> dict[str, Any]:
+    """Return the median errors on recordings of one version together."""
     bands: dict[str, dict[str, Any]] = {band: {} for band in (*BANDS, "all")}
     for length in LENGTHS:
-        windows = join([one.part(True, length) if only_held_out else one.windows[length] for one in recorded])
-        for model, predicted in measured.predict(windows).items():
-            off = by_band(errors(predicted, windows).distance_m[:, -1], windows)
+        windows = join([one.windows[length] for one, _ in parts])
+        predicted = [measured.predict(one.windows[length]) for one, measured in parts]
+        for model in MODELS:
+            paths = np.concatenate([of[model] for of in predicted])
+            off = by_band(errors(paths, windows).distance_m[:, -1], windows)
             for band, median in off.items():
                 figures = bands[band]
                 if model == "car":
@@ -182,9 +209,9 @@ def measure(measured: Measured, recorded: Sequence[Recorded], only_held_out: boo
     return {"bands": bands}
 
 
-def show(version: int, name: str, figures: dict[str, Any]) -> str:
+def show(version: int, car: str, figures: dict[str, Any]) -> str:
     """Return the figures of one version as a table."""
-    head = (f"version {version}, car={name}: median error (m)", *MODELS, "interval of the car", "windows")
+    head = (f"version {version}, car={car}: median error (m)", *MODELS, "interval of the car", "windows")
     rows = []
     for length in LENGTHS:
         for band, of in figures["bands"].items():
@@ -202,6 +229,16 @@ def show(version: int, name: str, figures: dict[str, Any]) -> str:
     return table(head, rows)
 
 
+def show_recording(name: str, figures: dict[str, Any]) -> str:
+    """Return the figures of one recording as a line: errors after a second by band."""
+    bands = (
+        f"{band} {number(of['one_second_error_m'], 3)} ({of['windows']})"
+        for band, of in figures["bands"].items()
+        if of["windows"]
+    )
+    return f"{name}: {', '.join(bands)}"
+
+
 @with_exit_code
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and draw."""
@@ -210,7 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--traces", type=Path, nargs="+", required=True, help="folders, files or archives of recorded drives"
     )
     parser.add_argument(
-        "--held-out", action="store_true", help="only the iterations that calibrate does not fit to"
+        "--leave-one-out", action="store_true", help="predict each recording with a car fitted to the others"
     )
     parser.add_argument("--car", help="one simulated car for all (an option of conf/car)")
     parser.add_argument(
@@ -219,31 +256,42 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.car is not None:
         car_named(options.car)
+    if options.car is not None and options.leave_one_out:
+        raise BadInput("--leave-one-out --car: accepted: one of the two, since cars are fitted")
     recorded = read_recorded(options.traces)
-    versions, drawn = {}, []
+    versions: dict[str, Any] = {}
+    drawn: list[tuple[int, Parts]] = []
     for one in recorded:
-        print(describe(one))
+        print(describe(one), flush=True)
     for version in sorted({one.version for one in recorded}):
         mine = [one for one in recorded if one.version == version]
-        measured = prepare(options.car or f"deepracer_v{version}", mine)
-        figures = measure(measured, mine, options.held_out)
-        print(f"\n{show(version, measured.name, figures)}", flush=True)
+        if options.leave_one_out:
+            parts = [(one, prepare_without(version, one, mine)) for one in mine]
+        else:
+            measured = prepare(options.car or f"deepracer_v{version}", mine)
+            parts = [(one, measured) for one in mine]
+        name = "fitted without the recording" if options.leave_one_out else measured.name
+        figures = measure(parts)
+        print(f"\n{show(version, name, figures)}", flush=True)
         versions[str(version)] = {
-            "car": measured.name,
-            "observer": measured.fitted.observer._asdict(),
-            "formula_values": measured.formula._asdict(),
+            "car": name,
             **figures,
             "recordings": {
                 one.name: {
                     "version_stated": one.stated,
                     "windows_left_out": one.windows["one_second"].left_out,
-                    **measure(measured, [one], options.held_out),
+                    "car": {p.key: getattr(measured.fitted.car, p.key) for p in PARAMETERS},
+                    "observer": measured.fitted.observer._asdict(),
+                    "formula_values": measured.formula._asdict(),
+                    **measure([(one, measured)]),
                 }
-                for one in mine
+                for one, measured in parts
             },
         }
-        drawn.append((version, measured, mine))
-    write_json(options.json, {"versions": versions, "held_out": options.held_out})
+        for one in mine:
+            print(f"  {show_recording(one.name, versions[str(version)]['recordings'][one.name])}", flush=True)
+        drawn.append((version, parts))
+    write_json(options.json, {"versions": versions, "leave_one_out": options.leave_one_out})
     if options.figures is not None:
         from benchmarks.fidelity_figures import draw
 

@@ -11,8 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fidelity import Measured
-from benchmarks.recorded import BANDS, LENGTHS, Recorded, held_out, in_band, join
+from benchmarks.fidelity import Parts
+from benchmarks.recorded import BANDS, LENGTHS, in_band, join
 from benchmarks.replay import WARM_UP_STEPS, cut_windows, errors, replay
 
 Floats = NDArray[np.float64]
@@ -23,7 +23,7 @@ _LEAST = 20
 """Fewer windows are not drawn."""
 _BINS = 9
 
-Drawn = Sequence[tuple[int, Measured, Sequence[Recorded]]]
+Drawn = Sequence[tuple[int, Parts]]
 
 
 def draw(versions: Drawn, folder: Path) -> list[Path]:
@@ -37,17 +37,16 @@ def draw(versions: Drawn, folder: Path) -> list[Path]:
 
 
 def _laps(versions: Drawn) -> plt.Figure:
-    """Draw the fastest held-out episode of each version, the simulated car put back every three seconds."""
+    """Draw the fastest episode of each version, the simulated car put back every three seconds."""
     figure, axes = plt.subplots(1, len(versions), figsize=(4.6 * len(versions), 3.8), squeeze=False)
-    for axis, (version, measured, recorded) in zip(axes[0], versions, strict=True):
+    for axis, (version, parts) in zip(axes[0], versions, strict=True):
         # The recording with most rows; of its episodes, complete laps before others, then the shortest.
-        one = max(recorded, key=lambda each: len(each.steps))
-        steps = one.steps[held_out(one.steps["iteration"].to_numpy())]
+        one, measured = max(parts, key=lambda each: len(each[0].steps))
         of = ["stream", "worker", "iteration", "episode"]
-        episodes = steps.groupby(of, sort=False, observed=True)
+        episodes = one.steps.groupby(of, sort=False, observed=True)
         laps = episodes.agg(rows=("steps", "size"), progress=("progress", "max")).reset_index()
         lap = laps.sort_values(["progress", "rows"], ascending=[False, True]).iloc[0]
-        rows = steps[(steps[of] == list(lap[of])).all(axis=1)]
+        rows = one.steps[(one.steps[of] == list(lap[of])).all(axis=1)]
         car, yaw = measured.fitted.car, np.radians(rows["yaw"])
         origin = [rows[c] - car.front_point_m * turn(yaw) for c, turn in (("X", np.cos), ("Y", np.sin))]
         axis.plot(*origin, color=RECORDED, lw=2.6)
@@ -81,10 +80,12 @@ def _residuals(versions: Drawn) -> plt.Figure:
         "ahead, by speed",
     )
     figure, axes = plt.subplots(len(versions), 4, figsize=(15, 3.3 * len(versions)), squeeze=False)
-    for row, (version, measured, recorded) in zip(axes, versions, strict=True):
-        windows = join([one.part(True) for one in recorded])
-        car, observer = measured.fitted.car, measured.fitted.observer
-        off = errors(replay(car, windows, observer), windows)
+    for row, (version, parts) in zip(axes, versions, strict=True):
+        each = [one.windows["one_second"] for one, _ in parts]
+        windows = join(each)
+        fits = [measured.fitted for _, measured in parts]
+        paths = [replay(fit.car, of, fit.observer) for fit, of in zip(fits, each, strict=True)]
+        off = errors(np.concatenate(paths), windows)
         yaw = windows.truth[:, -1, 2]
         x_m, y_m = off.x_m[:, -1], off.y_m[:, -1]
         ahead_m, left_m = np.cos(yaw) * x_m + np.sin(yaw) * y_m, np.cos(yaw) * y_m - np.sin(yaw) * x_m

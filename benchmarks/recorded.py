@@ -15,6 +15,7 @@ from benchmarks.replay import WARM_UP_STEPS, Windows, cut_windows, errors, repla
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.errors import BadInput
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,25 +36,16 @@ _ARCHIVE = re.compile(r"\.(?:tar|tgz|tar\.(?:gz|bz2|xz)|(?:log|txt)\.(?:gz|bz2|x
 
 @dataclasses.dataclass(frozen=True)
 class Recorded:
-    """One recording of a service's car."""
+    """One recording of a service's car: a training, an evaluation or a race."""
 
-    path: Path
+    name: str
+    """Of the file or folder; if it holds several recordings, with the recording's stream."""
     version: int
     stated: bool
     """Whether the recording states its version; else it is the one whose car predicts the recording best."""
     steps: pd.DataFrame
     windows: dict[str, Windows]
     """By the names of `LENGTHS`."""
-
-    @property
-    def name(self) -> str:
-        """Name of the file or folder."""
-        return self.path.resolve().name
-
-    def part(self, held: bool, length: str = "one_second") -> Windows:
-        """Return the windows that are held out, or the others."""
-        windows = self.windows[length]
-        return windows.choose(held_out(windows.iteration) == held)
 
 
 class Median(NamedTuple):
@@ -75,7 +67,7 @@ def car_named(name: str) -> CarConfig:
 
 
 def read_recorded(paths: Sequence[Path]) -> list[Recorded]:
-    """Read recordings; a folder of archives is one recording an archive.
+    """Read recordings; in a folder of archives, those of each archive.
 
     Raises:
         BadInput: there is nothing, or nothing that can be read.
@@ -86,17 +78,21 @@ def read_recorded(paths: Sequence[Path]) -> list[Recorded]:
         recording = read_recording(path)
         for problem in recording.problems:
             print(problem, file=sys.stderr)
-        steps = recording.steps
-        front_point_m = cars[VERSIONS[0]].front_point_m
-        windows = {
-            length: cut_windows(steps, front_point_m, count, _EVERY_ROWS) for length, count in LENGTHS.items()
-        }
-        metadata = recording.metadata
+        name, metadata = path.resolve().name, recording.metadata
         stated = metadata is not None and "version" in metadata.given and metadata.version in VERSIONS
-        version = (
-            metadata.version if metadata is not None and stated else _nearest(cars, windows["one_second"])
-        )
-        found.append(Recorded(path, version, stated, steps, windows))
+        streams = list(recording.steps.groupby("stream", sort=False, observed=True))
+        for stream, steps in streams:
+            windows = {
+                length: cut_windows(steps, cars[VERSIONS[0]].front_point_m, count, _EVERY_ROWS)
+                for length, count in LENGTHS.items()
+            }
+            version = (
+                metadata.version if metadata is not None and stated else _nearest(cars, windows["one_second"])
+            )
+            of = name if len(streams) == 1 else f"{name} {stream}"
+            found.append(Recorded(of, version, stated, steps, windows))
+    if not found:
+        raise BadInput(f"--traces {' '.join(map(str, paths))}: no recorded steps; accepted: recorded drives")
     return found
 
 
@@ -125,13 +121,6 @@ def _nearest(cars: dict[int, CarConfig], windows: Windows) -> int:
         version: np.median(errors(replay(car, some), some).distance_m[:, -1]) for version, car in cars.items()
     }
     return min(VERSIONS, key=lambda version: float(np.nan_to_num(off[version], nan=np.inf)))
-
-
-def held_out(iteration: NDArray[np.int64]) -> Mask:
-    """Return for each window whether its iteration is held out of the fit: every fourth, or the last of fewer."""
-    iterations = np.unique(iteration)
-    held: Mask = np.isin(iteration, iterations[3::4] if len(iterations) > 3 else iterations[-1:])
-    return held
 
 
 def join(parts: Sequence[Windows]) -> Windows:

@@ -147,32 +147,34 @@ def _by_episode(recorded: pd.DataFrame) -> Any:
 def _durations(recorded: pd.DataFrame, x_m: Floats, y_m: Floats) -> Floats:
     """Return how long the step from each row to the next took, (rows,).
 
-    The service sends an action 15 times a second, more or less: in some recordings the distance from row t to t + 1
-    is longer where the time between rows t - 1 and t is, in others it is not. How much so is found by regression; that
-    share of the recorded jitter is taken.
+    The service sends an action 15 times a second, more or less. Some recordings stamp a row at the end of its step, so
+    that the step from row t to t + 1 lasts from stamp t - 1 to t; some, of version 6, at its start: from stamp t to
+    t + 1; and in some the stamps' jitter says nothing. Which, and how much of the jitter is real, is found by a
+    regression of the distance driven.
     """
     stamp = recorded["tstamp"].to_numpy(np.float64)
-    relative = np.zeros(len(stamp))
-    relative[1:] = np.diff(stamp) / PERIOD_S - 1.0
-    group = _by_episode(recorded).ngroup()
-    same = np.zeros(len(stamp), bool)
-    same[1:] = group.to_numpy()[1:] == group.to_numpy()[:-1]
-    relative[~same | (np.abs(relative) > _MOST_JITTER)] = 0.0
-    driven = np.zeros(len(stamp))
-    driven[:-1] = np.hypot(np.diff(x_m), np.diff(y_m))
+    group = _by_episode(recorded).ngroup().to_numpy()
+    same = group[1:] == group[:-1]
+    jitter = np.diff(stamp) / PERIOD_S - 1.0
+    jitter[~same | (np.abs(jitter) > _MOST_JITTER)] = 0.0
+    at_end, at_start = np.append(0.0, jitter), np.append(jitter, 0.0)
+    driven = np.append(np.hypot(np.diff(x_m), np.diff(y_m)), 0.0)
     around = 0.25 * sum(np.roll(driven, shift) for shift in (-2, -1, 1, 2))
     # Within an episode, away from its ends and moving.
-    steady = same & (around > _LEAST_DRIVEN_M)
-    for shift in (-3, -2, -1, 1, 2):
-        steady &= np.roll(same, shift)
+    steady = (at_end != 0.0) & (at_start != 0.0) & (around > _LEAST_DRIVEN_M)
+    for shift in (2, 1, 0, -1, -2, -3):
+        steady &= np.roll(np.append(False, same), shift)
     longer = driven / np.maximum(around, _LEAST_DRIVEN_M) - 1.0
-    steady &= (np.abs(longer) < _MOST_JITTER) & (relative != 0.0)
+    steady &= np.abs(longer) < _MOST_JITTER
     if steady.sum() < _LEAST_STEADY:
         return np.full(len(stamp), PERIOD_S)
-    # Neighbours take part, since jitter alternates.
-    columns = [*(np.roll(relative, shift)[steady] for shift in (1, 0, -1)), np.ones(steady.sum())]
-    share = np.linalg.lstsq(np.stack(columns, axis=1), longer[steady], rcond=None)[0][1]
-    durations: Floats = PERIOD_S * (1.0 + np.clip(share, 0.0, 1.0) * relative)
+    # Neighbours take part: they are in `around`, and jitter alternates.
+    columns = [np.roll(at_end, shift)[steady] for shift in (0, -1, 2, 1, -2, -3)]
+    shares = np.linalg.lstsq(np.stack([*columns, np.ones(steady.sum())], axis=1), longer[steady], rcond=None)[
+        0
+    ]
+    real = at_end if shares[0] >= shares[1] else at_start
+    durations: Floats = PERIOD_S * (1.0 + np.clip(shares[:2].max(), 0.0, 1.0) * real)
     return durations
 
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from benchmarks import calibrate
-from benchmarks.recorded import BANDS, car_named, held_out, in_band, join, median_error, read_recorded, sample
+from benchmarks.recorded import BANDS, car_named, in_band, join, median_error, read_recorded, sample
 from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, cut_windows, errors, replay
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim.batch import CarBatch
@@ -152,6 +152,25 @@ def test_a_car_predicts_its_own_recording_and_one_that_steers_later_does_not(win
     assert other > 0.04
 
 
+@pytest.mark.parametrize("stamped", ["at the start", "at the end", "at random"])
+def test_a_step_lasts_as_long_as_the_stamps_that_the_distance_driven_follows_say(stamped):
+    rng = np.random.default_rng(0)
+    lasted_s = PERIOD_S * rng.uniform(0.7, 1.3, 800)
+    ended_s = np.cumsum(lasted_s)
+    began_s = ended_s - lasted_s
+    random_s = PERIOD_S * (np.arange(800) + rng.uniform(-0.3, 0.3, 800))
+    driven = pd.DataFrame({"steps": np.arange(800), "X": 2.0 * began_s}).assign(
+        stream="training", worker=0, iteration=0, episode=0, Y=0.0, yaw=0.0, steer=0.0, throttle=2.0
+    )
+    stamps = {"at the start": began_s, "at the end": ended_s, "at random": random_s}
+    driven = driven.assign(episode_status="in_progress", tstamp=stamps[stamped])
+    windows = cut_windows(driven, CAR.front_point_m, 15)
+    found_s = windows.duration_s[1:, WARM_UP_STEPS:].ravel()
+    expected_s = np.full(800, PERIOD_S) if stamped == "at random" else lasted_s
+    first = 1 + WARM_UP_STEPS
+    np.testing.assert_allclose(found_s, expected_s[first : first + len(found_s)], rtol=0.05)
+
+
 def test_predictions_do_not_depend_on_the_other_windows(windows):
     some = np.array([3, 8, 9, 40])
     np.testing.assert_array_equal(replay(CAR, windows)[some], replay(CAR, windows.choose(some)))
@@ -168,7 +187,7 @@ def chosen(*keys: str) -> list[calibrate.Parameter]:
 
 def test_a_fit_finds_the_parameters_of_the_car_that_was_recorded_and_leaves_the_others(windows):
     wrong = dataclasses.replace(CAR, steering_trim_deg=3.0, tyre_friction=1.3 * CAR.tyre_friction)
-    some = windows.choose(np.flatnonzero(~held_out(windows.iteration))[::2])
+    some = windows.choose(np.arange(0, len(windows), 2))
     found = calibrate.fit(wrong, some, chosen("steering_trim_deg", "tyre_friction"), 15)
     assert found.car.steering_trim_deg == pytest.approx(CAR.steering_trim_deg, abs=0.2)
     assert found.car.tyre_friction == pytest.approx(CAR.tyre_friction, rel=0.05)
@@ -229,11 +248,6 @@ def test_episodes_of_several_recordings_keep_apart(windows):
     assert len(np.unique(join([windows, windows]).episode)) == 2 * len(np.unique(windows.episode))
 
 
-@pytest.mark.parametrize(("iterations", "held"), [(28, [3, 7, 11, 15, 19, 23, 27]), (3, [2]), (1, [0])])
-def test_every_fourth_iteration_is_held_out_or_the_last_of_few(iterations, held):
-    assert np.flatnonzero(held_out(np.arange(iterations))).tolist() == held
-
-
 def write(recorded: pd.DataFrame, folder: Path) -> Path:
     """Write one car's drives as the service does."""
     for iteration, rows in recorded.groupby("iteration"):
@@ -249,7 +263,7 @@ def write(recorded: pd.DataFrame, folder: Path) -> Path:
     return folder
 
 
-def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
+def test_the_command_reports_the_errors_and_writes_a_car_that_can_be_chosen(
     recorded, tmp_path, capsys, monkeypatch
 ):
     # Episodes of all cars become one car's.
@@ -261,7 +275,7 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
     arguments = ["--traces", str(traces), "--car", "deepracer_v4", "--output", str(output)]
     assert calibrate.main([*arguments, "--evaluations", "4"]) == 0
     printed = capsys.readouterr().out
-    assert "held out, middle" in printed
+    assert "after one second, middle" in printed
     assert "0 left out" in printed
     monkeypatch.chdir(tmp_path)
     mine, base = car_named("mine"), car_named("deepracer_v4")
@@ -280,7 +294,6 @@ def test_the_command_reports_both_parts_and_writes_a_car_that_can_be_chosen(
         (["--traces", "nowhere"], "nowhere: no such file or folder"),
         (["--traces", "empty"], "empty: no recorded steps"),
         (["--traces", "few"], "few: "),
-        (["--traces", "few", "--leave-one-out"], "--leave-one-out"),
         (["--traces", "few", "--car", "lorry"], "lorry"),
         (["--traces", "few", "--output", "missing/car.yaml"], "--output missing/car.yaml: cannot be written"),
         (["--traces", "few", "--output", "empty"], "--output empty: cannot be written"),
@@ -306,3 +319,10 @@ def test_a_version_is_found_where_it_is_stated_and_where_it_is_not(reference):
     names = ("console_v5_reinvent_base.log.gz", "droa_v6_training.tar.gz", "console_v5_one_bot_ppo.tar.gz")
     found = read_recorded([reference / "race_pace" / name for name in names])
     assert [(one.version, one.stated) for one in found] == [(5, True), (6, True), (5, False)]
+
+
+def test_each_evaluation_of_a_folder_is_a_recording_of_its_own(reference):
+    both = read_recorded([reference / "console_training/sim-trace/evaluation"])
+    assert len(both) == len({one.name for one in both}) == 2
+    assert all(one.steps["stream"].nunique() == 1 for one in both)
+    assert [one.version for one in both] == [4, 4]

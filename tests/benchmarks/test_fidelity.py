@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks import fidelity
+from benchmarks.calibrate import PARAMETERS, fit
 from benchmarks.fidelity import Formula, bicycle, fit_formula
-from benchmarks.recorded import BANDS, car_named
-from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, errors
+from benchmarks.recorded import BANDS, car_named, read_recorded
+from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, errors, replay
 
 CAR = car_named("deepracer")
 
@@ -66,7 +67,7 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
     file = tmp_path / "figures.json"
     names = ("console_v5_reinvent_base.log.gz", "drfc_v5_FS_June2020.log.gz", "droa_v6_training.tar.gz")
     traces = [str(reference / "race_pace" / name) for name in names]
-    arguments = ["--traces", *traces, "--held-out", "--json", str(file)]
+    arguments = ["--traces", *traces, "--json", str(file)]
     assert fidelity.main([*arguments, "--figures", str(tmp_path / "figures")]) == 0
     versions = json.loads(file.read_text())["versions"]
     assert {version: of["car"] for version, of in versions.items()} == {
@@ -87,11 +88,40 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
     assert "version 6, car=deepracer_v6" in capsys.readouterr().out
 
 
+def test_a_recording_left_out_is_predicted_by_a_car_that_has_not_seen_it(
+    reference, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(fidelity, "PARAMETERS", PARAMETERS[-2:])
+    monkeypatch.setattr(fidelity, "_FIT_EVALUATIONS", 3)
+    traces, file = reference / "console_training/sim-trace/evaluation", tmp_path / "figures.json"
+    assert fidelity.main(["--traces", str(traces), "--leave-one-out", "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())["versions"]["4"]
+    first, second = read_recorded([traces])
+    some = second.windows["one_second"]
+    begin = fit(car_named("deepracer_v5"), some, (), 12)
+    alone = fit(begin.car, some, PARAMETERS[-2:], 3, begin.observer)
+    found = figures["recordings"][first.name]
+    assert found["car"] == {p.key: getattr(alone.car, p.key) for p in PARAMETERS[-2:]}
+    assert found["observer"] == alone.observer._asdict()
+    off = errors(replay(alone.car, first.windows["one_second"], alone.observer), first.windows["one_second"])
+    assert found["bands"]["all"]["one_second_error_m"] == np.median(off.distance_m[:, -1])
+    # Together they are the errors of both, each from its own car.
+    each = [of["bands"]["all"] for of in figures["recordings"].values()]
+    assert figures["bands"]["all"]["windows"] == sum(of["windows"] for of in each)
+    low, high = sorted(of["one_second_error_m"] for of in each)
+    assert low <= figures["bands"]["all"]["one_second_error_m"] <= high
+    assert f"{first.name}: " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--traces", "nowhere"], "nowhere: no such file or folder"),
         (["--traces", ".", "--car", "lorry"], "lorry"),
+        (
+            ["--traces", ".", "--leave-one-out", "--car", "ideal"],
+            "--leave-one-out --car: accepted: one of the two",
+        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line(arguments, words, tmp_path, monkeypatch, capsys):
