@@ -35,12 +35,12 @@ from deepracer_exp.errors import BadInput
 
 Floats = NDArray[np.float64]
 MODELS = ("car", "formula", "bicycle")
-_FITTED_TO = 1500
+_FITTED_TO = 600
 """Windows to which cars, observers and formulas are fitted, at most."""
 _EVALUATIONS = 12
-_BEGIN = {4: "deepracer_v5", 5: "deepracer_v4", 6: "deepracer_v5"}
+_BEGIN = {4: "deepracer_v6", 5: "deepracer_v4", 6: "deepracer_v4"}
 """Where a fit with a recording left out begins: the car of another version, which has not seen the recording."""
-_FIT_EVALUATIONS = 25
+_FIT_EVALUATIONS = 30
 
 
 def bicycle(car: CarConfig, windows: Windows) -> Floats:
