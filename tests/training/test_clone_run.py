@@ -1,6 +1,8 @@
 """`deepracer-exp clone`: a new run with another run's policy, and what it records of its parent."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -68,6 +70,19 @@ def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(p
     (grandchild,) = (folder for folder in ended.folders if folder not in (parent, child))
     assert (lineage(grandchild)["parent"], lineage(grandchild)["generation"]) == (child.name, 2)
     assert config(grandchild)["algorithm"]["lr"] == pytest.approx(config(parent)["algorithm"]["lr"] / 100)
+
+
+def test_a_copy_without_links_is_cloned_and_evaluated_from_the_same_checkpoint(parent, call):
+    best = (parent / "checkpoints" / "best").resolve().name
+    copied = Path(shutil.copytree(parent, parent.with_name("copied")))
+    shutil.rmtree(parent)
+    ended = call("evaluate", str(copied), "evaluation.trials=1", "evaluation.laps=1", "evaluation.time_s=3")
+    assert ended.code == 0, ended.stderr
+    assert f"checkpoint {best}" in ended.stderr
+    child = child_of(copied, call("clone", str(copied), "budget.iterations=1"))
+    assert lineage(child)["checkpoint"] == best
+    assert list(pinned(copied / "checkpoints")) == [best]
+    assert call("runs", "lineage", str(child)).code == 0
 
 
 @pytest.mark.parametrize(("override", "lr"), [("algorithm.lr=3e-4", 3e-4), ("algorithm=ppo", 1e-3)])

@@ -1,6 +1,7 @@
 """`deepracer-exp resume`: the rest of a run is what it would have been."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -72,6 +73,18 @@ def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, cut
     assert_same_run(run, whole(trained, *overrides))
     assert summary(run)["iteration"] == 6
     assert "will not be that of an uninterrupted run" not in ended.stderr
+
+
+def test_a_copy_without_links_continues_as_the_run_itself(trained, cut, call):
+    run = cut()
+    original = run.rename(run.with_name(f"{run.name}-original"))
+    shutil.copytree(original, run)  # follows the links, as `cp -rL` does
+    shutil.rmtree(original)
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    assert_same_run(run, whole(trained))
+    for label in ("best", "last"):
+        assert (run / "checkpoints" / label).is_symlink()
 
 
 def test_after_a_corrupt_checkpoint_the_run_is_written_again_from_the_newest_intact_one(trained, cut, call):
