@@ -266,7 +266,7 @@ def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple
     if parent is None:
         return ()
     if known is not None and known.user_attrs.get("parent") == parent and "parent_run" in known.user_attrs:
-        return tuple(known.user_attrs["parent_run"])
+        return tuple(line for line in known.user_attrs["parent_run"] if key_of(line) in ("run", "checkpoint"))
 
     from deepracer_exp.training.clone import prepare_clone
 

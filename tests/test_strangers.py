@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from deepracer_exp.config import acting
-from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.compose import compose_entry, compose_experiment
 from sweeps.storage import open_storage
 from sweeps.study import load_study
 
@@ -199,6 +199,37 @@ def test_a_study_of_a_stranger_imports_nothing_and_ones_own_resumes(run_at, acco
     assert ended.code == 0, ended.stderr
     assert "budget.alert_command" in ended.stderr
     assert not sent.exists()
+
+
+STORED = {
+    "budget.alert_command=say": "budget.alert_command=say",
+    "budget.alert_webhook=HOOK": "budget.alert_webhook=HOOK",
+    "tracking.uri=http://evil:5000": "tracking.uri=http://evil:5000",
+    "tracking=wandb": "tracking.project=",
+    "sweep.storage=postgresql+psycopg://evil/studies": "sweep.storage=",
+    "sweep/executor=ray": "sweep.executor.address=auto",
+}
+
+
+@pytest.mark.parametrize("override", STORED)
+def test_what_a_study_stores_counts_once_its_user_has_named_the_same(account, override):
+    def composed(stored: bool) -> tuple[dict, tuple[str, ...]]:
+        entry = "sweep" if override.startswith("sweep") else "train"
+        made = compose_entry(entry, [override], stored=stored)
+        return made.mapping, made.notes
+
+    plain = compose_entry("sweep" if override.startswith("sweep") else "train", []).mapping
+    left_out, (note,) = composed(stored=True)
+    assert STORED[override] in note
+    assert left_out == plain
+    named, _ = composed(stored=False)
+    assert named != plain
+    assert composed(stored=True) == (named, ())
+    acting.remember()
+    acting._named.clear()
+    assert composed(stored=True) == (named, ())
+    account()
+    assert composed(stored=True)[0] == plain
 
 
 def test_the_record_of_an_account_holds_no_text_and_is_its_own(call, account, tmp_path):

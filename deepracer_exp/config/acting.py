@@ -74,7 +74,10 @@ def acting(config: Mapping[str, Any]) -> Iterator[Acting]:
         yield Acting("tracking.uri", str(tracking["uri"]))
     if tracking.get("kind") == "wandb":
         yield Acting("tracking.project", f"{tracking.get('entity')}/{tracking.get('project')}")
-    executor = _part(_part(config, "sweep"), "executor")
+    sweep = _part(config, "sweep")
+    if sweep.get("storage") is not None:
+        yield Acting("sweep.storage", str(sweep["storage"]))
+    executor = _part(sweep, "executor")
     if executor.get("kind", "local") != "local":
         yield Acting("sweep.executor.address", str(executor.get("address")))
 
@@ -134,10 +137,8 @@ def take_over(config: dict[str, Any], where: str) -> list[str]:
         group, key, *_ = one.key.split(".")
         if group == "tracking":
             config[group] = dict(_PLAIN_TRACKING)
-        elif group == "budget":
-            config[group] = {**config[group], key: None}
         else:
-            config[group] = {**config[group], key: {"kind": "local"}}
+            config[group] = {**config[group], key: {"kind": "local"} if key == "executor" else None}
         left_out.append(
             f"{one.key}={without_passwords(one.text)}: not taken over from {where}, because you have not used it "
             "before; repeat it to use it"
