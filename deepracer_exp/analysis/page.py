@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -16,8 +15,6 @@ from markupsafe import Markup
 from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 from plotly.utils import PlotlyJSONEncoder
-
-from deepracer_exp.files import atomic_write
 
 from .charts.figure import Chart
 from .charts.layout import draw
@@ -69,18 +66,6 @@ def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int
 def plot_of(chart: Chart) -> Plot:
     """Draw a chart for desk and phone, and pack it."""
     return plot(draw(chart), chart.name, chart.title, draw(chart, NARROW_WIDTH))
-
-
-def write_chart(path: Path, chart: Chart) -> Path:
-    """Write a page with one chart atomically.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    drawn = plot_of(chart)
-    return atomic_write(
-        path, render(__package__, "chart.html.j2", [drawn], plot=drawn, caption=chart.caption)
-    )
 
 
 def packed(text: str) -> str:

@@ -89,7 +89,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         entry="evaluate",
     )
     add_run(parser, "evaluation=NAME | KEY=VALUE")
-    parser.add_argument("-o", "--output", metavar="FILE", help="page with the figure to write (.html)")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", help="page to write (.html): the table, figures and all laps"
+    )
 
     parser = commands.add_parser(
         "stopping",
@@ -255,7 +257,7 @@ _CHECKPOINTS_EPILOG = """\
   deepracer-exp checkpoints RUN                             the trials by which the training chose its best one
   deepracer-exp checkpoints RUN evaluation=summit evaluation.trials=40
   deepracer-exp checkpoints RUN evaluation.tracks=[Oval_track,Bowtie_track]
-  deepracer-exp checkpoints RUN -o checkpoints.html         also draw speed against stability
+  deepracer-exp checkpoints RUN -o checkpoints.html         a page, too: speed against stability, all laps
 
 Every checkpoint drives the same trials, on the usual and on held-out conditions.
 """

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
+    from deepracer_exp.analysis.log_tables import Table as PageTable
     from deepracer_exp.runs.clean import Removable, StoreOverview
     from deepracer_exp.runs.files import RunRecord
     from deepracer_exp.runs.lineage import Member
@@ -98,7 +99,10 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(compare, where, many=True)
     compare.add_argument(
-        "-o", "--output", metavar="PAGE.html", help="draw learning curves and lap times on this page"
+        "-o",
+        "--output",
+        metavar="PAGE.html",
+        help="page to write: these tables, learning curves and lap times",
     )
     add_replay(compare, "the fastest lap of each run's best checkpoint")
 
@@ -251,11 +255,14 @@ def _compare(args: argparse.Namespace) -> int:
 
     if args.output is not None:
         from deepracer_exp.analysis.charts.runs import learning_curves_compared
-        from deepracer_exp.analysis.page import write_chart
+        from deepracer_exp.analysis.comparison_page import write_comparison
 
         chart = learning_curves_compared(dict(zip(ascii_uppercase, records, strict=False)))
+        names = sorted({str(record.config.get("name")) for record in records})
         with writing(f"--output {args.output}"):
-            write_chart(Path(args.output), chart)
+            write_comparison(
+                Path(args.output), f"Runs of {', '.join(names)} compared", [], _page_tables(records), [chart]
+            )
     console = table_console()
     for letter, record in zip(ascii_uppercase, records, strict=False):
         console.print(f"{letter}  {record.path}", soft_wrap=True)
@@ -263,7 +270,7 @@ def _compare(args: argparse.Namespace) -> int:
         console.print()
         console.print(table)
     if args.output is not None:
-        console.print(f"\n{args.output}: learning curves", soft_wrap=True)
+        console.print(f"\n{args.output}: these tables, learning curves and lap times", soft_wrap=True)
     if args.replay is not None:
         stored = [check_policy(str(folder), str(stores.runs_dir), stores.uri, None) for folder in folders]
         from deepracer_exp.evaluation.driven_laps import drive_laps
@@ -273,6 +280,24 @@ def _compare(args: argparse.Namespace) -> int:
         write_laps(args.replay, [first, *drive_laps(stored[1], None, protocol, beside=first)])
         console.print(f"\n{args.replay}: the fastest laps of their best checkpoints", soft_wrap=True)
     return 0
+
+
+def _page_tables(records: "Sequence[RunRecord]") -> "list[tuple[str, PageTable, str]]":
+    """Return what the terminal shows as tables of a page, each with a title and a note."""
+    from deepracer_exp.analysis.comparison import results, value_text
+    from deepracer_exp.analysis.log_tables import Table
+    from deepracer_exp.runs.lineage import run_differences
+
+    heads = ("", *ascii_uppercase[: len(records)])
+    runs = [(letter, record.name) for letter, record in zip(heads[1:], records, strict=True)]
+    achieved = [(name, *texts) for name, texts, _ in results(records)]
+    chosen = [(key, *map(value_text, values)) for key, values in run_differences(records).items()]
+    note = "Race score, complete laps, completion and mean lap are those of the best checkpoint, evaluated."
+    return [
+        ("Runs", Table(("", "run"), tuple(runs), 2), ""),
+        ("Results", Table(heads, tuple(achieved), 1), note),
+        ("Configuration", Table(heads, tuple(chosen), 1), "" if chosen else "No difference."),
+    ]
 
 
 def _tables(records: "Sequence[RunRecord]") -> "list[Table]":

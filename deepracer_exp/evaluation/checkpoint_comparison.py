@@ -12,8 +12,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from deepracer_exp.analysis.charts.runs import speed_and_stability
-from deepracer_exp.analysis.page import write_chart
+from deepracer_exp.analysis.charts.runs import evaluated_laps, speed_and_stability
+from deepracer_exp.analysis.comparison_page import write_comparison
+from deepracer_exp.analysis.log_tables import Table as PageTable
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
@@ -51,6 +52,8 @@ class LapStatistics:
     """A quarter of the complete laps are faster."""
     median_s: float
     best_s: float
+    laps_s: tuple[float, ...]
+    """Of all complete laps on the usual conditions, in the order of the trials."""
     held_out_complete: float
     held_out_completion: float
     held_out_lap_time_s: float
@@ -129,6 +132,7 @@ def lap_statistics(evaluation: Evaluation, metric: Metric) -> LapStatistics:
         lap_time_s=time_s(25),
         median_s=time_s(50),
         best_s=time_s(0),
+        laps_s=tuple(usual.lap_times_s.tolist()),
         held_out_complete=math.nan if held_out is None else 100 * held_out.lap_share,
         held_out_completion=math.nan if held_out is None else held_out.completion,
         held_out_lap_time_s=time_s(25, HELD_OUT),
@@ -208,6 +212,16 @@ def _cells(one: CheckpointResult, intervals: bool) -> dict[str, str]:
     }
 
 
+def _page_table(results: Sequence[CheckpointResult]) -> PageTable:
+    """Return the comparison as the table of a page."""
+    names = [name for name in _NAMES if name != _HELD_OUT or _has_held_out(results)]
+    # Words before numbers.
+    order = [_LABELS, *(name for name in names if name != _LABELS)]
+    cells = [(one.name, _cells(one, intervals=True)) for one in results]
+    rows = tuple((name, *(found[column] for column in order)) for name, found in cells)
+    return PageTable(("checkpoint", *(name.replace("\n", " ") for name in order)), rows, 2)
+
+
 _LEGEND = (
     f"laps: share of complete laps, with its {CONFIDENCE:.0%} interval in brackets",
     "done: completion, the mean share of the lap driven",
@@ -263,6 +277,15 @@ def show_checkpoints(
             for one in found
             if one.figures is not None
         ]
+        drawn = pd.DataFrame(rows)
+        charts = (speed_and_stability(drawn, best), evaluated_laps(drawn))
+        legend = "; ".join([*_LEGEND[:2], *held_out, *_LEGEND[2:]])
         with writing(picture):
-            write_chart(Path(picture), speed_and_stability(run.path.name, pd.DataFrame(rows), best))
-        out.print(f"\n{picture}: speed against stability", soft_wrap=True)
+            write_comparison(
+                Path(picture),
+                f"Checkpoints of {run.experiment.name}",
+                [f"Recommended: {best}, {why}.", run.path.name],
+                [("Evaluated laps", _page_table(found), f"{legend[0].upper()}{legend[1:]}.")],
+                [chart for chart in charts if chart is not None],
+            )
+        out.print(f"\n{picture}: this table, speed against stability, and all evaluated laps", soft_wrap=True)

@@ -3,6 +3,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deepracer_exp.analysis.charts.layout import draw
@@ -11,6 +12,7 @@ from deepracer_exp.analysis.comparison import NOTHING, last_value, results, valu
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.runs.lineage import run_differences
+from tests.page_html import Html
 
 from .chart_layers import layers
 
@@ -120,6 +122,13 @@ def test_runs_of_any_kind_are_drawn_over_each_other(record):
         "C  tracks",
     ]
     assert draw(chart).data
+    evaluated = {"eval_completion": 100.0, "eval_lap_time_s": 8.2}
+    best = {"metric": "race_score", "iteration": 10, "rank": [1.0, -9.0], **evaluated}
+    raced = dataclasses.replace(record("raced", eval_lap_time_s=8.4), summary={"best": best})
+    panels = [p for row in learning_curves_compared({"A": raced, "B": record("not")}).rows for p in row]
+    assert [panel.title for panel in panels][-2:] == ["Lap time in evaluation, mean", "Lap times"]
+    (star,) = (one for one in layers(panels[-1], "points") if one.marker.symbol == "star")
+    np.testing.assert_allclose(star.y, [8.2, np.nan], rtol=1e-6)
     none = learning_curves_compared({"A": record("x", lap_s=None), "B": record("y", lap_s=None)})
     assert draw(none).data
     assert [panel.title for row in none.rows for panel in row] == [
@@ -147,6 +156,11 @@ def test_the_command_shows_differences_and_results_and_writes_the_page_it_is_ask
     assert ["seed", "1", "2"] in words
     assert ["best", "lap", "in", "training,", "s", "10.00", "9.25"] in words
     assert [page.name for page in tmp_path.rglob("*.html")] == output[1:]
+    for page in tmp_path.rglob("*.html"):
+        text = Html(page.read_text()).text
+        assert "Runs of default compared" in text
+        for row in ("A first B second", "seed 1 2", "best lap in training, s 10.00 9.25"):
+            assert row in text
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,10 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.convergence import moving_average
 from deepracer_exp.runs.files import EVALUATIONS, METRICS, RunRecord
 from deepracer_exp.runs.lineage import read_lineage
+from deepracer_exp.runs.result import result_of
 
 from .figure import Chart, Layer, Panel, band, bars, heatmap, in_rows, line, mark, note, points
-from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE
+from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE, VERMILION
 from .training import ITERATION
 
 _CURVES = {
@@ -221,20 +222,27 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
         np.array([last_value(record, name) for record in records.values()], np.float64)
         for name in ("best_lap_time_s", "mean_lap_time_s")
     )
-    has_laps = np.isfinite(best_s).any()
+    results = [result_of(record.summary) for record in records.values()]
+    evaluated_s = np.array(
+        [one.lap_time_s if one is not None and one.evaluated else None for one in results], np.float64
+    )
+    has_laps, was_evaluated = np.isfinite(best_s).any(), np.isfinite(evaluated_s).any()
     panels: list[Panel] = []
     for column, title, unit in (
         ("completion", "Completion, mean", "per cent of the lap"),
         ("mean_return", "Return of an episode, mean", "return"),
-        *([("mean_lap_time_s", "Lap time, mean", "lap time, s")] if has_laps else []),
+        *([("mean_lap_time_s", "Lap time in training, mean", "lap time, s")] if has_laps else []),
+        *([("eval_lap_time_s", "Lap time in evaluation, mean", "lap time, s")] if was_evaluated else []),
     ):
         layers: list[Layer] = []
         for number, (label, record) in enumerate(records.items()):
             rows = pd.DataFrame(record.rows)
+            if column == "eval_lap_time_s":
+                rows = rows[rows[column].notna()] if column in rows else rows.iloc[:0].assign(**{column: []})
             columns = [one for one in rows if one.startswith(f"{column}/")] or [column]
             # Not every iteration ends an episode on every track.
             values = rows[columns].astype(float).ffill().mean(axis=1, skipna=False)
-            curve = moving_average(values.to_numpy())
+            curve = values.to_numpy() if column == "eval_lap_time_s" else moving_average(values.to_numpy())
             color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
             name = None if panels else f"{label}  {record.name}"
             layers.append(line(rows["env_steps"] / 1000, curve, color, name, dashed=dashed))
@@ -242,26 +250,60 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     if has_laps:
         at = np.arange(len(records))
         laps: list[Layer] = [
-            bars(at, best_s, BLUE, "best"),
-            points(at, mean_s, ORANGE, "mean of the last iteration", size=11, symbol="diamond"),
+            bars(at, best_s, BLUE, "best in training"),
+            points(at, mean_s, ORANGE, "mean in training, last iteration", size=11, symbol="diamond"),
+            *(
+                [points(at, evaluated_s, VERMILION, "mean of the best checkpoint", size=14, symbol="star")]
+                if was_evaluated
+                else []
+            ),
             *(note((float(k), 0.0), "no lap") for k in at[np.isnan(best_s)]),
         ]
-        panels.append(
-            Panel(title="Laps in training", y_label="lap time, s", layers=laps, x_names=list(records))
-        )
+        panels.append(Panel(title="Lap times", y_label="lap time, s", layers=laps, x_names=list(records)))
     return Chart(
         name="learning_curves_compared",
         title="Learning curves and lap times" if has_laps else "Learning curves",
-        caption="Lines are moving averages of three iterations.",
+        caption="Lines are moving averages of three iterations, those of evaluations join them. In training the policy "
+        "explores and is slower.",
         rows=in_rows(panels),
     )
 
 
-def speed_and_stability(run: str, checkpoints: pd.DataFrame, recommended: str) -> Chart:
+def evaluated_laps(checkpoints: pd.DataFrame) -> Chart | None:
+    """Draw the time of every evaluated lap of each checkpoint; None without a complete lap.
+
+    `checkpoints` has a row each, the oldest first: `name`, and `laps_s`, the times of its complete laps on the usual
+    conditions, s.
+    """
+    laps_s = [np.asarray(one, np.float64) for one in checkpoints["laps_s"]]
+    if not sum(map(len, laps_s)):
+        return None
+    x = [
+        at + 0.5 * ((np.arange(len(some)) + 0.5) / max(len(some), 1) - 0.5) for at, some in enumerate(laps_s)
+    ]
+    medians = [float(np.median(some)) if len(some) else np.nan for some in laps_s]
+    panel = Panel(
+        layers=[
+            points(np.concatenate(x), np.concatenate(laps_s), BLUE, "a lap", size=7),
+            points(np.arange(len(laps_s)), medians, ORANGE, "median", size=13, symbol="diamond"),
+        ],
+        x_names=list(checkpoints["name"]),
+        x_label="checkpoint",
+        y_label="lap time, s",
+    )
+    return Chart(
+        name="evaluated_laps",
+        title="Evaluated laps of each checkpoint",
+        caption="Complete laps on the usual conditions, from left to right in the order of the trials; a checkpoint "
+        "without one has no point.",
+        rows=[[panel]],
+    )
+
+
+def speed_and_stability(checkpoints: pd.DataFrame, recommended: str) -> Chart:
     """Draw the lap time of checkpoints against their share of complete laps.
 
     Args:
-        run: its name.
         checkpoints: one row each, the oldest first: `name`, `labels` (`best, last` or the like), `lap_time_s` (25th
             percentile; NaN without a lap), `complete` (per cent of the episodes) with its interval `low` to `high`,
             and `held_out_lap_time_s` and `held_out_complete` on held-out conditions (NaN if there are none).
@@ -301,7 +343,7 @@ def speed_and_stability(run: str, checkpoints: pd.DataFrame, recommended: str) -
     )
     return Chart(
         name="speed_and_stability",
-        title=f"{run}: speed and stability of its checkpoints",
+        title="Speed and stability of the checkpoints",
         caption="Filled points are the usual conditions, with the 95 per cent interval of the share of complete laps; "
         "open points are held-out conditions.",
         rows=[[panel]],
