@@ -29,7 +29,7 @@ _PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")
 # Files that lie beside the logs of a model and hold no data of a recording.
 _BESIDE = re.compile(
     r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
-    r"|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
+    r"|worker_\d+\..*\.csv|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
 )
 _MOST_NAMED = 3
 _MOST_METRICS_BYTES = 2**26
@@ -130,7 +130,7 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
     """Read one file; return whether it was recognised."""
     name = file.name
     if name.lower().endswith(".csv"):
-        return _read_csv(parts, file)
+        return not _BESIDE.fullmatch(name) and _read_csv(parts, file)
     if _METADATA.fullmatch(name):
         parts.metadata.append((file, read_model_metadata(file.path, file.head(SETTINGS_BYTES + 1))))
         return True

@@ -98,8 +98,9 @@ class _Assembly:
         """Folder of the CSVs by the root of the text logs of the same training."""
         self.copies: dict[tuple[str, ...], Drives] = {}
         """Copies of other trainings, by their folders."""
-        for number, (files, log) in enumerate(self.logs):
-            self._add_log(number, files, log)
+        # A log of 2019 repeats lines of the training's under the name of an evaluation.
+        for number in sorted(range(len(self.logs)), key=lambda at: _place(*self.logs[at]).kind != TRAINING):
+            self._add_log(number, *self.logs[number])
         for one in self.drives:
             one.place = replace(one.place, root=self.jobs.get(one.place.root, one.place.root))
         self.roots = {number: self.jobs.get(root, root) for number, root in self.roots.items()}
@@ -165,10 +166,7 @@ class _Assembly:
 
     def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
         """Add the drives of a log, unless they are known already from CSVs or another log."""
-        file = files[0]
-        place = place_of(file.parts)
-        if log.kind is not None and place.kind == TRAINING:
-            place = replace(place, kind=log.kind, worker=0)
+        file, place = files[0], _place(files, log)
         if place.kind == TRAINING:
             name = place.name.replace(str(place.worker), "#") if place.worker else place.name
             if log.job:
@@ -187,11 +185,12 @@ class _Assembly:
         mine = Drives(place, table, iterations_of(table, log, whole), log.world or "", [place.name])
         if place.kind != TRAINING:
             mine.iteration[:] = 0
-        left = np.ones(len(mine.iteration), np.bool_)
+        left, alike = np.ones(len(mine.iteration), np.bool_), False
         for other in self.drives:
             same = rows_also_in(mine, other)
             if same.any():
-                if left.all():  # of copies the first counts
+                if left.all() and other.place.kind == place.kind:  # of copies the first counts
+                    alike = True
                     self.roots[number] = other.place.root
                     if place.kind == TRAINING:
                         self.jobs[job] = other.place.root
@@ -201,6 +200,8 @@ class _Assembly:
         if left.all():
             mine.world = mine.world or self.parts.worlds.get(place.kind, "")
             self.drives.append(mine)
+        elif left.any() and not alike:
+            self.drives.append(mine.choose(left))
         elif left.any():
             self._add_rest(file, mine.choose(left), self.roots[number], _finished(mine))
 
@@ -284,11 +285,7 @@ class _Assembly:
         return [
             log
             for at, (files, log) in enumerate(self.logs)
-            if (
-                log.saved
-                or (log.checkpoints and log.steps.rows and place_of(files[0].parts).kind == TRAINING)
-            )
-            and log.kind is None
+            if (log.saved or (log.checkpoints and log.steps.rows and _place(files, log).kind == TRAINING))
             and self._round(files[0], self.roots[at]) == number
         ]
 
@@ -418,6 +415,12 @@ class _Assembly:
                 rows += [{**row, "stream": stream, "worker": 0, "iteration": 0} for row in episodes]
         rows.sort(key=lambda row: (0, row["episode"]) if row["stream"] == TRAINING else (1, 0))
         return typed_table(METRICS_COLUMNS, rows)
+
+
+def _place(files: Sequence[LogFile], log: TrainingLog) -> Place:
+    """Return the job of a log, by its name, or by its settings where the name says nothing of a race."""
+    place = place_of(files[0].parts)
+    return replace(place, kind=log.kind, worker=0) if log.kind and place.kind == TRAINING else place
 
 
 def _finished(log: Drives) -> Ints:

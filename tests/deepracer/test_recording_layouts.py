@@ -335,9 +335,33 @@ def test_numbers_of_the_logs_of_2019_are_no_iterations(tmp_path):
     assert not recording.rounds
     steps = recording.steps
     assert (steps["iteration"] == steps["episode"] // 20).all()
+    # Lines that an evaluation's log repeats are the training's, whatever else is in it.
+    for episodes in ([2, 3], [2, 3, 40]):
+        again = pd.concat(
+            [
+                made.drives([number], seed=99)
+                if number == 40
+                else made.drives([2, 3], seed=1).query("episode == @number")
+                for number in episodes
+            ]
+        )
+        (tmp_path / "evaluation-sim-trace-log.log").write_text(made.log_text(again, 15))
+        both = read_recording(tmp_path)
+        assert not both.problems
+        assert made.training(both)["X"].tolist() == steps["X"].tolist()
+        assert len(both.steps) - len(steps) == 6 * episodes.count(40)
+    (tmp_path / "evaluation-sim-trace-log.log").unlink()
     # Those whose episodes begin anew are trainings of their own.
     (tmp_path / "sim-trace-log-12.log").write_text(made.log_text(made.drives([0, 1], seed=12), 15))
     assert len(read_recording(tmp_path).rounds) > 1
+
+
+def test_the_trainers_own_table_of_each_worker_is_no_trace(tmp_path):
+    made.write_folder(made.drfc_single(), tmp_path)
+    (tmp_path / "worker_0.simple_rl_graph.main_level.main_level.agent_0.csv").write_text(
+        "Episode #,Loss\n1,0\n"
+    )
+    assert not read_recording(tmp_path).problems
 
 
 def test_folders_may_be_named_by_their_workers(tmp_path):
