@@ -12,6 +12,8 @@ from deepracer_exp.errors import count
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, REPORT
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console
 
     from deepracer_exp.config.running import TrackingConfig
@@ -66,6 +68,7 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     if outcome.status == "failed":
         print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
         print(f"  details: {outcome.folder}", file=sys.stderr)
+        _print_unrecorded([outcome], tracking)
         return
     print(f"\n{outcome.status}: {outcome.reason}")
     print(
@@ -81,11 +84,8 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
             print(f"    {name:12}  {what}")
     if outcome.note is not None:
         print(f"warning: {outcome.note}", file=sys.stderr)
-    if isinstance(tracking, MLflowTracking):
-        runs_dir = outcome.folder.parent.parent
-        store = f"runs_dir={runs_dir}" if tracking.uri is None else f"tracking.uri={tracking.uri}"
-        where = "" if store == "runs_dir=runs" else f" {shlex.quote(store)}"
-        print(f"  compare runs  {_command()} ui{where}")
+    if isinstance(tracking, MLflowTracking) and outcome.unrecorded is None:
+        print(f"  compare runs  {_command()} ui{_store_word(outcome.folder.parent.parent, tracking.uri)}")
     steps = next_steps(outcome.folder, summary)
     shown = [(line.replace(COMMAND, _command(), 1), what) for line, what in steps]
     width = max((len(line) for line, _ in shown), default=0)
@@ -93,13 +93,56 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
         print("\n  next")
     for line, what in shown:
         print(f"    {line:{width}}  # {what}")
+    _print_unrecorded([outcome], tracking)
 
 
-def print_results(outcomes: "Sequence[TrainResult]") -> None:
+def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
     """Print one line per run."""
     print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
         print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
+    _print_unrecorded(outcomes, tracking)
+
+
+def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
+    """Say last, on standard error, what was not recorded, and how to send it later."""
+    from deepracer_exp.analysis.next_steps import run_word
+    from deepracer_exp.config.running import MLflowTracking
+
+    lacking = [one for one in outcomes if one.unrecorded is not None]
+    for reason in dict.fromkeys(one.unrecorded for one in lacking):
+        print(f"\nwarning: {reason}", file=sys.stderr)
+    if lacking and isinstance(tracking, MLflowTracking):
+        words = shlex.join(run_word(one.folder) for one in lacking)
+        store = _store_word(lacking[0].folder.parent.parent, tracking.uri)
+        print(
+            f"  the run folder has everything; send it later: {_command()} runs send {words}{store}",
+            file=sys.stderr,
+        )
+
+
+def print_unsent(study: "Path") -> None:
+    """Say on standard error of how many runs of a study MLflow lacks something, and how to send it later."""
+    from deepracer_exp.runs.files import CONFIG
+    from deepracer_exp.tracking.delivery import undelivered
+    from deepracer_exp.tracking.store import resolve_store
+
+    runs_dir = study.parent
+    stores = list(undelivered(sorted(file.parent for file in study.glob(f"*/{CONFIG}"))).values())
+    own = resolve_store(None, runs_dir).shown
+    for store in dict.fromkeys(stores):
+        words = f" {shlex.quote(str(study))}/*{_store_word(runs_dir, None if store == own else store)}"
+        print(
+            f"\nwarning: MLflow ({store}): something of {count(stores.count(store), 'run')} was not recorded\n"
+            f"  the run folders have everything; send it later: {_command()} runs send{words}",
+            file=sys.stderr,
+        )
+
+
+def _store_word(runs_dir: "Path", uri: str | None) -> str:
+    """Return the word of a command line that says where runs are recorded; empty for the usual place."""
+    store = f"runs_dir={runs_dir}" if uri is None else f"tracking.uri={uri}"
+    return "" if store == "runs_dir=runs" else f" {shlex.quote(store)}"
 
 
 def _command() -> str:

@@ -52,6 +52,7 @@ _EPILOG = """\
   deepracer-exp runs promote best:default --alias rain      the best run of an experiment
   deepracer-exp runs promote RUN checkpoint=120 --model season
   deepracer-exp evaluate champion                           from then on; export and clone accept it, too
+  deepracer-exp runs send                                   record in MLflow what it lacks of ended runs
   deepracer-exp runs clean --apply
 
 All of them accept runs_dir=DIR (default: runs) and tracking.uri=URI (default: the MLflow store in runs_dir).
@@ -131,6 +132,16 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         default="champion",
         help="alias for it, taken from the version that has it (default: champion)",
     )
+
+    send = add_command(
+        actions,
+        "send",
+        _send,
+        help="record in MLflow what it lacks of ended runs",
+        description="Record in MLflow, from the folders of ended runs, what it lacks because it did not answer or "
+        "refused; without RUN, of all runs of this store in runs_dir.",
+    )
+    add_run(send, where, many=True)
 
     clean = add_command(
         actions,
@@ -430,6 +441,35 @@ def _promote(args: argparse.Namespace) -> int:
     print(f"  run         {run.path}")
     print(f"  checkpoint  {registered.checkpoint}, sha256 {registered.sha256[:12]}")
     print(f"\n  race it     {command_line('evaluate', str(registered), config, OF_POLICY)}")
+    return 0
+
+
+def _send(args: argparse.Namespace) -> int:
+    from deepracer_exp.runs.files import TRACKING
+    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.tracking.delivery import deliver, is_delivered, undelivered
+    from deepracer_exp.tracking.store import resolve_store
+    from deepracer_exp.tracking.tracking_file import read_tracked_run
+
+    runs, overrides = runs_and_overrides(args)
+    stores = read_stores(overrides)
+    store = resolve_store(stores.uri, stores.runs_dir)
+    named = [resolve(run, stores.runs_dir, stores.uri).path for run in runs]
+    for folder in named:
+        recorded = read_tracked_run(folder / TRACKING).store
+        # What a run names as its store may be a stranger's, who would be given this user's password.
+        if stores.uri is None and recorded != store.shown:
+            raise BadInput(f"{folder}: was recorded in {recorded}; give tracking.uri={recorded}")
+    everything = undelivered(run_folders(stores.runs_dir)).items()
+    folders = named or [folder for folder, recorded in everything if recorded == store.shown]
+    for folder in dict.fromkeys(folders):
+        if is_delivered(folder, stores.uri, stores.runs_dir):
+            print(f"{folder.name}: MLflow has everything")
+            continue
+        points = deliver(folder, stores.uri, stores.runs_dir)
+        print(f"{folder.name}: sent, with {count(points, 'metric point')} that MLflow lacked")
+    if not folders:
+        print(f"MLflow ({store.shown}) has everything of the ended runs in {stores.runs_dir}")
     return 0
 
 

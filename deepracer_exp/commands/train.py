@@ -4,10 +4,8 @@ import argparse
 import shlex
 import sys
 import traceback
-from pathlib import Path
 
 from deepracer_exp.errors import BadInput, reading
-from deepracer_exp.runs.files import TRACKING
 
 from .arguments import (
     add_command,
@@ -19,7 +17,14 @@ from .arguments import (
     run_and_overrides,
     split_stores,
 )
-from .output import print_notes, print_result, print_results, print_start, warnings_on_stderr
+from .output import (
+    print_notes,
+    print_result,
+    print_results,
+    print_start,
+    print_unsent,
+    warnings_on_stderr,
+)
 from .startup import (
     check_changes,
     check_files,
@@ -147,7 +152,7 @@ def _train(args: argparse.Namespace) -> int:
         if outcome.status == "interrupted":
             break
     if args.multirun:
-        print_results(outcomes)
+        print_results(outcomes, composed[0][0].tracking)
     return max(outcome.exit_code for outcome in outcomes)
 
 
@@ -163,15 +168,13 @@ The run continues from its last checkpoint, in its own folder and in the same ML
 checkpoint is overwritten. With collector=sync, in_process or ray the result equals that of an uninterrupted run, bit
 for bit. It cannot with collector=async, nor with a budget in minutes or money or one that several runs share. A reward
 function that keeps something between calls starts without it.
-
-If MLflow did not answer when a run ended, resume delivers the points that it lacks.
 """
 
 
 def _resume(args: argparse.Namespace) -> int:
     from deepracer_exp.config.parse import import_own_classes
     from deepracer_exp.runs.resolve import resolve
-    from deepracer_exp.training.budget import RunEnded, refuse_ended
+    from deepracer_exp.training.budget import refuse_ended
 
     name, given = run_and_overrides(args)
     stores, changes = split_stores(given)
@@ -179,10 +182,7 @@ def _resume(args: argparse.Namespace) -> int:
     # The folder says where the run is, but MLflow may have moved.
     overrides = [*changes, *(one for one in given if one.startswith("tracking.uri="))]
     experiment = check_changes(run_dir, overrides)
-    try:
-        refuse_ended(run_dir, experiment.budget, overrides)
-    except RunEnded as error:
-        return _deliver(run_dir, getattr(experiment.tracking, "uri", None), error)
+    refuse_ended(run_dir, experiment.budget, overrides)
     import_own_classes(experiment)
     print_start()
     start_workers_early(experiment.collector.forks)
@@ -195,20 +195,6 @@ def _resume(args: argparse.Namespace) -> int:
         outcome = resume(run_dir, overrides, Console(stderr=True))
     print_result(outcome, experiment.tracking)
     return outcome.exit_code
-
-
-def _deliver(run_dir: Path, uri: str | None, ended: Exception) -> int:
-    """Deliver the points of an ended run that MLflow lacks; if there are none, raise that the run has ended."""
-    from deepracer_exp.tracking.delivery import deliver, is_delivered
-
-    runs_dir = run_dir.parent.parent
-    if not (run_dir / TRACKING).exists() or is_delivered(run_dir, uri, runs_dir):
-        raise ended
-    points = deliver(run_dir, uri, runs_dir)
-    if not points:
-        raise ended
-    print(f"{ended}\n  delivered {points:,} points that MLflow lacked")
-    return 0
 
 
 _CLONE_EPILOG = """\
@@ -325,6 +311,7 @@ def _sweep(args: argparse.Namespace) -> int:
     else:
         print("no trial was completed: all were pruned or failed")
     print(f"\n  page  {folder / REPORT}")
+    print_unsent(folder)
     return 0
 
 

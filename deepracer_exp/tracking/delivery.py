@@ -1,7 +1,7 @@
 """Record in MLflow, from a run folder, what the training could not record itself."""
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,9 +10,10 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.files import METRICS, SUMMARY, TRACKING, read_metrics, read_object, read_run_id
 from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
 
+from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import END_TAG
 from .metrics import now_ms, points_at, points_of
-from .store import Store, StoreRefusedError, StoreUnavailableError, has_store, one_line, resolve_store
+from .store import Store, has_store, resolve_store
 from .tracking_file import Status, TrackedRun, TrackingFile, read_tracked_run
 
 if TYPE_CHECKING:
@@ -59,11 +60,11 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             run.end(file.run.status or ENDS.get(summary["status"], "KILLED"), file.run.end_ms or now_ms())
             file.change(complete=True)
     except StoreRefusedError as error:
-        raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused it: {one_line(error)}") from error
+        raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused it: {error}") from error
     except StoreUnavailableError as error:
         raise RunFailed(
             f"{run_dir}: MLflow ({store.shown}) does not answer; the run folder keeps what is missing there:"
-            f" {one_line(error)}"
+            f" {error}"
         ) from error
     return written
 
@@ -92,7 +93,11 @@ def deliver_evaluation(
             for file, folder in files.items():
                 run.log_artifact(file, folder)
     except (StoreRefusedError, StoreUnavailableError) as error:
-        _log.warning("MLflow (%s): this evaluation was not recorded: %s", store.shown, one_line(error))
+        _log.warning(
+            "MLflow (%s): this evaluation was not recorded; evaluate again later: %s",
+            store.shown,
+            error,
+        )
 
 
 def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
@@ -103,6 +108,19 @@ def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
     """
     run, store = read_tracked_run(run_dir / TRACKING), resolve_store(uri, runs_dir)
     return run.complete and run.store == store.shown and has_store(uri, runs_dir)
+
+
+def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
+    """Return the ended runs whose store lacks something of them, each with that store, without password.
+
+    Runs that were not recorded in MLflow are left out; MLflow is not imported.
+
+    Raises:
+        BadInput: a tracking.json is invalid.
+    """
+    ended = [one for one in folders if (one / TRACKING).exists() and (one / SUMMARY).exists()]
+    tracked = {folder: read_tracked_run(folder / TRACKING) for folder in ended}
+    return {folder: run.store for folder, run in tracked.items() if not run.complete}
 
 
 @contextmanager

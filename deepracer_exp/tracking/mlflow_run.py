@@ -20,9 +20,10 @@ from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_B
 
 from deepracer_exp.addresses import without_passwords
 
+from .calls import FileGoneError, StoreRefusedError, pages, store_errors
 from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, OURS, PARENT, experiment_note, result_note
 from .metrics import BEST, Point, best_metrics, points_at
-from .store import Store, StoreRefusedError, client_of, pages, silence_mlflow, store_errors
+from .store import Store, client_of, silence_mlflow
 from .tracking_file import TrackedRun
 
 silence_mlflow()
@@ -173,7 +174,7 @@ class MLflowRun:
         """Copy a file, or all files of a folder, to the run's artifacts under `folder`."""
         with store_errors():
             if not path.exists():
-                raise FileNotFoundError(f"{path} is gone")
+                raise FileGoneError(f"{path} is gone")
             if self._store.sqlite_file is not None:
                 self._refuse_far_files()
             copy = self._client.log_artifacts if path.is_dir() else self._client.log_artifact

@@ -17,9 +17,10 @@ from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, find_checkpoi
 from deepracer_exp.runs.clean import StoreOverview
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, read_metrics, read_run_id
 
+from .calls import pages
 from .metadata import picture, race_result
 from .metrics import metric_names
-from .store import existing_store, has_store, open_client, pages
+from .store import existing_store, has_store, open_client
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -7,18 +7,27 @@ import logging
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 from urllib.parse import unquote, urlsplit
 
 from filelock import FileLock
 
-from deepracer_exp.addresses import redact, with_password, without_passwords
+from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.files import MLFLOW_DB
+
+from . import calls
+from .calls import (
+    BoundedClient,
+    StoreRefusedError,
+    StoreUnavailableError,
+    ended_within,
+    store_errors,
+)
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -37,13 +46,6 @@ _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SQLITE_PREFIX = "sqlite:///"
 _USER, _PASSWORD = "MLFLOW_TRACKING_USERNAME", "MLFLOW_TRACKING_PASSWORD"
 _GIVEN = {name: os.environ.get(name) for name in (_USER, _PASSWORD)}
-
-_WORTH_RETRYING = (408, 425, 429)
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error of a store on one line, shortened and without passwords."""
-    return redact(" ".join(str(error).split()))[:300]
 
 
 @dataclass(frozen=True)
@@ -171,8 +173,10 @@ def silence_mlflow() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def client_of(store: Store) -> "MlflowClient":
-    """Return a client of a store; all clients use the user and password of the latest one's store.
+def client_of(store: Store, total_s: float | None = None) -> "MlflowClient":
+    """Return a client of a store, whose calls all end; in all they take at most `total_s`.
+
+    All clients use the user and password of the latest one's store.
 
     MLflow reads both from the environment at each request. In the address they would appear in its messages.
     """
@@ -184,8 +188,14 @@ def client_of(store: Store) -> "MlflowClient":
     from mlflow import MlflowClient
 
     silence_mlflow()
+
     # The model registry may be set elsewhere (MLFLOW_REGISTRY_URI), but it refers to these runs.
-    return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
+    def connect() -> MlflowClient:
+        return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
+
+    # A file answers, but its tables may have to be created first.
+    client = connect() if store.sqlite_file else ended_within(total_s or calls.CALL_S, connect)
+    return cast("MlflowClient", BoundedClient(client, total_s))
 
 
 def is_run_id(text: str) -> bool:
@@ -232,62 +242,25 @@ def existing_store(uri: str | None, runs_dir: Path) -> Store:
 
 
 @contextmanager
-def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowClient]":
+def open_client(
+    what: str, uri: str | None, runs_dir: Path, total_s: float | None = None
+) -> "Iterator[MlflowClient]":
     """Open a store and turn its errors into BadInput.
 
-    `what` begins the message; `uri` is the store, as in `tracking.uri`, None: the one in `runs_dir`.
+    `what` begins the message; `uri` is the store, as in `tracking.uri`, None: the one in `runs_dir`; the calls within
+    the block take at most `total_s` in all (None: the usual wait for what is looked up).
 
     Raises:
-        BadInput: there is no store, it does not answer, or it refuses.
+        BadInput: there is no store, it does not answer in time, or it refuses.
     """
     if not has_store(uri, runs_dir):
         raise BadInput(
             f"{what}: {runs_dir} has no mlflow.db to look it up in; give tracking.uri=URI or a run's folder"
         )
     store = existing_store(uri, runs_dir)
-    # Imported here: it takes three seconds, and nothing else needs it.
-    from mlflow.exceptions import MlflowException
-    from sqlalchemy.exc import SQLAlchemyError
-
     try:
-        yield client_of(store)
-    except (MlflowException, SQLAlchemyError, OSError) as error:
-        raise BadInput(f"{what}: {store.shown}: {one_line(error)}") from error
-
-
-def pages(search: Callable[..., Any], **what: Any) -> Iterator[Any]:
-    """Return the results of one of the client's searches, from all pages."""
-    token = None
-    while True:
-        page = search(**what, page_token=token)
-        yield from page
-        token = page.token
-        if not token:
-            return
-
-
-class StoreUnavailableError(Exception):
-    """The store did not answer, or not as expected: the call may be repeated."""
-
-
-class StoreRefusedError(Exception):
-    """The store refused the call, or a file is gone: repeating the call would change nothing."""
-
-
-@contextmanager
-def store_errors() -> Iterator[None]:
-    """Turn errors of MLflow and its database into StoreUnavailableError and StoreRefusedError."""
-    from mlflow.exceptions import MlflowException
-    from sqlalchemy.exc import SQLAlchemyError
-
-    try:
-        yield
-    except MlflowException as error:
-        status = error.get_http_status_code()
-        if 400 <= status < 500 and status not in _WORTH_RETRYING:
-            raise StoreRefusedError(str(error)) from error
-        raise StoreUnavailableError(str(error)) from error
-    except FileNotFoundError as error:
-        raise StoreRefusedError(str(error)) from error
-    except (OSError, SQLAlchemyError) as error:
-        raise StoreUnavailableError(str(error)) from error
+        # Within: its import takes three seconds, and nothing else needs it.
+        with store_errors():
+            yield client_of(store, total_s or calls.LOOKUP_S)
+    except (StoreRefusedError, StoreUnavailableError) as error:
+        raise BadInput(f"{what}: MLflow ({store.shown}): {error}") from error

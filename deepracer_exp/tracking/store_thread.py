@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from tenacity import RetryCallState, Retrying, retry_if_exception_type
 from tenacity.wait import wait_exponential_jitter
 
-from .store import Store, StoreRefusedError, StoreUnavailableError, one_line
+from .calls import FileGoneError, StoreRefusedError, StoreUnavailableError
+from .store import Store
 
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
@@ -45,6 +46,8 @@ class StoreThread:
     Attributes:
         run: the run, once MLflow is loaded.
         is_rejected: whether the store refused a vital call.
+        outage: why the store does not answer; None while it does.
+        refusal: why it refused a call, the first time; None if it refused none.
     """
 
     def __init__(self, store: Store, meanwhile: str, on_rejected: Callable[[], None] = lambda: None) -> None:
@@ -55,6 +58,8 @@ class StoreThread:
         """
         self.run: MLflowRun | None = None
         self.is_rejected = False
+        self.outage: str | None = None
+        self.refusal: str | None = None
         self._store, self._meanwhile, self._on_rejected = store, meanwhile, on_rejected
         self._calls: deque[_Call] = deque()
         self._changed = threading.Condition()
@@ -111,6 +116,7 @@ class StoreThread:
             nonlocal is_repetition
             again, is_repetition = is_repetition, True
             call.do(run, again)
+            self.outage = None
             return True
 
         retrying = Retrying(
@@ -119,12 +125,14 @@ class StoreThread:
             stop=lambda _: time.monotonic() >= self._end_by,
             sleep=self._pause,
             before_sleep=self._log_outage,
-            retry_error_callback=lambda _: False,
+            retry_error_callback=self._give_up,
         )
         try:
             return retrying(once)
         except StoreRefusedError as error:
-            self._refuse(call, one_line(error))
+            if not isinstance(error, FileGoneError):
+                self.refusal = self.refusal or str(error)
+            self._refuse(call, str(error))
             return False
 
     def _refuse(self, call: _Call, reason: str) -> None:
@@ -145,11 +153,16 @@ class StoreThread:
         else:
             self._has_deadline.wait(seconds)
 
+    def _give_up(self, state: RetryCallState) -> bool:
+        self.outage = str(state.outcome and state.outcome.exception())
+        return False
+
     def _log_outage(self, state: RetryCallState) -> None:
         error = state.outcome.exception() if state.outcome is not None else None
-        if error is not None and not self._is_outage_logged:
+        self.outage = str(error)
+        if not self._is_outage_logged:
             self._is_outage_logged = True
             _log.warning(
                 "MLflow (%s) does not answer; %s and recording is retried: %s",
-                self._store.shown, self._meanwhile, one_line(error),
+                self._store.shown, self._meanwhile, error,
             )  # fmt: skip

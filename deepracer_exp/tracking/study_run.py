@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import END_TAG, NOTE, PARENT, param_text, study_view
 from .metrics import now_ms, points_at, trial_metrics
-from .store import Store, StoreRefusedError, StoreUnavailableError, one_line
+from .store import Store
 from .store_thread import StoreThread
 from .tracking_file import Status, TrackedRun
 
@@ -236,7 +237,7 @@ def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLfl
             call(run)
             done.append(run.run_id)
         except (StoreRefusedError, StoreUnavailableError) as error:
-            reasons.append(one_line(error))
+            reasons.append(str(error))
 
     thread = threading.Thread(target=work, name="mlflow-trial", daemon=True)
     thread.start()

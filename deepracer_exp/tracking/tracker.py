@@ -30,9 +30,10 @@ from deepracer_exp.config.running import (
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import SUMMARY, TENSORBOARD, WANDB, read_object
 
+from .calls import StoreRefusedError
 from .metadata import END_TAG, Scalar, param_text
 from .metrics import Point, now_ms, points_of
-from .store import Store, StoreRefusedError, resolve_store
+from .store import Store, resolve_store
 from .store_thread import StoreThread
 from .tracking_file import Status, TrackedRun, TrackingFile, read_tracked_run
 
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _POINTS_PER_CALL = 1000
+FINISH_S = 30.0
+"""How long the end of a run waits for its store."""
 
 
 class Tracker:
@@ -52,9 +55,17 @@ class Tracker:
     and a resumed run (`reopen`) logs all rows of its metrics.jsonl again, of which only the missing ones are written.
     """
 
+    failure: str | None = None
+    """After `finish`: what was not recorded, and why, in one sentence; None: everything was."""
+
     @property
     def run_id(self) -> str | None:
         """Id of the run in MLflow, once it exists."""
+        return None
+
+    @property
+    def outage(self) -> str | None:
+        """Why the store does not answer at the moment, for which `finish` waits; None: it does."""
         return None
 
     def start(
@@ -100,7 +111,7 @@ class Tracker:
     def set_tag(self, key: str, value: str) -> None:
         """Set a tag of the run."""
 
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
+    def finish(self, status: Status, deadline_s: float = FINISH_S) -> int:
         """Write what is left for at most `deadline_s`, end the run and return the number of lost points.
 
         A failed or killed run may be resumed from its last checkpoint: later points are not written.
@@ -127,6 +138,12 @@ class MLflowTracker(Tracker):
     @override
     def run_id(self) -> str | None:
         return self._thread.run.run_id if self._thread.run else None
+
+    @property
+    @override
+    def outage(self) -> str | None:
+        reason = self._thread.outage
+        return None if reason is None else f"MLflow ({self._store.shown}): {reason}"
 
     @property
     def waiting(self) -> int:
@@ -180,7 +197,7 @@ class MLflowTracker(Tracker):
         self._thread.put(f"tag {key}", lambda run, _: run.set_tags({key: value}))
 
     @override
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
+    def finish(self, status: Status, deadline_s: float = FINISH_S) -> int:
         end_ms = now_ms()
         self._file.change(status=status, end_ms=end_ms)
         if status == "FINISHED":
@@ -189,17 +206,14 @@ class MLflowTracker(Tracker):
             self._thread.put("the result", lambda run, _: run.conclude(self._file.run, summary))
         is_ended = self._thread.finish(lambda run, _: run.end(status, end_ms), deadline_s)
         lost = self.waiting - sum(map(len, self._held))
-        if self._thread.is_rejected:
-            return lost  # which was logged
-        if lost:
-            _log.warning(
-                "MLflow (%s): %d of %d metric points were not recorded; metrics.jsonl has them all,"
-                " `deepracer-exp resume %s` records them",
-                self._store.shown, lost, self._logged, self._file.folder,
-            )  # fmt: skip
-        if not is_ended:
-            _log.warning("MLflow (%s): the run could not be marked %s", self._store.shown, status)
-        self._file.change(complete=is_ended and not lost)
+        complete = is_ended and not lost and self._thread.refusal is None
+        if not complete:
+            reason = self._thread.refusal or self._thread.outage or f"no answer within {deadline_s:g} s"
+            what = f"{lost:,} of {self._logged:,} metric points were" if lost else "some of this run was"
+            self.failure = f"MLflow ({self._store.shown}): {what} not recorded: {reason}"
+            if not self._thread.is_rejected:  # which was logged
+                _log.warning("%s; the run folder has everything", self.failure)
+        self._file.change(complete=complete)
         return lost
 
     def _begin(self, file: TrackingFile, open_run: Callable[["MLflowRun", TrackedRun, bool], None]) -> None:
@@ -315,7 +329,7 @@ class TensorBoardTracker(LoggerTracker):
         self._logger.experiment.add_text(key, value)
 
     @override
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
+    def finish(self, status: Status, deadline_s: float = FINISH_S) -> int:
         self._logger.experiment.close()
         return 0
 
@@ -394,7 +408,7 @@ class WandbTracker(LoggerTracker):
         self._logger.experiment.summary[key] = value
 
     @override
-    def finish(self, status: Status, deadline_s: float = 30.0) -> int:
+    def finish(self, status: Status, deadline_s: float = FINISH_S) -> int:
         if status == "FINISHED":
             self.safe_until(2**62)
         # W&B waits without a limit for a server that does not answer.
@@ -403,7 +417,8 @@ class WandbTracker(LoggerTracker):
         ending.start()
         ending.join(deadline_s)
         if ending.is_alive():
-            _log.warning("W&B does not answer; `wandb sync` in the run folder uploads what is missing")
+            self.failure = "W&B does not answer; `wandb sync` in the run folder uploads what is missing"
+            _log.warning(self.failure)
         return 0
 
 

@@ -18,8 +18,9 @@ from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import running
 
+from .calls import pages
 from .metadata import VIEW, WORKFLOW
-from .store import Store, existing_store, open_client, pages
+from .store import Store, existing_store, open_client
 
 _HOST = "127.0.0.1"
 _START_S = 90.0

@@ -37,7 +37,7 @@ from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
-from deepracer_exp.tracking.tracker import Tracker
+from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
@@ -80,7 +80,7 @@ def standard_callbacks(
         BudgetCallback(Alerts(experiment.budget), tracker),
         RecordCallback(),
         ReportCallback(),
-        TrackingCallback(tracker),
+        TrackingCallback(tracker, console),
         DisplayCallback(names, console),
         BestCallback(experiment, setup),
     ]
@@ -243,8 +243,8 @@ class ReportCallback(Callback):
 class TrackingCallback(Callback):
     """Passes rows, tags and files to the tracker."""
 
-    def __init__(self, tracker: Tracker):
-        self._tracker = tracker
+    def __init__(self, tracker: Tracker, console: Console):
+        self._tracker, self._console = tracker, console
 
     def on_replay(self, trainer: Trainer) -> None:
         """Log the row again: the store may lack some, and takes none twice."""
@@ -264,7 +264,7 @@ class TrackingCallback(Callback):
             self._tracker.log(eval_columns(trainer.evaluation), step=trainer.env_steps)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
-        """Log files and end the run in the store."""
+        """Log files and end the run in the store; the result says what was not recorded."""
         path, checkpoints = trainer.folder.path, trainer.checkpoints.folder
         files: list[tuple[Path, str | None]] = [(path / name, None) for name in _TRACKED_FILES]
         files.append((path / CRASH_DUMPS, CRASH_DUMPS))
@@ -273,7 +273,11 @@ class TrackingCallback(Callback):
             if file.exists():
                 self._tracker.log_artifact(file, folder)
         self._tracker.set_tag(END_TAG, f"{result.status}: {result.reason}")
+        if self._tracker.outage is not None:
+            line = f"{self._tracker.outage}; waiting for at most {FINISH_S:g} s"
+            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
         self._tracker.finish(ENDS.get(result.status, "KILLED"))
+        result.unrecorded = self._tracker.failure
 
     def on_release(self, trainer: Trainer) -> None:
         """End the run in the store as killed."""

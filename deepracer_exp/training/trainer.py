@@ -63,6 +63,8 @@ class TrainResult:
     """The exception that ended a failed run."""
     note: str | None = None
     """A line on what is missing from the results."""
+    unrecorded: str | None = None
+    """A sentence on what its tracker could not record, and why."""
 
 
 class Callback:

@@ -3,9 +3,10 @@ import threading
 
 import pytest
 
+from deepracer_exp.tracking.calls import StoreUnavailableError
 from deepracer_exp.tracking.metadata import VIEW
 from deepracer_exp.tracking.mlflow_run import MLflowRun
-from deepracer_exp.tracking.store import Store, StoreUnavailableError
+from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.study_run import Progress, StudyRun, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import TrackedRun
 

@@ -1,0 +1,154 @@
+"""Calls of an MLflow store: each of them ends, and each error is one sentence."""
+
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, TypeVar
+
+from deepracer_exp.addresses import redact
+
+Value = TypeVar("Value")
+
+CALL_S = 120.0
+"""Longest wait for one call, which may send a checkpoint.
+
+The time limit of an HTTP request is one for the pause between two bytes: a server that sends one now and then would
+hold it for ever."""
+LOOKUP_S = 60.0
+"""Longest wait for all calls together of what is looked up in a store."""
+_WORTH_RETRYING = (408, 425, 429)
+
+
+class StoreUnavailableError(Exception):
+    """The store did not answer, or not as expected: the call may be repeated."""
+
+
+class StoreRefusedError(Exception):
+    """The store refused the call: repeating it would change nothing."""
+
+
+class FileGoneError(StoreRefusedError):
+    """A file that was to be recorded no longer exists."""
+
+
+class BoundedClient:
+    """A client of MLflow of which every call ends; in all they take at most `total_s`.
+
+    Its methods raise TimeoutError, which is an OSError, when their time is up.
+    """
+
+    def __init__(self, client: Any, total_s: float | None = None) -> None:
+        self._client = client
+        self._end_by = None if total_s is None else time.monotonic() + total_s
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._client, name)
+        if not callable(found):
+            return found
+        return partial(self._call, found)
+
+    def _call(self, call: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        left_s = CALL_S if self._end_by is None else max(self._end_by - time.monotonic(), 0.0)
+        return ended_within(left_s, lambda: call(*args, **options))
+
+
+def ended_within(seconds: float, call: Callable[[], Value]) -> Value:
+    """Return the result of a call; its thread is left alone when time is up, since nothing can end it.
+
+    Raises:
+        TimeoutError: time is up.
+    """
+    results: list[Value] = []
+    errors: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            results.append(call())
+        except BaseException as error:  # noqa: BLE001 - raised again below
+            errors.append(error)
+
+    # Daemon, so that the process does not wait for it either.
+    thread = threading.Thread(target=work, name="mlflow-call", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if errors:
+        raise errors[0]
+    if not results:
+        raise TimeoutError(f"no answer within {seconds:.0f} s")
+    return results[0]
+
+
+@contextmanager
+def store_errors() -> Iterator[None]:
+    """Turn errors of MLflow and its database into StoreUnavailableError and StoreRefusedError, one sentence each."""
+    from google.protobuf.json_format import ParseError  # type: ignore[import-untyped]
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except MlflowException as error:
+        status = error.get_http_status_code()
+        if 400 <= status < 500 and status not in _WORTH_RETRYING:
+            raise StoreRefusedError(_sentence(error)) from error
+        raise StoreUnavailableError(_sentence(error)) from error
+    except FileNotFoundError as error:
+        raise FileGoneError(str(error)) from error
+    except (OSError, SQLAlchemyError, ParseError) as error:
+        raise StoreUnavailableError(_sentence(error)) from error
+
+
+def _sentence(error: BaseException) -> str:
+    """Return an error of MLflow or its database as one sentence without passwords."""
+    from google.protobuf.json_format import ParseError
+    from mlflow.environment_variables import MLFLOW_HTTP_REQUEST_TIMEOUT
+    from mlflow.exceptions import MlflowException, RestException
+    from urllib3.exceptions import NewConnectionError, ProtocolError
+    from urllib3.exceptions import TimeoutError as TooLate
+
+    links = list(_causes(error))
+    text = " ".join(str(error).split())
+    failed = re.search(r"too many (\d{3}) error responses|failed with error code (\d{3})", text)
+    status = int(failed[1] or failed[2]) if failed else None
+    if any(
+        isinstance(one, NewConnectionError | ProtocolError) for one in links
+    ):  # the first is a TimeoutError, too
+        return "no connection: nothing answers at this address"
+    if any(isinstance(one, TooLate) for one in links):
+        return f"no answer within {MLFLOW_HTTP_REQUEST_TIMEOUT.get()} s"
+    if isinstance(error, MlflowException) and error.error_code == "UNAUTHENTICATED":
+        return (
+            "the server refuses the user and password (401); give them as MLFLOW_TRACKING_USERNAME and "
+            "MLFLOW_TRACKING_PASSWORD"
+        )
+    if status is not None:
+        return f"the server answers with error {status}"
+    if isinstance(error, ParseError) or ("valid JSON" in text and not isinstance(error, RestException)):
+        return "the answer is not that of an MLflow server"
+    return one_line(getattr(error, "orig", None) or error)
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error of a database on one line, shortened and without passwords."""
+    return redact(" ".join(str(error).split()))[:300]
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Return an error and those that led to it; urllib3 keeps some as `reason`."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def pages(search: Callable[..., Any], **what: Any) -> Iterator[Any]:
+    """Return the results of one of the client's searches, from all pages."""
+    token = None
+    while True:
+        page = search(**what, page_token=token)
+        yield from page
+        token = page.token
+        if not token:
+            return

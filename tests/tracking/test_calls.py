@@ -1,0 +1,84 @@
+"""Servers that answer with an error, with something else, slowly or never."""
+
+import time
+from collections.abc import Callable, Iterator
+from functools import partialmethod
+
+import pytest
+
+from deepracer_exp.tracking import calls
+from deepracer_exp.tracking.registry import look_up
+from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import MLflowTracker
+from tests.conftest import refused
+
+from .odd_servers import odd_server
+
+ODD = {
+    "401": "refuses the user and password (401)",
+    "403": "answers with error 403",
+    "500": "answers with error 500",
+    "302": "answers with error 302",
+    "hang": "no answer within",
+    "drip": "no answer within",
+    "<html>": "not that of an MLflow server",
+    '{"registered_models": [{"name": 3}], "experiment": 7}': "not that of an MLflow server",
+    "closed": "nothing answers at this address",
+}
+
+
+@pytest.fixture(params=ODD)
+def odd(request, free_port, monkeypatch) -> Iterator[tuple[str, str]]:
+    """Address of an odd server, and what is said of it."""
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "2")
+    monkeypatch.setattr(calls, "CALL_S", 4.0)
+    monkeypatch.setattr(calls, "LOOKUP_S", 4.0)
+    if request.param == "closed":
+        yield f"http://127.0.0.1:{free_port}", ODD["closed"]
+        return
+    with odd_server(request.param) as uri:
+        yield uri, ODD[request.param]
+
+
+def test_looking_up_an_alias_ends_in_one_sentence(odd, tmp_path):
+    uri, words = odd
+    message = refused(look_up, "x@champion", uri, tmp_path)
+    assert message.startswith(f"x@champion: MLflow ({uri}): ")
+    assert words in message
+    assert len(message) < 220
+    assert "API request" not in message
+
+
+def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path):
+    uri, words = odd
+    tracker = MLflowTracker(resolve_store(uri, tmp_path))
+    tracker.start("run", "race", {"seed": 1}, {}, tmp_path / "tracking.json")
+    tracker.safe_until(1)
+    tracker.log({"completion": 5.0}, 1)
+    began = time.monotonic()
+    assert tracker.finish("FINISHED", deadline_s=8.0) == 1
+    assert time.monotonic() - began < 30
+    assert tracker.failure is not None
+    assert tracker.failure.startswith(f"MLflow ({uri}): 1 of 1 metric points were not recorded: ")
+    assert words in tracker.failure
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("answer", ["401", "500", "drip"])
+def test_what_a_training_could_not_record_is_its_last_lines_and_is_sent_by_their_command(
+    answer, tmp_path, call: Callable, train_here: Callable, server, monkeypatch
+):
+    monkeypatch.setattr(MLflowTracker, "finish", partialmethod(MLflowTracker.finish, deadline_s=3.0))
+    with odd_server(answer) as uri:
+        ended = train_here("tracking=mlflow", f"tracking.uri={uri}")
+    assert ended.code == 0
+    assert "compare runs" not in ended.stdout
+    *_, warning, command = ended.stderr.splitlines()
+    assert warning.startswith(f"warning: MLflow ({uri}): ")
+    assert ODD[answer] in warning
+    name = ended.folder.name
+    assert command.endswith(f" runs send {name} tracking.uri={uri}")
+    # The server is mended, at another port here.
+    sent = call("runs", "send", name, f"tracking.uri={server.uri}")
+    assert sent.code == 0, sent.stderr
+    assert sent.stdout.startswith(f"{name}: sent, with ")
