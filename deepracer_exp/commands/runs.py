@@ -1,17 +1,14 @@
 """`deepracer-exp runs`: list runs, compare them, show their lineage, promote and clean them; and `ui`."""
 
 import argparse
-import datetime
-import math
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from string import ascii_uppercase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count, writing
-from deepracer_exp.runs.files import CONFIG, METRICS, SUMMARY, run_folders
+from deepracer_exp.runs.files import METRICS
 
 from .arguments import (
     STORES,
@@ -26,6 +23,8 @@ from .arguments import (
 )
 from .output import table_console
 from .replay import add_replay, check_replay, write_laps
+from .runs_edit import add_edits
+from .runs_list import LIST, add_list
 from .startup import check_policy
 
 if TYPE_CHECKING:
@@ -38,10 +37,8 @@ if TYPE_CHECKING:
     from deepracer_exp.runs.files import RunRecord
     from deepracer_exp.runs.lineage import Member
 
-_NONE = "\N{EN DASH}"
 _MOST_CHANGES = 6
 """Changes of a clone that its lineage shows."""
-_LIST = "list"
 _EPILOG = """\
   deepracer-exp runs                                        list the runs, newest first
   deepracer-exp runs compare runs/default/*                 all runs of an experiment
@@ -53,6 +50,11 @@ _EPILOG = """\
   deepracer-exp runs promote RUN checkpoint=120 --model season
   deepracer-exp evaluate champion                           from then on; export and clone accept it, too
   deepracer-exp runs send                                   record in MLflow what it lacks of ended runs
+  deepracer-exp runs list --where 'score_s<12' --sort score_s --format csv
+  deepracer-exp runs rename RUN blue-car                    from then on blue-car means this run
+  deepracer-exp runs note RUN "new tyres"
+  deepracer-exp runs tag RUN car=blue checked=
+  deepracer-exp runs delete RUN
   deepracer-exp runs clean --apply
 
 All of them accept runs_dir=DIR (default: runs) and tracking.uri=URI (default: the MLflow store in runs_dir).
@@ -62,6 +64,8 @@ What can be removed:
   - checkpoints that are neither best nor last
   - the traces of failed runs
   - the folders of runs that were deleted in MLflow
+  - with --traces, the traces of finished runs, or all but the newest tenth of their iterations; analyze, report and
+    watch then know only what is left, and results, checkpoints and pages stay
 
 What is never removed: checkpoints that are registered (deepracer-exp runs promote), pinned or cloned from, and runs
 that have one; runs in progress; files and folders that no training wrote, and whatever links point at.
@@ -72,7 +76,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     """Add the family of commands, and `ui`."""
     family = commands.add_parser(
         "runs",
-        help="list, compare, promote and clean runs",
+        help="list, compare, label, promote and clean runs",
         description="List runs with their state, score, laps and age; compare them, show their lineage, register and "
         "clean them.",
         epilog=_EPILOG,
@@ -81,14 +85,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     actions = family.add_subparsers(metavar="ACTION", required=True)
     where = " | ".join(f"{key}=..." for key in STORES)
 
-    listing = add_command(
-        actions,
-        _LIST,
-        _list,
-        help="list the runs, newest first (the default)",
-        description="List the runs of a folder, newest first.",
-    )
-    add_overrides(listing, "runs_dir=DIR")
+    add_list(actions)
 
     compare = add_command(
         actions,
@@ -133,15 +130,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="alias for it, taken from the version that has it (default: champion)",
     )
 
-    send = add_command(
-        actions,
-        "send",
-        _send,
-        help="record in MLflow what it lacks of ended runs",
-        description="Record in MLflow, from the folders of ended runs, what it lacks because it did not answer or "
-        "refused; without RUN, of all runs of this store in runs_dir.",
-    )
-    add_run(send, where, many=True)
+    add_edits(actions)
 
     clean = add_command(
         actions,
@@ -153,6 +142,11 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_overrides(clean, where)
     clean.add_argument("--apply", action="store_true", help="remove what is listed")
+    clean.add_argument(
+        "--traces",
+        choices=("thin", "drop"),
+        help="list the traces of finished runs, too: all but the newest tenth of their iterations, or all",
+    )
 
     ui = add_command(
         commands,
@@ -168,71 +162,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def with_default_action(arguments: list[str]) -> list[str]:
     """Return the arguments of a command line in which `runs` without an action means `runs list`."""
     if arguments[:1] == ["runs"] and (len(arguments) == 1 or is_override(arguments[1])):
-        return ["runs", _LIST, *arguments[1:]]
+        return ["runs", LIST, *arguments[1:]]
     return arguments
-
-
-def _list(args: argparse.Namespace) -> int:
-    from rich.table import Table
-
-    from deepracer_exp.runs.files import read_object
-
-    runs_dir = read_stores(args.overrides).runs_dir
-    if not runs_dir.is_dir():
-        raise BadInput(f"runs_dir={runs_dir}: is not a folder; `deepracer-exp train` creates it")
-    folders = {folder: _began_s(folder) for folder in run_folders(runs_dir)}
-    if not folders:
-        print(f"no runs in {runs_dir}")
-        return 0
-    table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
-    table.columns[0].overflow = "fold"
-    for name in ("score (s)", "laps", "best lap (s)", "age"):
-        table.add_column(name, justify="right")
-    now_s = time.time()
-    for folder in sorted(folders, key=lambda one: (folders[one], one), reverse=True):
-        try:
-            summary = read_object(folder / SUMMARY)
-            state = str(summary.get("status") or _state_without_end(folder))
-        except BadInput:  # one damaged run does not hide the others
-            summary, state = {}, "unreadable"
-        best = summary.get("best") or {}
-        table.add_row(
-            f"{folder.parent.name}/{folder.name}",
-            state,
-            _number(best.get("eval_race_score_s"), ".2f"),
-            _number(summary.get("laps"), ",.0f"),
-            _number(summary.get("best_lap_time_s"), ".2f"),
-            _age(now_s - folders[folder]),
-        )
-    table_console().print(table)
-    return 0
-
-
-def _state_without_end(folder: Path) -> str:
-    from deepracer_exp.runs.folder import is_held
-
-    return "running" if is_held(folder) else "killed"
-
-
-def _began_s(folder: Path) -> float:
-    """Return when a run began, Unix time: its folder's name says so, unless it was renamed."""
-    try:
-        return datetime.datetime.strptime(folder.name[: len("20260101-120000")], "%Y%m%d-%H%M%S").timestamp()
-    except ValueError:
-        return (folder / CONFIG).stat().st_mtime
-
-
-def _number(value: Any, form: str) -> str:
-    known = isinstance(value, int | float) and math.isfinite(value)
-    return format(value, form) if known else _NONE
-
-
-def _age(seconds: float) -> str:
-    """Return an age in its largest unit: ``40 s``, ``12 min``, ``5 h``, ``3 d``."""
-    for unit, length_s in (("d", 86_400), ("h", 3_600), ("min", 60)):
-        if seconds >= length_s:
-            return f"{seconds // length_s:.0f} {unit}"
-    return f"{max(seconds, 0):.0f} s"
 
 
 def _compare(args: argparse.Namespace) -> int:
@@ -444,39 +375,10 @@ def _promote(args: argparse.Namespace) -> int:
     return 0
 
 
-def _send(args: argparse.Namespace) -> int:
-    from deepracer_exp.runs.files import TRACKING
-    from deepracer_exp.runs.resolve import resolve
-    from deepracer_exp.tracking.delivery import deliver, is_delivered, undelivered
-    from deepracer_exp.tracking.store import resolve_store
-    from deepracer_exp.tracking.tracking_file import read_tracked_run
-
-    runs, overrides = runs_and_overrides(args)
-    stores = read_stores(overrides)
-    store = resolve_store(stores.uri, stores.runs_dir)
-    named = [resolve(run, stores.runs_dir, stores.uri).path for run in runs]
-    for folder in named:
-        recorded = read_tracked_run(folder / TRACKING).store
-        # What a run names as its store may be a stranger's, who would be given this user's password.
-        if stores.uri is None and recorded != store.shown:
-            raise BadInput(f"{folder}: was recorded in {recorded}; give tracking.uri={recorded}")
-    everything = undelivered(run_folders(stores.runs_dir)).items()
-    folders = named or [folder for folder, recorded in everything if recorded == store.shown]
-    for folder in dict.fromkeys(folders):
-        if is_delivered(folder, stores.uri, stores.runs_dir):
-            print(f"{folder.name}: MLflow has everything")
-            continue
-        points = deliver(folder, stores.uri, stores.runs_dir)
-        print(f"{folder.name}: sent, with {count(points, 'metric point')} that MLflow lacked")
-    if not folders:
-        print(f"MLflow ({store.shown}) has everything of the ended runs in {stores.runs_dir}")
-    return 0
-
-
 def _clean(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
-    from deepracer_exp.runs.clean import remove, survey, total
+    from deepracer_exp.runs.clean import THIN, asked_traces, remove, survey, total
 
     stores = read_stores(args.overrides)
     runs_dir = stores.runs_dir
@@ -487,17 +389,24 @@ def _clean(args: argparse.Namespace) -> int:
     if note is not None:
         print(note, file=sys.stderr)
     found = survey(runs_dir, overview)
-    _show_removable(found.removable, runs_dir, console)
+    removable = [*found.removable, *asked_traces(found.offered, args.traces)]
+    _show_removable(removable, runs_dir, console)
     for reason in dict.fromkeys(reason for _, reason in found.kept):
         runs = [str(run.relative_to(runs_dir)) for run, given in found.kept if given == reason]
         more = f" and {len(runs) - 1} more" * (len(runs) > 1)
         console.print(f"kept: {runs[0]}{more}: {reason}", soft_wrap=True)
-    if not found.removable:
+    if args.traces is None and found.offered:
+        short = asked_traces(found.offered, THIN)
+        print(
+            f"offered: the traces of {count(len(found.offered), 'finished run')}: --traces drop removes "
+            f"{decimal(total(found.offered))}, --traces thin {decimal(total(short))}"
+        )
+    if not removable:
         print("nothing to remove")
     elif args.apply:
-        removed = [item for item in found.removable if remove(item)]
+        removed = [item for item in removable if remove(item)]
         print(f"removed {decimal(total(removed))}")
-        for item in found.removable:
+        for item in removable:
             if item not in removed:
                 print(f"kept: {item.run.relative_to(runs_dir)}: a training or a clone has started meanwhile")
     else:

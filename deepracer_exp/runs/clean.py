@@ -24,13 +24,19 @@ from .files import (
 )
 from .folder import RunFolder, is_held
 from .lineage import read_lineage
+from .result import FAILED, FINISHED, STOPPED_EARLY
 
 SPARE_CHECKPOINTS = "checkpoints neither best nor last"
 FAILED_TRACE = "trace of a failed run"
+WHOLE_TRACE, EARLY_TRACE = "trace of a finished run", "trace of a finished run, all but its newest iterations"
+THIN, DROP = "thin", "drop"
+"""What may be done with the traces of finished runs."""
+ASKED = "run that was asked for"
 DELETED = "run deleted in MLflow"
 
 _IDLE_S = 3600.0
 """A run without a summary that changed more recently may be training on another machine."""
+_LEAST_ITERATIONS = 10
 _UNKNOWN = (
     "recorded in a store that was not read, where a checkpoint may be registered: give it as tracking.uri=URI"
 )
@@ -52,7 +58,7 @@ class Removable:
 
     run: Path
     what: str
-    """SPARE_CHECKPOINTS, FAILED_TRACE or DELETED."""
+    """One of the words above."""
     paths: tuple[Path, ...]
     size: int
     """Bytes."""
@@ -65,6 +71,8 @@ class Removables:
     removable: list[Removable] = field(default_factory=list)
     kept: list[tuple[Path, str]] = field(default_factory=list)
     """Runs with something that must be kept for now, and why."""
+    offered: list[Removable] = field(default_factory=list)
+    """Traces of finished runs, which are removed only where that is asked for."""
 
 
 def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
@@ -99,10 +107,13 @@ def remove(item: Removable) -> bool:
         return False
     try:
         pins = pinned(item.run / CHECKPOINTS)
-        if (pins and item.what == DELETED) or pins.keys() & {path.name for path in item.paths}:
+        if (pins and item.run in item.paths) or pins.keys() & {path.name for path in item.paths}:
             return False
         for path in item.paths:
-            shutil.rmtree(path)
+            if _is_folder(path):
+                shutil.rmtree(path)
+            else:
+                path.unlink()
         return True
     except OSError as error:
         raise RunFailed(f"{error.filename}: cannot be removed: {error.strerror}") from error
@@ -139,8 +150,52 @@ def _search(run: Path, wanted: dict[str, str], overview: StoreOverview | None, f
         else:
             found.removable.append(Removable(run, SPARE_CHECKPOINTS, spare, sum(map(_size, spare))))
     trace = run / TRACE
-    if read_object(run / SUMMARY).get("status") == "failed" and _is_folder(trace):
+    status = read_object(run / SUMMARY).get("status")
+    if status is None or not _is_folder(trace):
+        return
+    if status == FAILED:
         found.removable.append(Removable(run, FAILED_TRACE, (trace,), _size(trace)))
+    elif status in (FINISHED, STOPPED_EARLY):
+        found.offered.append(Removable(run, WHOLE_TRACE, (trace,), _size(trace)))
+
+
+def asked_traces(offered: Sequence[Removable], how: str | None) -> list[Removable]:
+    """Return what of the offered traces is to go: all of them (DROP), all but their newest part (THIN) or nothing."""
+    if how == DROP:
+        return list(offered)
+    return [early for item in offered if (early := _early(item)) is not None] if how == THIN else []
+
+
+def _early(item: Removable) -> Removable | None:
+    """Return all of a trace but the newest tenth of its iterations and at least ten; None: it has no more.
+
+    The newest are what pages read of a trace that is too long for memory.
+    """
+    (trace,) = item.paths
+    files = sorted(path for path in trace.iterdir() if path.is_file() and not path.is_symlink())
+    early = tuple(files[: -max(len(files) // 10, _LEAST_ITERATIONS)])
+    if not early:
+        return None
+    return Removable(item.run, EARLY_TRACE, early, sum(path.lstat().st_size for path in early))
+
+
+def deletable(run: Path, runs_dir: Path) -> Removable:
+    """Return a whole run that someone asks to delete.
+
+    Raises:
+        BadInput: it is no folder of its own in `runs_dir`, is in progress, or another run or a registered model needs
+            it.
+    """
+    place = run.resolve()
+    if run.is_symlink() or place.parent.parent != runs_dir.resolve() or place.parent.is_symlink():
+        raise BadInput(f"{run}: is not a run's own folder in runs_dir={runs_dir}; nothing was deleted")
+    wanted = _cloned_from(runs_dir)[place.name] | {
+        name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()
+    }
+    reasons = [f"checkpoint {name} is {why}" for name, why in sorted(wanted.items())]
+    if reason := _in_progress(run) or ", ".join(reasons):
+        raise BadInput(f"{run}: {reason}; nothing was deleted")
+    return Removable(run, ASKED, (run,), _size(run))
 
 
 def _own_runs(runs_dir: Path) -> Iterator[Path]:

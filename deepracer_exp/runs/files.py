@@ -1,6 +1,10 @@
 """The files of a run folder: their names, and what a training wrote into them."""
 
+import contextlib
+import getpass
 import json
+import os
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +27,8 @@ REPORT = "report.html"
 BEST_LAP = "best_lap.png"
 LEARNING = "learning.png"
 TRACKING = "tracking.json"
+LABELS = "labels.json"
+"""Name, note and tags that people gave the run."""
 LINEAGE = "lineage.json"
 """In a clone's folder."""
 REWARD_PRINTS = "reward_prints.log"
@@ -103,6 +109,14 @@ def read_config(path: Path) -> dict[str, Any]:
     if not isinstance(mapping, dict):
         raise BadInput(f"{file}: holds no values; a run writes its experiment there")
     return {str(key): value for key, value in mapping.items()}
+
+
+def who_and_where() -> dict[str, str]:
+    """Return the user who runs this process, and the name of the machine, as `user` and `host`."""
+    user = f"uid {os.getuid()}" if hasattr(os, "getuid") else "unknown"
+    with contextlib.suppress(KeyError, OSError):  # containers often have a user id without a name
+        user = getpass.getuser()
+    return {"user": user, "host": socket.gethostname()}
 
 
 def sees_pictures(config: Mapping[str, Any]) -> bool:

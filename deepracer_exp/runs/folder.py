@@ -38,6 +38,7 @@ from .files import (
     SUMMARY,
     TRACE,
     read_metrics,
+    who_and_where,
 )
 
 logger = logging.getLogger("deepracer_exp")
@@ -98,6 +99,7 @@ class RunFolder:
             "seed": seed,
             "names": dict(names),
             "machine": {
+                **who_and_where(),
                 "system": platform.platform(),
                 "cores": psutil.cpu_count(),
                 "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.files import METRICS, SUMMARY, TRACKING, read_metrics, read_object, read_run_id
+from deepracer_exp.runs.labels import Labels, read_labels
 from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
 
 from .calls import StoreRefusedError, StoreUnavailableError
-from .metadata import END_TAG
+from .metadata import END_TAG, NAME, USER_NOTE, USER_TAG, label_tags
 from .metrics import now_ms, points_at, points_of
-from .store import Store, has_store, resolve_store
+from .store import Store, has_store, open_client, resolve_store
 from .tracking_file import Status, TrackedRun, TrackingFile, read_tracked_run
 
 if TYPE_CHECKING:
@@ -56,7 +57,9 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             )
             _log_files(run, run_dir, file.run)
             run.conclude(file.run, summary)
-            run.set_tags({END_TAG: f"{summary['status']}: {summary['reason']}"})
+            run.set_tags(
+                {END_TAG: f"{summary['status']}: {summary['reason']}"} | label_tags(read_labels(run_dir))
+            )
             run.end(file.run.status or ENDS.get(summary["status"], "KILLED"), file.run.end_ms or now_ms())
             file.change(complete=True)
     except StoreRefusedError as error:
@@ -121,6 +124,51 @@ def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
     ended = [one for one in folders if (one / TRACKING).exists() and (one / SUMMARY).exists()]
     tracked = {folder: read_tracked_run(folder / TRACKING) for folder in ended}
     return {folder: run.store for folder, run in tracked.items() if not run.complete}
+
+
+def deliver_labels(run_id: str, labels: Labels, uri: str | None, runs_dir: Path) -> None:
+    """Record a run's name, note and tags in MLflow, without those it had before.
+
+    Raises:
+        BadInput: the store, as of `deliver`, does not answer or refuses.
+    """
+    with open_client(run_id, uri, runs_dir) as client:
+        tags, wanted = client.get_run(run_id).data.tags, label_tags(labels)
+        for key in tags:
+            if key not in wanted and (key == USER_NOTE or key.startswith(USER_TAG)):
+                client.delete_tag(run_id, key)
+        for key, value in wanted.items():
+            client.set_tag(run_id, key, value)
+
+
+def recorded_labels(run_id: str, uri: str | None, runs_dir: Path) -> Labels:
+    """Return the name, note and tags that a run has in MLflow.
+
+    Raises:
+        BadInput: as of `deliver_labels`.
+    """
+    with open_client(run_id, uri, runs_dir) as client:
+        tags = client.get_run(run_id).data.tags
+    own = {key.removeprefix(USER_TAG): value for key, value in tags.items() if key.startswith(USER_TAG)}
+    return Labels(tags.get(NAME), tags.get(USER_NOTE), own)
+
+
+def mark_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) -> None:
+    """Mark a run as deleted in the store, as of `deliver`, that recorded it; `mlflow gc` removes it for good.
+
+    Raises:
+        BadInput: the run was recorded in another store, or this one does not answer.
+    """
+    recorded = read_tracked_run(run_dir / TRACKING).store
+    if recorded != resolve_store(uri, runs_dir).shown:
+        raise BadInput(
+            f"{run_dir}: was recorded in {recorded}; give tracking.uri={recorded} to delete it there"
+        )
+    if not has_store(uri, runs_dir):
+        return
+    with open_client(f"{run_dir}: nothing was deleted", uri, runs_dir) as client:
+        if client.get_run(run_id).info.lifecycle_stage == "active":
+            client.delete_run(run_id)
 
 
 @contextmanager

@@ -2,14 +2,14 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.overrides import key_of
-from deepracer_exp.runs.files import BEST_LAP, REPORT
+from deepracer_exp.runs.files import BEST_LAP, REPORT, who_and_where
+from deepracer_exp.runs.labels import Labels
 from deepracer_exp.runs.lineage import Lineage
 
 from .metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
@@ -50,11 +50,17 @@ def param_text(value: Scalar) -> str:
 NOTE = "mlflow.note.content"
 """Tag of a run or an experiment that MLflow shows as its description."""
 
+NAME, USER_NOTE, USER_TAG = "mlflow.runName", "note", "tag."
+"""Tags of a run that people set: its name, a note, and the beginning of the keys of their own tags."""
+
 PARENT = "mlflow.parentRunId"
 """Tag of a run that is nested under another one in the UI."""
 
 END_TAG = "end"
 """Tag of an ended run: its status and the reason."""
+
+HOST = "host"
+"""Tag of a run: the machine on which it began."""
 
 _MOST_PARAMS = 12  # columns of the table; a tag of an experiment takes 5,000 characters
 
@@ -119,6 +125,19 @@ def lineage_tags(lineage: Lineage) -> dict[str, str]:
     return tags if lineage.parent_run_id is None else {**tags, PARENT: lineage.parent_run_id}
 
 
+def user_tags() -> dict[str, str]:
+    """Return the tags of every run that say whose it is: `mlflow.user`, which fills a column of MLflow, and `host`."""
+    who = who_and_where()
+    return {"mlflow.user": who["user"], HOST: who["host"]}
+
+
+def label_tags(labels: Labels) -> dict[str, str]:
+    """Return the tags of a run that say what people say of it."""
+    given = {NAME: labels.name, USER_NOTE: labels.note}
+    tags = {key: value for key, value in given.items() if value is not None}
+    return tags | {f"{USER_TAG}{key}": value for key, value in labels.tags.items()}
+
+
 _COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.constants", "budget.env_steps")
 """Keys and groups that racers vary: always recorded as parameters."""
 
@@ -153,6 +172,7 @@ def run_tags(
     metrics += f"\n\nWith several tracks also {each}."
     tags = {
         **names,
+        **user_tags(),
         "reward_sha256": reward_sha256,
         "run_dir": str(run_dir),
         "mlflow.source.name": "deepracer-exp train",
@@ -162,8 +182,6 @@ def run_tags(
             f"Metrics, against control steps of all cars:\n\n{metrics}\n"
         ),
     }
-    if user := os.environ.get("USER"):  # containers often have a user id without a name
-        tags["mlflow.user"] = user
     if git_commit:
         tags |= {"git_commit": git_commit, "mlflow.source.git.commit": git_commit}
     return tags

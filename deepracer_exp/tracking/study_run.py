@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .calls import StoreRefusedError, StoreUnavailableError
-from .metadata import END_TAG, NOTE, PARENT, param_text, study_view
+from .metadata import END_TAG, NOTE, PARENT, param_text, study_view, user_tags
 from .metrics import now_ms, points_at, trial_metrics
 from .store import Store
 from .store_thread import StoreThread
@@ -82,7 +82,7 @@ class StudyRun:
         """Start creating or finding the run of a search: expressions by key, and overrides of all trials."""
         params = _params(space, base)
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
-        tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE}
+        tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE, **user_tags()}
         self._tracked = TrackedRun(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
@@ -192,7 +192,7 @@ def open_trial_run(
 
     None if the store refuses or does not answer; the seeds are then nested under the study itself.
     """
-    tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE}
+    tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE, **user_tags()}
     tracked = TrackedRun(None, f"trial {trial}", study, now_ms(), store.shown, _params({}, base), tags)
 
     def open_run(run: "MLflowRun") -> None:

@@ -1,3 +1,4 @@
+import os
 from dataclasses import fields
 
 import pytest
@@ -8,7 +9,15 @@ from mlflow.utils.validation import _validate_metric_name
 from deepracer_exp.agents.ppo import UpdateMetrics
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
-from deepracer_exp.tracking.metadata import LONGEST_PARAM, flatten, joined, param_text, run_params
+from deepracer_exp.tracking.metadata import (
+    LONGEST_PARAM,
+    flatten,
+    joined,
+    param_text,
+    run_params,
+    run_tags,
+    user_tags,
+)
 from deepracer_exp.tracking.metrics import (
     BEST,
     METRICS,
@@ -99,3 +108,15 @@ def test_long_values_are_cut_but_stay_distinguishable(text, end):
     cut = param_text(text)
     assert len(cut) == LONGEST_PARAM
     assert (param_text(text + end) == cut) == (end == "")
+
+
+@pytest.mark.parametrize("name", ["anna", None])
+def test_every_run_says_who_made_it_and_where(monkeypatch, tmp_path, name):
+    def no_name() -> str:
+        raise KeyError("uid not found")
+
+    monkeypatch.setattr("getpass.getuser", no_name if name is None else lambda: name)
+    monkeypatch.setattr("socket.gethostname", lambda: "box")
+    wanted = {"mlflow.user": name or f"uid {os.getuid()}", "host": "box"}
+    assert run_tags({}, None, "0", tmp_path).items() >= wanted.items()
+    assert user_tags() == wanted

@@ -1,0 +1,227 @@
+"""`deepracer-exp runs send`, `rename`, `note`, `tag` and `delete`: what is done to single runs."""
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deepracer_exp.errors import BadInput, count
+from deepracer_exp.runs.files import TRACKING, run_folders
+
+from .arguments import (
+    STORES,
+    Stores,
+    add_command,
+    add_overrides,
+    add_run,
+    complete_runs,
+    read_stores,
+    runs_and_overrides,
+)
+
+if TYPE_CHECKING:
+    from deepracer_exp.runs.labels import Labels
+
+
+def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the commands."""
+    where = " | ".join(f"{key}=..." for key in STORES)
+    send = add_command(
+        actions,
+        "send",
+        _send,
+        help="record in MLflow what it lacks of ended runs",
+        description="Record in MLflow, from the folders of ended runs, what it lacks because it did not answer or "
+        "refused; without RUN, of all runs of this store in runs_dir.",
+    )
+    add_run(send, where, many=True)
+    for name, call, what, value in (
+        ("rename", _rename, "name a run; commands find it by this name, too", "NAME"),
+        ("note", _note, "write a note to a run", "TEXT"),
+        ("tag", _tag, "set tags of a run; KEY= removes one", "KEY=VALUE"),
+    ):
+        parser = add_command(
+            actions,
+            name,
+            call,
+            help=what,
+            description=f"{what[0].upper()}{what[1:]}. It is kept in the run's folder and in MLflow. "
+            "A run whose folder is elsewhere is given by MLflow's id.",
+        )
+        run = parser.add_argument("run", metavar="RUN", help="as for the other commands")
+        run.completer = complete_runs  # type: ignore[attr-defined]
+        parser.add_argument("values", nargs="+" if name == "tag" else 1, metavar=value)
+        if name != "tag":
+            add_overrides(parser, where)
+    delete = add_command(
+        actions,
+        "delete",
+        _delete,
+        help="delete runs and mark them as deleted in MLflow",
+        description="Delete the folders of runs in runs_dir, and mark the runs as deleted in MLflow, after a question. "
+        "Runs in progress stay, and so do those that a clone or a registered model needs.",
+    )
+    add_run(delete, where, many=True)
+    delete.add_argument("--yes", action="store_true", help="do not ask")
+
+
+def _send(args: argparse.Namespace) -> int:
+    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.tracking.delivery import deliver, is_delivered, undelivered
+    from deepracer_exp.tracking.store import resolve_store
+    from deepracer_exp.tracking.tracking_file import read_tracked_run
+
+    runs, overrides = runs_and_overrides(args)
+    stores = read_stores(overrides)
+    store = resolve_store(stores.uri, stores.runs_dir)
+    named = [resolve(run, stores.runs_dir, stores.uri).path for run in runs]
+    for folder in named:
+        recorded = read_tracked_run(folder / TRACKING).store
+        # What a run names as its store may be a stranger's, who would be given this user's password.
+        if stores.uri is None and recorded != store.shown:
+            raise BadInput(f"{folder}: was recorded in {recorded}; give tracking.uri={recorded}")
+    everything = undelivered(run_folders(stores.runs_dir)).items()
+    folders = named or [folder for folder, recorded in everything if recorded == store.shown]
+    for folder in dict.fromkeys(folders):
+        if is_delivered(folder, stores.uri, stores.runs_dir):
+            print(f"{folder.name}: MLflow has everything")
+            continue
+        points = deliver(folder, stores.uri, stores.runs_dir)
+        print(f"{folder.name}: sent, with {count(points, 'metric point')} that MLflow lacked")
+    if not folders:
+        print(f"MLflow ({store.shown}) has everything of the ended runs in {stores.runs_dir}")
+    return 0
+
+
+@dataclass(frozen=True)
+class _Target:
+    """A run that is labelled: its folder, its run in MLflow, or both."""
+
+    name: str
+    folder: Path | None
+    run_id: str | None
+    stores: Stores
+
+    def labels(self) -> "Labels":
+        from deepracer_exp.runs.labels import Labels, read_labels
+        from deepracer_exp.tracking.delivery import recorded_labels
+
+        if self.folder is not None:
+            return read_labels(self.folder)
+        return (
+            recorded_labels(self.run_id, self.stores.uri, self.stores.runs_dir) if self.run_id else Labels()
+        )
+
+    def write(self, labels: "Labels") -> None:
+        """Write labels into the folder and into MLflow; if that lacks them, say so."""
+        from deepracer_exp.runs.labels import write_labels
+        from deepracer_exp.tracking.delivery import deliver_labels
+        from deepracer_exp.tracking.store import has_store, resolve_store
+        from deepracer_exp.tracking.tracking_file import TrackingFile, read_tracked_run
+
+        if self.folder is not None:
+            write_labels(self.folder, labels)
+        store = resolve_store(self.stores.uri, self.stores.runs_dir)
+        if self.run_id is None or not has_store(self.stores.uri, self.stores.runs_dir):
+            return
+        if self.folder is not None and read_tracked_run(self.folder / TRACKING).store != store.shown:
+            return  # a store that was not asked for
+        try:
+            deliver_labels(self.run_id, labels, self.stores.uri, self.stores.runs_dir)
+        except BadInput as error:
+            if self.folder is None:
+                raise
+            TrackingFile.read(self.folder / TRACKING, store.shown).change(complete=False)
+            print(f"warning: {error}\n  send it later: deepracer-exp runs send {self.name}", file=sys.stderr)
+
+
+def _target(name: str, stores: Stores) -> _Target:
+    from deepracer_exp.runs.files import read_run_id
+    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.tracking.store import is_run_id
+
+    try:
+        folder = resolve(name, stores.runs_dir, stores.uri).path
+    except BadInput:
+        if not is_run_id(name):
+            raise
+        return _Target(name, None, name, stores)  # its folder is on another machine
+    return _Target(name, folder, read_run_id(folder), stores)
+
+
+def _rename(args: argparse.Namespace) -> int:
+    from deepracer_exp.config.experiment import safe_name
+
+    target = _target(args.run, read_stores(args.overrides))
+    (name,) = args.values
+    try:
+        safe_name(name)
+    except ValueError as error:
+        raise BadInput(f"{name}: {error}") from None
+    others = [folder for folder in run_folders(target.stores.runs_dir) if folder != target.folder]
+    from deepracer_exp.runs.labels import read_labels
+
+    if any(name in (folder.name, read_labels(folder).name) for folder in others):
+        raise BadInput(f"{name}: another run in {target.stores.runs_dir} has this name")
+    target.write(replace(target.labels(), name=name))
+    return 0
+
+
+def _note(args: argparse.Namespace) -> int:
+    from deepracer_exp.runs.labels import check_label
+
+    target = _target(args.run, read_stores(args.overrides))
+    (note,) = args.values
+    target.write(replace(target.labels(), note=check_label("TEXT", note) or None))
+    return 0
+
+
+def _tag(args: argparse.Namespace) -> int:
+    from deepracer_exp.runs.labels import check_tag
+
+    words = [word for word in args.values if word.partition("=")[0] not in STORES]
+    stores = read_stores(word for word in args.values if word not in words)
+    changes = dict(check_tag(word) for word in words)
+    if not changes:
+        raise BadInput("KEY=VALUE: missing; write deepracer-exp runs tag RUN KEY=VALUE")
+    target = _target(args.run, stores)
+    labels = target.labels()
+    tags = {key: value for key, value in (labels.tags | changes).items() if value}
+    target.write(replace(labels, tags=tags))
+    return 0
+
+
+def _delete(args: argparse.Namespace) -> int:
+    from rich.filesize import decimal
+
+    from deepracer_exp.runs.clean import deletable, remove, total
+    from deepracer_exp.runs.files import read_run_id
+    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.tracking.delivery import mark_deleted
+
+    runs, overrides = runs_and_overrides(args)
+    stores = read_stores(overrides)
+    if not runs:
+        raise BadInput("RUN: missing; write deepracer-exp runs delete RUN")
+    folders = dict.fromkeys(resolve(run, stores.runs_dir, stores.uri).path for run in runs)
+    items = [deletable(folder, stores.runs_dir) for folder in folders]
+    for item in items:
+        print(f"{decimal(item.size):>10}  {item.run}")
+    if not args.yes:
+        if not sys.stdin.isatty():
+            raise BadInput(
+                f"{count(len(items), 'run')}: nothing was deleted; give --yes to delete without a question"
+            )
+        print(f"delete {count(len(items), 'run')}, {decimal(total(items))}? [y/N] ", end="", flush=True)
+        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            print("nothing was deleted")
+            return 0
+    for item in items:
+        run_id = read_run_id(item.run)
+        if run_id is not None:
+            mark_deleted(item.run, run_id, stores.uri, stores.runs_dir)
+        if not remove(item):
+            raise BadInput(f"{item.run}: a training or a clone has started meanwhile; it was not deleted")
+    print(f"deleted {count(len(items), 'run')}")
+    return 0

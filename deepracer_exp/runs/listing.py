@@ -1,0 +1,55 @@
+"""The runs of a folder as rows: what `deepracer-exp runs` lists."""
+
+import datetime
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.errors import BadInput
+
+from .files import CONFIG, PROVENANCE, SUMMARY, read_object, read_run_id, run_folders
+from .labels import read_labels
+
+COLUMNS = ("run", "name", "state", "score_s", "laps", "best_lap_s", "began", "user", "host", "note", "id")
+"""Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `score_s` the
+race score of the best checkpoint and `best_lap_s` the fastest exploring lap, both in seconds."""
+
+TAG = "tag."
+"""Beginning of the columns of tags."""
+
+Row = dict[str, Any]
+
+
+def rows_of_folder(runs_dir: Path, is_held: Callable[[Path], bool]) -> list[Row]:
+    """Return a row for each run of a folder, the newest first; `is_held` says whether a run is in progress."""
+    rows = [_of_folder(folder, is_held) for folder in run_folders(runs_dir)]
+    return sorted(rows, key=lambda row: (row["began"], row["run"]), reverse=True)
+
+
+def _of_folder(folder: Path, is_held: Callable[[Path], bool]) -> Row:
+    row: Row = dict.fromkeys(COLUMNS)
+    row |= {"run": f"{folder.parent.name}/{folder.name}", "began": iso_time(_began_s(folder))}
+    try:
+        summary, labels = read_object(folder / SUMMARY), read_labels(folder)
+        row["id"] = read_run_id(folder)
+        machine = read_object(folder / PROVENANCE).get("machine") or {}
+    except BadInput:  # one damaged run does not hide the others
+        return row | {"state": "unreadable"}
+    row["state"] = str(summary.get("status") or ("running" if is_held(folder) else "killed"))
+    row |= {"score_s": (summary.get("best") or {}).get("eval_race_score_s"), "laps": summary.get("laps")}
+    row |= {"best_lap_s": summary.get("best_lap_time_s"), "name": labels.name, "note": labels.note}
+    row |= {key: machine.get(key) for key in ("user", "host")}
+    return row | {f"{TAG}{key}": value for key, value in labels.tags.items()}
+
+
+def _began_s(folder: Path) -> float:
+    """Return when a run began, Unix time: its folder's name says so, unless it was renamed."""
+    try:
+        return datetime.datetime.strptime(folder.name[: len("20260101-120000")], "%Y%m%d-%H%M%S").timestamp()
+    except ValueError:
+        return (folder / CONFIG).stat().st_mtime
+
+
+def iso_time(seconds: float) -> str:
+    """Return a Unix time as an ISO time of UTC, which sorts as a text."""
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="seconds")

@@ -1,0 +1,56 @@
+"""The runs of an MLflow store as rows: what `deepracer-exp runs tracking.uri=URI` lists."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.runs.listing import Row, iso_time
+
+from .calls import pages
+from .metadata import END_TAG, HOST, NAME, USER_NOTE, USER_TAG
+from .metrics import BEST, METRICS
+from .store import open_client
+from .study_run import KIND
+
+_STORE_S = 300.0
+_ENDED = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "killed", "RUNNING": "running"}
+
+
+def rows_of_store(uri: str, runs_dir: Path) -> list[Row]:
+    """Return a row for each run of a store as of `open_client`, the newest first, without those that group others.
+
+    Raises:
+        BadInput: the store does not answer.
+    """
+    with open_client("runs", uri, runs_dir, _STORE_S) as client:
+        names = {one.experiment_id: one.name for one in pages(client.search_experiments)}
+        found = list(pages(client.search_runs, experiment_ids=list(names)))
+    rows = [_of_store(run, names[run.info.experiment_id]) for run in found if KIND not in run.data.tags]
+    return sorted(rows, key=lambda row: (row["began"], row["run"]), reverse=True)
+
+
+def _of_store(run: Any, experiment: str) -> Row:
+    tags: Mapping[str, str] = run.data.tags
+    metrics: Mapping[str, float] = run.data.metrics
+    state = tags.get(END_TAG, "").partition(":")[0] or _ENDED.get(run.info.status, run.info.status)
+    folder = Path(tags.get("run_dir", run.info.run_id)).name
+    row = {
+        "run": f"{experiment}/{folder}",
+        "name": tags.get(NAME),
+        "state": state,
+        "score_s": metrics.get(f"{BEST}score_s"),
+        "laps": metrics.get(METRICS["laps"][0]),
+        "best_lap_s": metrics.get(METRICS["best_lap_time_s"][0]),
+        "began": iso_time(run.info.start_time / 1000),
+        "user": tags.get("mlflow.user"),
+        "host": tags.get(HOST),
+        "note": tags.get(USER_NOTE),
+        "id": run.info.run_id,
+        **{key: value for key, value in tags.items() if key.startswith(USER_TAG)},
+    }
+    # Anyone can write tags on a server; control characters would reach the terminal.
+    return {_printable(key): _printable(value) for key, value in row.items()}
+
+
+def _printable(value: Any) -> Any:
+    return "".join(one if one.isprintable() else " " for one in value) if isinstance(value, str) else value
