@@ -15,11 +15,12 @@ from deepracer_exp.config.experiment import Experiment, safe_name
 from deepracer_exp.config.stored import config_differences
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.tracking.registry import Registered, is_alias, look_up
+from deepracer_exp.tracking.registry import Registered, fetch, is_alias, look_up, place_of
 from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
 from .checkpoint_files import LINKS, checkpoint_sha256, restore_links, verify
 from .files import BEST, BEST_OF_SWEEP, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
+from .labels import read_labels
 from .result import RunResult, read_result
 
 logger = logging.getLogger("deepracer_exp")
@@ -94,10 +95,11 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     if is_run_id(run):
         return StoredRun(_present(run, folder_of(run, tracking_uri, runs_dir), runs_dir))
     if "@" in run and "/" not in run:
-        return _of_registered(run, look_up(run, tracking_uri, runs_dir), runs_dir)
+        return _of_registered(run, look_up(run, tracking_uri, runs_dir), runs_dir, tracking_uri)
     folders = run_folders(runs_dir)
     matches = [folder for folder in folders if folder.name == run]
     matches = matches or [folder for folder in folders if folder.name.startswith(run)]
+    matches = matches or [folder for folder in folders if read_labels(folder).name == run]
     if len(matches) == 1:
         return StoredRun(matches[0])
     if matches:
@@ -114,7 +116,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
         registered = look_up(run, tracking_uri, runs_dir)
     except BadInput as error:
         raise BadInput(f"{unknown}; {str(error).removeprefix(f'{run}: ')}") from None
-    return _of_registered(run, registered, runs_dir)
+    return _of_registered(run, registered, runs_dir, tracking_uri)
 
 
 def best_of(experiment: str, runs_dir: Path) -> Path:
@@ -245,12 +247,14 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:59]}…"
 
 
-def _of_registered(run: str, found: Registered, runs_dir: Path) -> StoredRun:
-    """Return the run of a registered checkpoint, which must be as it was."""
-    path = _present(run, found.run_dir, runs_dir)
+def _of_registered(run: str, found: Registered, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
+    """Return the run of a registered checkpoint, which must be as it was; it is downloaded where it is not."""
+    places = found.run_dir, place_of(found.run_dir, runs_dir)
+    path = next((one for one in places if (one / CHECKPOINTS / found.checkpoint).is_dir()), None)
+    if path is None:
+        path = fetch(found, tracking_uri, runs_dir)
+        logger.warning("%s was downloaded from MLflow to %s", found, path)
     checkpoint = path / CHECKPOINTS / found.checkpoint
-    if not checkpoint.is_dir():
-        raise BadInput(f"{run}: {found} is {checkpoint}, which is gone; promote another checkpoint")
     verify(checkpoint)
     if checkpoint_sha256(checkpoint) != found.sha256:
         raise BadInput(

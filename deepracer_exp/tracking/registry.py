@@ -18,9 +18,10 @@ from deepracer_exp.runs.clean import StoreOverview
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, read_metrics, read_run_id
 
 from .calls import pages
+from .download import Download, download
 from .metadata import picture, race_result
 from .metrics import metric_names
-from .store import existing_store, has_store, open_client
+from .store import client_of, existing_store, has_store, open_client
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -43,6 +44,9 @@ class Registered:
     """Name of its folder."""
     sha256: str
     """Hash of the checkpoint."""
+    model_id: str
+    """Of the logged model that has the checkpoint's files."""
+    run_id: str
 
     def __str__(self) -> str:
         return f"{self.model}@{self.alias}"
@@ -277,4 +281,42 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
         raise BadInput(
             f"{what}: version {version.version} of {version.name} was not registered by deepracer-exp runs promote"
         )
-    return Registered(version.name, alias, str(version.version), Path(run_dir), checkpoint, sha256)
+    model_id = str(version.source).removeprefix("models:/")
+    return Registered(
+        version.name, alias, str(version.version), Path(run_dir), checkpoint, sha256, model_id, version.run_id
+    )
+
+
+def place_of(run_dir: Path, runs_dir: Path) -> Path:
+    """Return where in `runs_dir` a run belongs whose folder was elsewhere.
+
+    Raises:
+        BadInput: its name or that of its experiment is not one that a training gives.
+    """
+    for name in (run_dir.parent.name, run_dir.name):
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+            raise BadInput(f"{run_dir}: {name!r} is not the name of a run or an experiment")
+    return runs_dir / run_dir.parent.name / run_dir.name
+
+
+def fetch(registered: Registered, uri: str | None, runs_dir: Path) -> Path:
+    """Download a registered checkpoint with its run from a store as of `open_client`; return the run's folder.
+
+    The folder is where it would be if the run had been trained in `runs_dir`.
+
+    Raises:
+        BadInput: a name cannot be one of a run, or `download` fails.
+    """
+    store = existing_store(uri, runs_dir)
+    client_of(store)  # leaves user and password in the environment, which the download inherits
+    target = place_of(registered.run_dir, runs_dir)
+    wanted = Download(
+        uri=store.uri,
+        model_id=registered.model_id,
+        run_id=registered.run_id,
+        checkpoint=registered.checkpoint,
+        sha256=registered.sha256,
+        with_run=not target.exists(),
+    )
+    download(str(registered), wanted, store, target)
+    return target
