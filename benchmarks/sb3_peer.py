@@ -27,7 +27,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from deepracer_exp.collectors.base import worker_count
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, MLPConfig
@@ -107,7 +106,7 @@ def build(experiment: Experiment, physics_threads: int, car_racing: bool = False
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
     assert algorithm.frames_per_iteration is not None
-    n_cars = max(1, worker_count(experiment.collector)) * experiment.collector.cars
+    n_cars = experiment.collector.cars
     layers: dict[str, Any]
     if isinstance(network, MLPConfig):
         sizes = {key: list(network.hidden) for key in ("pi", "vf")}

@@ -11,7 +11,7 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
   experiment's without its `reward_batch`), episodes begun again as they end.
 - `all_tracks_over_one_env` (a ratio): the same on eighteen tracks at once, over the figure on one track.
 - `collect_steps_per_s`: batches of an iteration's frames through `LocalCollector` in sync mode with 1 and 2 worker
-  processes, the experiment's cars per process, its network sampling actions with its first weights.
+  processes, the experiment's cars, its network sampling actions with its first weights.
 - `train_steps_per_s`: `deepracer-exp train` as a process of its own without MLflow: collection, update, trace, metrics,
   checkpoints. Start-up and the first iteration are left out: env_steps over wall_clock_s between the first and the
   last line of metrics.jsonl.

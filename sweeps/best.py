@@ -59,8 +59,9 @@ def best_shown(study: optuna.Study) -> str:
 
 
 def best_line(study: optuna.Study) -> str:
-    """Return the command that trains with the winning values, quoted for a shell."""
-    overrides = [str(override) for override in best_trial(study).user_attrs.get("overrides", ())]
+    """Return the command that repeats the winner's training, quoted for a shell."""
+    attrs = best_trial(study).user_attrs
+    overrides = [str(override) for key in ("overrides", "where") for override in attrs.get(key, ())]
     if parent := study.user_attrs.get("parent_run"):
         run, *checkpoint = parent
         return shlex.join(["deepracer-exp", "clone", run.removeprefix("run="), *checkpoint, *overrides])

@@ -10,7 +10,7 @@ from optuna.storages import RDBStorage
 from optuna.study import Study, StudyDirection
 
 from deepracer_exp.addresses import redact
-from deepracer_exp.config.overrides import group_of
+from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
 
@@ -140,15 +140,19 @@ def open_study(
 
 def _differences(stored: dict[str, object], wanted: dict[str, object]) -> list[str]:
     found = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
-    # The collector that a worker runs a trial with does not change the trial.
     before, now = (
-        [line for line in one if group_of(line) != "collector"] if isinstance(one, list) else []
+        [line for line in one if not _says_where(line)] if isinstance(one, list) else []
         for one in (stored.get("base"), wanted["base"])
     )
     if before != now:
         gone, new = [one for one in before if one not in now], [one for one in now if one not in before]
         found.append(f"every trial: {' '.join(gone) or 'nothing'} -> {' '.join(new) or 'nothing'}")
     return found
+
+
+def _says_where(override: str) -> bool:
+    """Return whether an override only says in which processes a trial's cars drive, which does not change the trial."""
+    return group_of(override) == "collector" and key_of(override) != "collector.cars"
 
 
 def _known(request: SweepRequest, must_exist: bool) -> Study | None:

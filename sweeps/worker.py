@@ -331,11 +331,18 @@ class TrialRun(Callback):
 
     def _trained(self, index: int, overrides: Sequence[str]) -> TrainResult:
         own = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
-        # How a worker runs what was drawn is no part of the trial, and left out of the command that repeats it.
+        # Where a trial's cars drive is no part of it, and left out of the command that repeats it.
         given = {key_of(override) for override in overrides}
-        usual = ("collector=in_process", f"collector.threads={self._config.cores}", "report=false")
-        own += [override for override in usual if key_of(override) not in given]
+        where: list[str] = []
+        if not given & {"collector", "collector.mode", "collector.processes"}:
+            where = ["collector.mode=in_process", "collector.processes=null"]
+        if "collector.threads" not in given:
+            where.append(f"collector.threads={self._config.cores}")
+        own += where if "report" in given else [*where, "report=false"]
         experiment, composition, start = self._composed(own)
+        if experiment.observation.camera is not None:
+            # Several threads update such networks, and the last digits depend on how many.
+            self._patiently(lambda: self._trial.set_user_attr("where", where))
         if index:
             experiment, composition, start = self._composed([*own, f"seed={experiment.seed + index}"])
         title, tags = self._title_and_tags()

@@ -78,7 +78,14 @@ class Collector(ABC):
 
 def worker_count(config: CollectorConfig) -> int:
     """Return the number of worker processes, 0 for collection in this process."""
-    return 0 if config.mode == "in_process" else config.processes or cores()
+    if config.mode == "in_process":
+        return 0
+    return config.processes or max(n for n in config.accepted_processes if n <= cores())
+
+
+def cars_per_process(config: CollectorConfig) -> int:
+    """Return how many of the cars drive in each process."""
+    return config.cars // max(1, worker_count(config))
 
 
 def by_worker(states: Iterable[Any]) -> dict[str, Any]:

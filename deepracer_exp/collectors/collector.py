@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +24,8 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs.crash_dump import read_crash_dump
 from deepracer_exp.runs.files import HEARTBEAT
 
-from .base import Collector, by_worker, states_of, worker_count
+from .base import Collector, by_worker, cars_per_process, states_of, worker_count
+from .sampling import SamplingPolicy
 from .watchdog import Watchdog
 from .worker import EnvFactory
 
@@ -50,6 +51,7 @@ class LocalCollector(Collector):
 
         `frames_per_batch` is in control steps over all cars, and is rounded up to whole steps of all cars.
         """
+        policy = SamplingPolicy(policy)
         self._workers = worker_count(config)
         self._mode = config.mode
         self.time_dim = 0 if config.mode == "async" else 1
@@ -59,22 +61,21 @@ class LocalCollector(Collector):
         self._begun_from = state or {}
         states = states_of(self._begun_from, 0 if config.mode == "async" else max(1, self._workers))
         self._watchdog: Watchdog | None = None
-        parts = self._workers if config.mode == "sync" else 1
-        steps_per_batch = -(-frames_per_batch // (parts * config.cars))
-        factory = functools.partial(EnvFactory, setup=setup, n_cars=config.cars, run_dir=run_dir)
+        cars = cars_per_process(config)
+        together = config.cars if config.mode == "sync" else cars
+        steps_per_batch = -(-frames_per_batch // together)
+        factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir)
         options: dict[str, Any] = {
-            "frames_per_batch": steps_per_batch * parts * config.cars,
+            "frames_per_batch": steps_per_batch * together,
             "total_frames": -1,
             "use_buffers": True,
             "trust_policy": True,
         }
         if self._workers == 0:
-            self._random = torch.get_rng_state()
-            with self._own_stream():
-                env = factory(worker=0, threads=config.threads)
-                self._collector: Any = TorchRLCollector(
-                    env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
-                )
+            env = factory(worker=0, threads=config.threads)
+            self._collector: Any = TorchRLCollector(
+                env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
+            )
         else:
             heartbeat = run_dir / HEARTBEAT
             self._watchdog = Watchdog(
@@ -116,8 +117,7 @@ class LocalCollector(Collector):
         if not self._batches:
             return dict(self._begun_from)
         if self._watchdog is None:
-            with self._own_stream():
-                return by_worker([self._collector.env.take_state()])
+            return by_worker([self._collector.env.take_state()])
         states = self._ask(
             lambda: self._collector.map_fn("env.take_state"),
             lambda: "a collector worker did not report the state of its cars",
@@ -179,14 +179,10 @@ class LocalCollector(Collector):
         self._weights.shutdown()
 
     def _restore_cars(self, states: Sequence[Any]) -> None:
-        """Restore each worker's cars from its state.
-
-        TorchRL calls the policy once while it starts, which draws a random number, so this comes after that.
-        """
+        """Restore each worker's cars from its state."""
         if self._watchdog is None:
-            with self._own_stream():
-                self._collector.env.put_state(states[0])
-                self._collector.reset()
+            self._collector.env.put_state(states[0])
+            self._collector.reset()
             return
 
         def put() -> None:
@@ -194,14 +190,6 @@ class LocalCollector(Collector):
             self._collector.map_fn("reset")
 
         self._ask(put, lambda: "a collector worker did not restore its cars")
-
-    @contextlib.contextmanager
-    def _own_stream(self) -> Iterator[None]:
-        """Sample from the random stream of the cars in this process, which no other draw here may shift."""
-        with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(self._random)
-            yield
-            self._random = torch.get_rng_state()
 
     def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
         """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead.
@@ -246,8 +234,7 @@ class LocalCollector(Collector):
         """Return the next batch."""
         self._batches += 1
         if self._watchdog is None:
-            with self._own_stream():
-                return next(self._source)
+            return next(self._source)
         self._watchdog.expect()
         try:
             batch = next(self._source)
@@ -341,8 +328,7 @@ def open_collector(
 
 def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:
     """Return the control steps, over all cars, to ask of a collector at a time."""
-    workers = max(1, worker_count(config))
     frames = algorithm.frames_per_iteration
     if frames is None:
-        return workers * config.cars * _CHUNK_STEPS
-    return -(-frames // workers) if config.mode == "async" else frames
+        return config.cars * _CHUNK_STEPS
+    return -(-frames // worker_count(config)) if config.mode == "async" else frames

@@ -21,7 +21,8 @@ from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import REWARD_PRINTS
 
 from . import ray_cluster
-from .base import Collector, by_worker, states_of
+from .base import Collector, by_worker, cars_per_process, states_of
+from .sampling import SamplingPolicy
 from .worker import EnvFactory
 
 _LOOK_EVERY_S = 0.2
@@ -152,7 +153,7 @@ class RayCollector(Collector):
         import ray
 
         assert config.processes is not None
-        self._ray, self._policy, self._run_dir = ray, policy, run_dir
+        self._ray, self._policy, self._run_dir = ray, SamplingPolicy(policy), run_dir
         self._prints = RewardPrints(run_dir / REWARD_PRINTS)
         self._hang_timeout_s = config.hang_timeout_s
         self._begun_from = state or {}
@@ -173,10 +174,11 @@ class RayCollector(Collector):
     def _start(
         self, config: CollectorConfig, setup: RaceSetup, frames_per_batch: int, states: Sequence[Any]
     ) -> None:
-        frames = -(-frames_per_batch // (len(self._cars) * config.cars)) * config.cars
+        cars = cars_per_process(config)
+        frames = -(-frames_per_batch // config.cars) * cars
         threads = config.threads or 1
         factories = [
-            EnvFactory(setup=setup, worker=worker, n_cars=config.cars, threads=threads, run_dir=self._run_dir)
+            EnvFactory(setup=setup, worker=worker, n_cars=cars, threads=threads, run_dir=self._run_dir)
             for worker in range(len(self._cars))
         ]
         policy = self._ray.put(self._policy)

@@ -10,15 +10,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
+from torchrl.data import Unbounded
 
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.env.randomization import CarStreams, Purpose, StepNoise
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import REWARD_PRINTS
+
+from .sampling import NOISE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,8 +53,6 @@ class EnvFactory:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             end_with_owner()
-        # Each worker samples actions from a random stream of its own.
-        torch.manual_seed(int(np.random.SeedSequence([self.setup.seed, self.worker]).generate_state(1)[0]))
         race = Race(
             self.setup,
             self.n_cars,
@@ -75,7 +78,7 @@ class EnvFactory:
 
 
 class _StateKeepingEnv(RaceEnv):
-    """A RaceEnv whose state can be taken and restored, and whose errors carry the cars' state."""
+    """A RaceEnv for `SamplingPolicy`, whose state can be taken and restored, and whose errors carry the cars' state."""
 
     def __init__(
         self,
@@ -85,17 +88,31 @@ class _StateKeepingEnv(RaceEnv):
     ):
         super().__init__(race, on_step)
         self._on_failure = on_failure
+        width = 2 if race.setup.actions.n is None else 1
+        streams = CarStreams(race.setup.seed, race.cars.tolist(), Purpose.POLICY)
+        self._noise = StepNoise(streams, race.n_cars, width)
+        self._draw()
+        self.observation_spec[NOISE] = Unbounded((race.n_cars, width), dtype=torch.float64)
 
     def take_state(self) -> dict[str, Any]:
-        """Return the state of the cars and of the process's random stream, from which actions are sampled."""
-        return {"race": self.race.state_dict(), "random": torch.get_rng_state().numpy()}
+        """Return the state of the cars, and how many actions each has drawn numbers for."""
+        return {"race": self.race.state_dict(), "drawn": self._noise.steps}
 
     def put_state(self, state: Mapping[str, Any]) -> None:
         """Continue from what `take_state` returned; the reset that follows leaves the cars there and draws nothing."""
         self.resume_from(state["race"])
-        torch.set_rng_state(torch.from_numpy(state["random"]))
+        self._noise.steps = state["drawn"] - 1
+        self._draw()
 
-    def _step(self, tensordict):  # type: ignore[no-untyped-def]
+    def _draw(self) -> None:
+        # A copy: the next block of numbers is written over this one.
+        self._drawn = torch.from_numpy(self._noise.normal().copy())
+
+    def _seen(self) -> dict[str, torch.Tensor]:
+        return {**super()._seen(), NOISE: self._drawn}
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._draw()
         try:
             return super()._step(tensordict)
         except RunFailed as error:

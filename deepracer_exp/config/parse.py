@@ -85,6 +85,13 @@ def _check_combinations(experiment: Experiment) -> None:
             f"collector.processes={collector.processes} with collector.mode=in_process: "
             "choose collector=sync or collector=async for several processes"
         )
+    accepted = collector.accepted_processes
+    if collector.processes not in (None, *accepted):
+        near = sorted(sorted(accepted, key=lambda n: abs(n - (collector.processes or 1)))[:3])
+        raise BadInput(
+            f"collector.processes={collector.processes} with collector.cars={collector.cars}: every process has as "
+            f"many cars as the others, at least 4; accepted: {', '.join(map(str, near))}"
+        )
     if collector.mode == "ray" and collector.processes is None:
         raise BadInput(
             "collector.processes=null with collector=ray: the size of a cluster changes; give the number of processes"
@@ -104,11 +111,10 @@ def _check_combinations(experiment: Experiment) -> None:
     for name, track in experiment.tracks.items():
         key = f"track.{name}" if isinstance(experiment.track, dict) else "track"
         _check_shape(key, track)
-    cars = collector.cars * (collector.processes or 1)
-    if cars < len(experiment.tracks):
+    if collector.cars < len(experiment.tracks):
         raise BadInput(
             f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted: "
-            f"at least {-(-len(experiment.tracks) // (collector.processes or 1))}"
+            f"at least {len(experiment.tracks)}"
         )
 
 

@@ -11,6 +11,7 @@ from .own_class import OURS_OR_OWN, OwnClass
 Newest = Annotated[int, Field(ge=1, le=100_000)]
 Percent = Annotated[int, Field(ge=1, le=100)]
 EnvironmentVariable = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+_FEWEST_CARS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +21,9 @@ class CollectorConfig:
     mode: Literal["in_process", "sync", "async", "ray"]
     """In this process; in several processes that wait for each other, or do not; like sync, on a Ray cluster."""
     processes: UpTo1000 | None
-    """Worker processes; null: one per core (not with `ray`)."""
-    cars: Annotated[int, Field(ge=1, le=10_000)]
-    """Cars per process, simulated together."""
+    """Worker processes; null: one per core, as far as the cars can be dealt out evenly (not with `ray`)."""
+    cars: Annotated[int, Field(ge=1, le=100_000)]
+    """Cars of all processes together."""
     threads: Annotated[int, Field(ge=0, le=1024)]
     """Physics threads per process (0: in_process one per core, else one)."""
     hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
@@ -32,6 +33,14 @@ class CollectorConfig:
     def forks(self) -> bool:
         """Whether the training starts worker processes on its own machine."""
         return self.mode in ("sync", "async")
+
+    @property
+    def accepted_processes(self) -> list[int]:
+        """Numbers of processes over which the cars can be spread: evenly, at least four in each.
+
+        For fewer than four rows a matrix product may have other last digits, and a run would depend on the processes.
+        """
+        return [1, *(n for n in range(2, self.cars // _FEWEST_CARS + 1) if self.cars % n == 0)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,7 @@ class Purpose(IntEnum):
     PICTURE = 3
     LIDAR = 4
     LENS = 5
+    POLICY = 6
 
 
 class CarStreams:

@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
-from deepracer_exp.collectors.base import Collector, worker_count
+from deepracer_exp.collectors.base import Collector
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.trace import to_table
@@ -167,9 +167,8 @@ class Trainer:
         self.checkpoints = CheckpointStore(folder.path, kept.keep, kept.every)
         self.budget = Budget(experiment.budget, folder.path)
         collector = experiment.collector
-        cars = max(1, worker_count(collector)) * collector.cars
         self.metrics = RunMetrics(
-            track_names(setup), cars, experiment.car.control_period_s, experiment.stopping
+            track_names(setup), collector.cars, experiment.car.control_period_s, experiment.stopping
         )
         self._trace = TraceWriter(folder.path / TRACE)
         # More threads do not speed up networks of features, and on a busy machine they wait for one another: an

@@ -70,7 +70,7 @@ def driver_of(tmp_path: Path) -> Iterator[Callable[..., Driver]]:
     """Have the cars of experiment=tiny driven, so many steps a batch."""
     made = []
 
-    def make(*overrides: str, frames: int = 6 * 20) -> Driver:
+    def make(*overrides: str, frames: int = 8 * 20) -> Driver:
         made.append(Driver(tmp_path, *overrides, frames=frames))
         return made[-1]
 

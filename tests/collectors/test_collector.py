@@ -15,7 +15,7 @@ from deepracer_exp.sim.batch import cores
 
 pytestmark = pytest.mark.usefixtures("workers_start_early")
 
-FEW = "collector.cars=4"
+FEW = "collector.cars=8"
 
 
 @pytest.fixture
@@ -28,14 +28,18 @@ def test_processes_are_as_many_as_asked_for_or_as_there_are_cores():
         return worker_count(compose_experiment(overrides)[0].collector)
 
     assert count("collector=in_process") == 0
-    assert count("collector=sync") == count("collector=async") == cores() >= 1
-    assert count("collector=sync", "collector.processes=3") == 3
+    assert 1 <= count("collector=sync") == count("collector=async") <= cores()
+    assert count("collector=sync", "collector.processes=4") == 4
+    for cars in range(1, 60):
+        processes = count("collector=sync", f"collector.cars={cars}")
+        assert cars % processes == 0
+        assert processes == 1 or cars // processes >= 4
 
 
 @pytest.mark.parametrize(
     ("overrides", "shape"),
     [
-        (("collector=in_process",), (4, 16)),
+        (("collector=in_process",), (8, 8)),
         (("collector=sync", "collector.processes=2"), (8, 8)),
         (("collector=async", "collector.processes=2"), (4, 16)),
     ],

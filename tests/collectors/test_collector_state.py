@@ -11,9 +11,9 @@ from deepracer_exp.runs.checkpoints import State
 
 pytestmark = pytest.mark.usefixtures("workers_start_early")
 
-IN_PROCESS = ("collector=in_process", "collector.cars=6")
-SYNC = ("collector=sync", "collector.processes=2", "collector.cars=3")
-ONE = ("collector=sync", "collector.processes=1", "collector.cars=6")
+IN_PROCESS = ("collector=in_process", "collector.cars=8")
+SYNC = ("collector=sync", "collector.processes=2", "collector.cars=8")
+ONE = ("collector=sync", "collector.processes=1", "collector.cars=8")
 EVERYTHING = (
     *("track=[reinvent_carpet,Oval_track]", "track.direction=alternate", "randomization=sim2real"),
     # Cars are in the middle of a later episode when the state is taken.
@@ -35,6 +35,26 @@ def assert_same(batches, expected) -> None:
         for key, values in wanted.items(True, True):
             # NaN stands for a missing value in columns of the trace.
             assert torch.equal(batch[key].nan_to_num(7.0), values.nan_to_num(7.0)), key
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [("action_space=continuous", "observation=lidar"), EVERYTHING],
+    ids=["continuous", "everything"],
+)
+def test_batches_do_not_depend_on_how_the_cars_are_spread_over_processes(driver_of, overrides):
+    def batches(*where):
+        driver = driver_of("collector.cars=16", *where, *overrides, frames=16 * 40)
+        collection = driver.open()
+        try:
+            return driver.collect(collection, range(3))
+        finally:
+            collection.close()
+
+    alone = batches("collector.mode=in_process")
+    assert alone[0].batch_size == (16, 40)
+    for processes in (2, 4):
+        assert_same(batches("collector.mode=sync", f"collector.processes={processes}"), alone)
 
 
 @pytest.mark.parametrize("collector", [IN_PROCESS, SYNC], ids=["in_process", "sync"])

@@ -191,6 +191,8 @@ def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepte
             ["frames_per_iteration=None", "episodes_per_iteration=None"],
         ),
         (["collector=in_process", "collector.processes=3"], ["processes=3", "in_process"]),
+        (["collector.processes=3"], ["processes=3", "cars=256", "accepted: 1, 2, 4"]),
+        (["collector.cars=12", "collector.processes=4"], ["processes=4", "cars=12", "at least 4", "1, 2, 3"]),
         (["track.width_m=[1,2]", "track.knots=[[0,0],[1,0],[1,1]]"], ["2 values", "knots 3"]),
         (["track.width_m=0.8"], ["track.width_m without track.knots"]),
         (["track.name=moon"], ["track.name=moon: not a world"]),

@@ -126,7 +126,7 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
         (["track.2022_summit_speedway.weight=2"], "accepted with several tracks"),
         (["track.weight=abc"], 'track.weight="abc": input should be a valid number'),
         (
-            [TWO, "collector.cars=1", "collector.processes=1"],
+            [TWO, "collector.cars=1"],
             "collector.cars=1 with 2 tracks: every track needs",
         ),
     ],

@@ -195,7 +195,7 @@ def test_a_cluster_without_room_is_refused(two_nodes, run_at, tmp_path):
     more = "sweep.executor.cpus_per_worker=64"
     ended = run_at(tmp_path, *SWEEP, "sweep/executor=ray", more)
     ended.assert_bad_input("no node of the Ray cluster has that many", more)
-    ended = run_at(tmp_path, *_TINY, "collector=ray", "collector.processes=64")
+    ended = run_at(tmp_path, *_TINY, "collector=ray", "collector.cars=256", "collector.processes=64")
     ended.assert_bad_input("collector.processes=64", "has room for")
 
 

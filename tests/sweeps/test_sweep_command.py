@@ -9,7 +9,9 @@ from optuna.trial import TrialState
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_config, read_object
+from sweeps.best import best_line, best_run
 from sweeps.storage import open_storage
+from tests.training.conftest import assert_same_run, workers_start_early  # noqa: F401 - a fixture
 
 TINY = (
     *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=1"),
@@ -78,12 +80,12 @@ def test_a_trial_that_ends_is_a_line_with_what_it_drew_and_the_winner_one_that_t
     assert {key for key in config if config[key] != own[key]} <= {"collector", "name", "report", "runs_dir"}
 
 
-def test_a_trial_is_a_run_like_any_other(swept, call):
-    attrs = load(swept.cwd, "s").trials[0].user_attrs
-    ended = call("train", *attrs["overrides"], "collector=in_process")
+@pytest.mark.usefixtures("workers_start_early")
+def test_the_printed_command_repeats_the_winner_bit_for_bit(swept, call):
+    study = load(swept.cwd, "s")
+    ended = call(*shlex.split(best_line(study))[1:], "collector.processes=2")
     assert ended.code == 0, ended.stderr
-    last = read_object(swept.cwd / attrs["run_dir"] / "summary.json")["last"]
-    assert ended.summary["last"]["entropy"] == last["entropy"]
+    assert_same_run(best_run(study, swept.cwd / "runs"), ended.folder)
 
 
 @pytest.mark.slow

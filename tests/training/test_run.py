@@ -14,6 +14,8 @@ from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.training.run import run_training
 
+from .conftest import assert_same_run
+
 # Reached sooner than a lap: episodes end often.
 OVERRIDES = ("reward=speed_on_track", "episode.max_steps=60")
 HERE = "collector=in_process"
@@ -82,17 +84,17 @@ def test_another_seed_gives_another_run(trained):
 
 
 @pytest.mark.usefixtures("workers_start_early")
-def test_the_same_seed_gives_the_same_run_in_several_processes(call, tmp_path):
-    command = ("train", "experiment=tiny", "tracking=off", "collector.processes=2", *OVERRIDES)
-    runs = []
-    for name in ("first", "second"):
-        ended = call(*command, f"runs_dir={name}", "budget.env_steps=2048")
+def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tmp_path):
+    command = ("train", "experiment=tiny", "tracking=off", *OVERRIDES, "budget.env_steps=2048")
+    folders = []
+    for name, where in (("alone", "mode=in_process"), ("two", "processes=2"), ("four", "processes=4")):
+        ended = call(*command, f"name={name}", f"collector.{where}")
         assert ended.code == 0, ended.stderr
-        (folder,) = tmp_path.glob(f"{name}/tiny/*")
-        runs.append(read_metrics(folder / "metrics.jsonl"))
-        assert len(read_trace(folder / "trace", ["steps"])) == 2048
-    assert different_rows(*runs) is None
-    assert len(runs[0]) == 2
+        folders += (tmp_path / "runs" / name).iterdir()
+    for folder in folders[1:]:
+        assert_same_run(folders[0], folder)
+    assert len(read_metrics(folders[0] / "metrics.jsonl")) == 2
+    assert len(read_trace(folders[0] / "trace", ["steps"])) == 2048
 
 
 @pytest.mark.usefixtures("workers_start_early")

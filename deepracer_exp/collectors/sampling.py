@@ -1,0 +1,41 @@
+"""Actions that depend on the car and not on the process it drives in."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.distributions import Categorical, Distribution
+
+NOISE = "noise"
+"""Standard normal numbers of each car for its next action, float64: one for an index, two for steering and speed."""
+
+
+class SamplingPolicy(TensorDictModuleBase):
+    """A policy that draws each car's action from the car's own random numbers, the key `NOISE`.
+
+    Sampling from a generator of the process would make a run depend on how its cars are spread over processes. It
+    reads and writes what the policy does, and shares its parameters.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        """Wrap an `ActorCritic.policy`."""
+        super().__init__()
+        self.policy = policy
+        self.in_keys, self.out_keys = [*policy.in_keys, NOISE], policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add action, log-probability and the distribution's parameters."""
+        acted = tensordict.select(*self.policy.in_keys)
+        distribution = self.policy.get_dist(acted)
+        action = _drawn(distribution, tensordict.get(NOISE))
+        acted.set("action", action)
+        acted.set("action_log_prob", distribution.log_prob(action))
+        return tensordict.update(acted.select(*self.out_keys))
+
+
+def _drawn(distribution: Distribution, noise: Tensor) -> Tensor:
+    """Return samples for standard normal numbers, by the inverse of the distribution function."""
+    if isinstance(distribution, Categorical):
+        below = distribution.probs.cumsum(-1)[..., :-1]  # the last is 1, up to rounding
+        return (torch.special.ndtr(noise) >= below).sum(-1)
+    return distribution.mean + distribution.stddev * noise.to(distribution.mean.dtype)

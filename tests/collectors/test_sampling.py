@@ -1,0 +1,44 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Categorical
+from torchrl.modules import IndependentNormal
+
+from deepracer_exp.collectors.sampling import NOISE, SamplingPolicy, _drawn
+
+
+@pytest.fixture
+def noise():
+    return torch.randn(200_000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+def test_actions_are_drawn_as_often_as_their_probabilities_say(noise):
+    wanted = torch.tensor([0.5, 0.0, 0.3, 0.15, 0.05])
+    action = _drawn(Categorical(probs=wanted.expand(len(noise), -1)), noise[:, :1])
+    found = torch.bincount(action, minlength=5) / len(noise)
+    assert found[1] == 0
+    assert (found - wanted).abs().max() < 0.005
+
+
+def test_steering_and_speed_have_the_mean_and_deviation_of_the_policy(noise):
+    loc, scale = torch.tensor([0.25, -1.0]), torch.tensor([0.5, 0.125])
+    action = _drawn(IndependentNormal(loc.expand(len(noise), 2), scale.expand(len(noise), 2)), noise)
+    assert action.dtype == torch.float32
+    assert (action.mean(0) - loc).abs().max() < 0.005
+    assert (action.std(0) / scale - 1).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("network", ["mlp_small", "mlp_small_shared"])
+@pytest.mark.parametrize("space", ["discrete", "continuous"])
+def test_it_writes_what_the_policy_writes(driver_of, network, space):
+    policy = driver_of(f"network={network}", f"action_space={space}").policy
+    features = next(p for p in policy.parameters() if p.ndim == 2).shape[1]
+    seen = TensorDict({"observation": torch.randn(8, features)}, [8])
+    plain = policy(seen.clone())
+    noise = torch.randn(8, 1 if space == "discrete" else 2, dtype=torch.float64)
+    drawn = SamplingPolicy(policy)(seen.clone().set(NOISE, noise))
+    assert set(drawn.keys()) == {*plain.keys(), NOISE}
+    for key, values in plain.items():
+        assert (drawn[key].shape, drawn[key].dtype) == (values.shape, values.dtype), key
+    log_prob = policy.get_dist(seen.clone()).log_prob(drawn["action"])
+    assert torch.equal(drawn["action_log_prob"], log_prob)
