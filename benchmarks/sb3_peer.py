@@ -2,7 +2,7 @@
 
     python -m benchmarks.sb3_peer --iterations 20 [--physics-threads 0] [--torch-threads 1] [--car-racing] [OVERRIDE...]
 
-As many cars as the experiment has over all its processes are driven through `DeepRacerVectorEnv`, by default with one
+As many cars as the experiment has are driven through `DeepRacerVecEnv`, by default with one
 physics thread per core. Networks, batch size, epochs, frames per iteration, learning rate, discount and loss weights
 are the experiment's. The peer keeps no trace, no metrics and no checkpoints. One iteration is made before the clock
 starts; then `--iterations` are timed, collection and update, and the result is printed as one line of JSON.
@@ -18,10 +18,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -30,7 +28,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, MLPConfig
-from deepracer_exp.env.gym_env import DeepRacerVectorEnv
+from deepracer_exp.env.sb3 import DeepRacerVecEnv
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.sim.batch import cores
 
@@ -61,47 +59,6 @@ class Convolutions(BaseFeaturesExtractor):
         return features
 
 
-class SB3Cars(VecEnv):
-    """A `DeepRacerVectorEnv` behind Stable-Baselines3's interface, with as little overhead as that allows."""
-
-    def __init__(self, cars: DeepRacerVectorEnv):
-        self.cars = cars
-        self._truncated: NDArray[Any] = np.zeros(cars.num_envs, bool)
-        super().__init__(cars.num_envs, cars.single_observation_space, cars.single_action_space)
-
-    def reset(self) -> NDArray[np.float32]:
-        return self.cars.reset()[0]
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        self._actions = actions
-
-    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
-        observation, reward, terminated, truncated, infos = self.cars.step(self._actions)
-        ended = terminated | truncated
-        per_car: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for car in np.flatnonzero(ended):
-            per_car[car] = {
-                "terminal_observation": infos["final_obs"][car],
-                "TimeLimit.truncated": bool(truncated[car]),
-            }
-        return observation, reward, ended, per_car
-
-    def close(self) -> None:
-        self.cars.close()
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.cars, attr_name, None)] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise NotImplementedError
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError
-
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
-
-
 def build(experiment: Experiment, physics_threads: int, car_racing: bool = False) -> PPO:
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
@@ -122,7 +79,7 @@ def build(experiment: Experiment, physics_threads: int, car_racing: bool = False
             "CarRacing-v3", n_cars, env_kwargs={"continuous": False}, vec_env_cls=SubprocVecEnv
         )
     else:
-        cars = SB3Cars(DeepRacerVectorEnv(n_cars, threads=physics_threads, setup=build_setup(experiment)))
+        cars = DeepRacerVecEnv(n_cars, threads=physics_threads, setup=build_setup(experiment))
     return PPO(
         policy,
         cars,

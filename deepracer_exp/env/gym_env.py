@@ -24,10 +24,12 @@ from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
 from .setup import RaceSetup, build_setup, deal
+from .top_view import TopView
 
 Observed = Any
 """An array, or with two sensors a dictionary of arrays."""
 
+_METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}
 _BOUNDS = {"observation": (-np.inf, np.inf), "pixels": (0, 255), "lidar": (0, FURTHEST_M)}
 
 
@@ -37,23 +39,28 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
     Observation: the features of `Features`, float32; with a camera or a LIDAR, instead, its pictures, uint8, or
     readings, float32; with both, a dictionary of `pixels` and `lidar`. Action: an index into the action space's list,
     or steering and speed in -1..1. `info` has `progress` in per cent and `episode_status`, both of the pose before the
-    step.
+    step. `render` returns the track from above; `gymnasium.make(..., render_mode="human")` shows it in a window.
     """
 
-    def __init__(self, overrides: Sequence[str] = ()):
+    metadata = _METADATA
+
+    def __init__(self, overrides: Sequence[str] = (), render_mode: str | None = None):
         """Compose an experiment and put its car on the track.
 
         Args:
             overrides: as for `deepracer-exp train`.
+            render_mode: `rgb_array`, or None for no pictures.
 
         Raises:
-            BadInput: an override or a file it names is not accepted.
+            BadInput: an override or a file it names is not accepted, or there is no such mode.
         """
+        self.render_mode = _checked(render_mode)
         setup = build_setup(compose_experiment(overrides)[0])
         self._race = Race(setup, 1)
         self._weights = [course.weight for course in setup.courses]
         self._courses = deal(self._weights)
         self.observation_space, self.action_space = _spaces(self._race)
+        self._view = TopView(self._race)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -78,6 +85,10 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
         terminated, truncated = bool(race.terminated[0]), bool(race.truncated[0])
         return _observed(race, 0), float(race.reward[0]), terminated, truncated, info
 
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Return the track with the car from above, (height, width, 3); None without a `render_mode`."""
+        return None if self.render_mode is None else self._view.picture(0)
+
 
 class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
@@ -87,7 +98,7 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
     (objects: an observation, or None) with the mask `_final_obs`, and `final_info` with `_final_info`.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's protocol
+    metadata = {**_METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium's protocol
 
     def __init__(
         self,
@@ -95,6 +106,7 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
         overrides: Sequence[str] = (),
         threads: int = 1,
         setup: RaceSetup | None = None,
+        render_mode: str | None = None,
     ):
         """Compose an experiment and put its cars on the track.
 
@@ -103,10 +115,12 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
             overrides: as for `deepracer-exp train`.
             threads: physics threads; 0 means one per core.
             setup: the race, if it is built already; replaces `overrides`.
+            render_mode: `rgb_array`, or None for no pictures.
 
         Raises:
-            BadInput: an override or a file it names is not accepted.
+            BadInput: an override or a file it names is not accepted, or there is no such mode.
         """
+        self.render_mode = _checked(render_mode)
         setup = setup or build_setup(compose_experiment(overrides)[0])
         if num_envs < len(setup.courses):
             raise BadInput(
@@ -118,6 +132,7 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
         self.single_observation_space, self.single_action_space = _spaces(self._race)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+        self._view = TopView(self._race)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -155,6 +170,17 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
             }
             race.reset(ids)
         return _observed(race), reward, terminated, truncated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return each car on its track from above, (height, width, 3); None without a `render_mode`."""
+        return None if self.render_mode is None else tuple(map(self._view.picture, range(self.num_envs)))
+
+
+def _checked(render_mode: str | None) -> str | None:
+    accepted = _METADATA["render_modes"]
+    if render_mode not in (None, *accepted):
+        raise BadInput(f"render_mode={render_mode}: not a way to render; accepted: {', '.join(accepted)}")
+    return render_mode
 
 
 def _keys(race: Race) -> list[str]:

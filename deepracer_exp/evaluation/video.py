@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
-from shapely import get_coordinates, get_parts
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
+from deepracer_exp.tracks.picture import draw_track, extent
 from deepracer_exp.tracks.track import Track
 
 from .film import FRAMES_PER_S, Lap, in_frames, png, write_film
@@ -22,12 +22,9 @@ View = Literal["chase", "top"]
 WIDTH, HEIGHT = 960, 544
 """Multiples of 16, as video codecs want them."""
 
-_PIXELS_PER_M, _MOST_PIXELS, _FINER = 160, 4096, 2
-_MARGIN_M = 0.5
+_PIXELS_PER_M, _MOST_PIXELS = 160, 4096
 _HEAD = 0.2
 """Share of the frame that the view from above leaves free at the top for the overlay."""
-_BORDER_M, _DASH_M, _DASH_WIDTH_M = 0.05, 0.15, 0.025
-_DASH_COLOR = "#f5a623"
 _MARK_RGBA = (1.0, 0.75, 0.0, 0.55)
 _SMOOTHING = 0.13
 """Share of a heading change that the chase camera follows per frame."""
@@ -83,12 +80,6 @@ def _look_down(camera: mujoco.MjvCamera, track: Track, angle_rad: float) -> None
     camera.azimuth, camera.elevation = 90.0, -90.0
 
 
-def extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest x and y that a view from above shows, (2,) each."""
-    points = np.concatenate([track.inner, track.outer])
-    return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
-
-
 def _build(track: Track, car: CarConfig, view: View) -> mujoco.MjModel:
     low, high = extent(track)
     spec = build_spec(car, visual=True)
@@ -131,32 +122,6 @@ def _build(track: Track, car: CarConfig, view: View) -> mujoco.MjModel:
             **seen,
         )
     return spec.compile()
-
-
-def draw_track(track: Track, pixels_per_m: float) -> Image.Image:
-    """Draw the `extent` of a track from above, x to the right and y up."""
-    (low, high), scale = extent(track), _FINER * pixels_per_m
-    width, height = (int(size) for size in np.ceil((high - low) * scale))
-    image = Image.new("RGB", (width, height), track.floor.ground_color)
-    draw = ImageDraw.Draw(image)
-
-    def pixels(points: NDArray[np.float64]) -> list[tuple[float, float]]:
-        at = (points - low) * scale
-        return [(x, height - y) for x, y in at.tolist()]
-
-    for part in get_parts(track.road):
-        draw.polygon(pixels(get_coordinates(part.exterior)), fill=track.floor.road_color)
-        for hole in part.interiors:
-            draw.polygon(pixels(get_coordinates(hole)), fill=track.floor.ground_color)
-    for at_m in np.arange(0.0, track.length_m - _DASH_M, 2 * _DASH_M):
-        ends = track.points_at(np.array([at_m, at_m + _DASH_M]) / track.length_m)
-        draw.line(pixels(ends), fill=_DASH_COLOR, width=max(1, round(_DASH_WIDTH_M * scale)))
-    border = max(2, round(_BORDER_M * scale))
-    for side in (track.inner, track.outer):
-        draw.line(pixels(side), fill=track.floor.line_color, width=border, joint="curve")
-    draw.line(pixels(np.stack([track.inner[0], track.outer[0]])), fill="#ffffff", width=2 * border)
-    # Drawn at a higher resolution and reduced, for smooth edges.
-    return image.reduce(_FINER)
 
 
 def write_video(file: Path, view: View, lap: Lap, car: CarConfig, err: Console) -> None:

@@ -25,11 +25,11 @@ from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
+from deepracer_exp.tracks.picture import draw_track, extent
 
 from .evaluator import Evaluator
 from .film import Lap, drive_best_lap, in_frames, write_film
 from .sight import degrees, picture_of, saliency, under_heat
-from .video import draw_track, extent
 
 WIDTH, HEIGHT = 1280, 720
 _EYE = (480, 360)

@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RenderCollection
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from benchmarks.sb3_peer import SB3Cars
 from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
+from deepracer_exp.env.sb3 import DeepRacerVecEnv
 from deepracer_exp.errors import BadInput
 
 SPACES = ["action_space=discrete", "action_space=continuous"]
@@ -128,7 +129,7 @@ def test_gymnasiums_vector_wrappers_take_it():
 
 @pytest.mark.parametrize("space", SPACES)
 def test_stable_baselines_trains_on_the_vector_environment(space):
-    cars = SB3Cars(DeepRacerVectorEnv(8, [space, "episode.max_steps=40"]))
+    cars = DeepRacerVecEnv(8, [space, "episode.max_steps=40"])
     model = PPO("MlpPolicy", cars, n_steps=32, batch_size=64, n_epochs=2, device="cpu", seed=0)
     before = [p.clone() for p in model.policy.parameters()]
     model.learn(3 * 8 * 32)
@@ -137,9 +138,78 @@ def test_stable_baselines_trains_on_the_vector_environment(space):
     assert any((p != q).any() for p, q in zip(model.policy.parameters(), before, strict=True))
 
 
+def test_stable_baselines_drives_the_same_cars_and_is_told_how_episodes_ended():
+    overrides = ["action_space=continuous", "episode.max_steps=12"]
+    cars, plain = DeepRacerVecEnv(3, overrides), DeepRacerVectorEnv(3, overrides)
+    cars.seed(7)
+    np.testing.assert_array_equal(cars.reset(), plain.reset(seed=7)[0])
+    for action in np.random.default_rng(0).uniform(-1, 1, (30, 3, 2)).astype(np.float32):
+        observation, reward, ended, infos = cars.step(action)
+        expected, wanted, terminated, truncated, more = plain.step(action)
+        np.testing.assert_array_equal(observation, expected)
+        np.testing.assert_array_equal(reward, wanted)
+        np.testing.assert_array_equal(ended, terminated | truncated)
+        for car, info in enumerate(infos):
+            if not ended[car]:
+                assert info == {}
+                continue
+            np.testing.assert_array_equal(info["terminal_observation"], more["final_obs"][car])
+            assert info["TimeLimit.truncated"] == truncated[car]
+            assert info["progress"] == more["progress"][car]
+
+
 def test_stable_baselines_trains_on_a_single_car():
     cars = DummyVecEnv([lambda: gym.make("DeepRacer-v0", overrides=["episode.max_steps=40"])])
     model = PPO("MlpPolicy", cars, n_steps=64, batch_size=32, n_epochs=1, device="cpu", seed=0)
     model.learn(128)
     assert model.num_timesteps == 128
     assert all(p.isfinite().all() for p in model.policy.parameters())
+
+
+# --- Pictures
+
+
+@pytest.mark.parametrize("track", ["reinvent_base", "Straight_track"])
+def test_the_picture_shows_the_car_where_it_is(track):
+    env = gym.make("DeepRacer-v0", render_mode="rgb_array", overrides=[f"track={track}"])
+    env.reset(seed=0)
+
+    def where():
+        picture = env.render()
+        assert picture.dtype == np.uint8
+        assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
+        red = (picture == (0xD6, 0x27, 0x28)).all(axis=-1)
+        row, column = np.argwhere(red).mean(axis=0)
+        return np.array([column, -row])
+
+    race = env.unwrapped._race
+    pixels, metres = [where()], [race.rules.now.front[0]]
+    for _ in range(25):
+        env.step(env.action_space.n // 2)
+    pixels.append(where())
+    metres.append(race.rules.now.front[0])
+    moved_px, moved_m = pixels[1] - pixels[0], metres[1] - metres[0]
+    assert np.hypot(*moved_m) > 0.5
+    cosine = moved_px @ moved_m / np.hypot(*moved_px) / np.hypot(*moved_m)
+    assert cosine > 0.99
+
+
+def test_what_gymnasium_and_stable_baselines_ask_for_pictures_gets_them():
+    env = gym.make("DeepRacer-v0", render_mode="rgb_array")
+    collected = RenderCollection(env)
+    collected.reset()
+    collected.step(0)
+    assert len(collected.render()) == 2
+    assert env.metadata["render_fps"] == 15
+    cars = DeepRacerVecEnv(4, render_mode="rgb_array")
+    cars.reset()
+    height, width, _ = env.render().shape
+    assert cars.render().shape == (2 * height, 2 * width, 3)
+
+
+def test_without_a_mode_nothing_is_rendered_and_another_mode_is_refused():
+    env = DeepRacerEnv()
+    env.reset()
+    assert env.render() is None
+    with pytest.raises(BadInput, match=r"render_mode=ansi: .*accepted: rgb_array"):
+        DeepRacerEnv(render_mode="ansi")
