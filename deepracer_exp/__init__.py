@@ -73,3 +73,7 @@ def __getattr__(name: str) -> Any:
         module = next((module for module, names in _MODULES.items() if name in names), "api")
         return getattr(import_module(f"deepracer_exp.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -74,3 +74,8 @@ def test_what_a_public_function_returns_is_public():
     for call in (compose, evaluate, make_env, read_run, resume, train):
         returned = inspect.signature(call, eval_str=True).return_annotation
         assert getattr(deepracer_exp, returned.__name__) is returned
+
+
+def test_dir_lists_the_whole_api():
+    assert set(deepracer_exp.__all__) <= set(dir(deepracer_exp))
+    assert all(getattr(deepracer_exp, name) is not None for name in deepracer_exp.__all__)

@@ -16,12 +16,12 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
 
 
-def run_cells(name: str) -> list[Any]:
-    """Run the cells in one namespace and return what each shows: the value of its last line."""
+def run_cells(name: str, cells: int | None = None) -> list[Any]:
+    """Run the first `cells` of code in one namespace, and return what each shows: the value of its last line."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
     shown = []
-    cells = json.loads((FOLDER / name).read_text(encoding="utf-8"))["cells"]
-    texts = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    every = json.loads((FOLDER / name).read_text(encoding="utf-8"))["cells"]
+    texts = ["".join(cell["source"]) for cell in every if cell["cell_type"] == "code"][:cells]
     for number, text in enumerate(texts):
         *body, last = ast.parse(text, f"cell {number}").body
         if not isinstance(last, ast.Expr):
@@ -45,6 +45,26 @@ def test_the_log_analysis_runs_on_a_run_of_ours(trained, tmp_path, monkeypatch, 
             assert value.data
     assert "- " in capsys.readouterr().out
     assert (tmp_path / "log_analysis.html").stat().st_size > 1_000_000
+
+
+def test_the_log_analysis_finds_the_newest_run_from_the_folder_of_the_notebooks(
+    trained, tmp_path, monkeypatch
+):
+    monkeypatch.delenv("DEEPRACER_LOG", raising=False)
+    run = trained(*LAPS).folder
+    runs = tmp_path / "runs"
+    runs.symlink_to(run.parent.parent)
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.chdir(tmp_path / "notebooks")
+    newest = max(runs.glob("*/*/metrics.jsonl"), key=lambda file: file.stat().st_mtime).parent
+    assert run_cells("log_analysis.ipynb", cells=1) == [newest.name]
+
+
+def test_the_log_analysis_trains_a_short_run_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.delenv("DEEPRACER_LOG", raising=False)
+    monkeypatch.chdir(tmp_path)
+    (name,) = run_cells("log_analysis.ipynb", cells=1)
+    assert [folder.name for folder in tmp_path.glob("runs/*/*")] == [name]
 
 
 def test_an_own_training_loop_learns_with_public_names_only():
