@@ -85,7 +85,7 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
         terminated, truncated = bool(race.terminated[0]), bool(race.truncated[0])
         return _observed(race, 0), float(race.reward[0]), terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Return the track with the car from above, (height, width, 3); None without a `render_mode`."""
         return None if self.render_mode is None else self._view.picture(0)
 
