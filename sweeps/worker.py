@@ -220,9 +220,9 @@ class TrialRun(Callback):
             trainer.request_stop(f"{self._pruned_by}: {reason}", STOPPED_EARLY)
 
     def summary(self, trainer: Trainer) -> dict[str, Any]:
-        """Check the claim before the end of the run is written: drawing its pictures takes a second."""
+        """Name the trial, and check its claim before the end of the run is written: pictures take a second to draw."""
         self._lease.confirm()
-        return {}
+        return {"study": self._config.study, "trial": self._number}
 
     def _begin(self, run_dir: Path) -> None:
         self._show(0.0, {})

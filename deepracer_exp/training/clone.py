@@ -13,13 +13,15 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
 from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, read_config, read_object, read_run_id
+from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, SUMMARY, read_config, read_object, read_run_id
 from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
 from deepracer_exp.runs.resolve import StoredRun, resolve
 
 SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
 _OWN = ("run", "checkpoint")
+_AS_USUAL = ("report=true", "collector.mode=sync", "collector.processes=null", "collector.threads=0")
+"""How the clone of a sweep's trial runs: the trial itself had one core and no report, because others ran beside it."""
 _ALLOWED = {
     "track": "the policy has to find its way on another road",
     "reward": "values learned for another reward are wrong at first",
@@ -84,7 +86,8 @@ def prepare_clone(
 
 def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composition:
     names = read_object(parent.path / PROVENANCE).get("names", {})
-    composition = with_overrides(read_config(parent.path), names, changes, stored=stored)
+    usual = _AS_USUAL if "trial" in read_object(parent.path / SUMMARY) else ()
+    composition = with_overrides(read_config(parent.path), names, [*usual, *changes], stored=stored)
     keys = {change.lstrip("+").split("=", 1)[0] for change in changes}
     if not keys & {"algorithm", "algorithm.lr"}:
         composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import psutil
 import torch
@@ -28,7 +29,7 @@ from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.runs.checkpoints import intact_checkpoint, read_training
+from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
 from deepracer_exp.runs.convergence import UNDECIDED
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
@@ -318,6 +319,7 @@ def _reopen(
     refuse_changes(run_dir, state, composition.mapping, setup)
     acting.refuse_reward(composition.mapping, run_dir.name)
     _try(experiment, setup)
+    _forget_damaged_best(run_dir, state)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
     folder = RunFolder(run_dir)
@@ -355,6 +357,20 @@ def _reopen(
     for why in _differences_to_uninterrupted(experiment, setup):
         logger.warning("the result will not be that of an uninterrupted run: %s", why)
     return trainer
+
+
+def _forget_damaged_best(run_dir: Path, state: dict[str, Any]) -> None:
+    """Let the rest of a run find its best policy where the best so far cannot be read any more."""
+    if state["best"] is None:
+        return
+    name = checkpoint_name(state["best"]["iteration"])
+    try:
+        check(run_dir / CHECKPOINTS / name)
+    except BadInput as error:
+        logger.warning(
+            "the best checkpoint so far, %s, is lost: %s; a later one will be the best", name, error
+        )
+        state["best"] = None
 
 
 def _print_memory(memory: str | None, console: Console) -> None:

@@ -12,6 +12,8 @@ from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.runs.checkpoints import State
+from deepracer_exp.runs.files import read_config, read_object
+from deepracer_exp.training.clone import prepare_clone
 
 OFTEN = ("episode.max_steps=60", "checkpoints.every=2", "budget.env_steps=null", "budget.iterations=3")
 
@@ -56,6 +58,20 @@ def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_it
     for group, key in (("budget", "iterations"), ("algorithm", "max_grad_norm")):
         before[group].pop(key), after[group].pop(key)
     assert before == after
+
+
+def test_a_clone_of_a_sweeps_trial_runs_as_a_training_does(parent):
+    def clone():
+        return prepare_clone([f"run={parent}"], parent.parents[1], None).experiment
+
+    stored = read_config(parent)
+    assert (stored["report"], stored["collector"]["mode"]) == (False, "in_process")
+    assert (clone().report, clone().collector.mode) == (False, "in_process")
+    summary = read_object(parent / "summary.json")
+    (parent / "summary.json").write_text(json.dumps({**summary, "study": "s", "trial": 3}))
+    assert clone().report
+    assert (clone().collector.mode, clone().collector.processes) == ("sync", None)
+    assert clone().collector.cars == stored["collector"]["cars"]
 
 
 def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(parent, call):

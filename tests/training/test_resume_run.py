@@ -8,7 +8,8 @@ import torch
 import yaml
 from mlflow import MlflowClient
 
-from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.resolve import resolve
@@ -102,6 +103,34 @@ def test_after_a_corrupt_checkpoint_the_run_is_written_again_from_the_newest_int
     assert "000003: corrupt" in ended.stderr
     assert "using 000002, the newest intact one" in ended.stderr
     assert_same_run(run, whole(trained))
+
+
+def test_past_a_damaged_best_checkpoint_a_later_one_becomes_the_best(cut, call):
+    run = cut()
+    ended = call("resume", run.name, "budget.iterations=5")
+    assert ended.code == 0, ended.stderr
+    best = (run / "checkpoints" / "best").resolve()
+    assert best != (run / "checkpoints" / "last").resolve()
+    for archive in best.rglob("state.tdz"):
+        archive.write_bytes(archive.read_bytes()[:-20])
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    assert f"the best checkpoint so far, {best.name}, is lost" in ended.stderr
+    named = checkpoint_name(summary(run)["best"]["iteration"])
+    assert check(run / "checkpoints" / "best").name == named != best.name
+
+
+def test_a_resumed_run_that_fails_says_so_in_one_line(cut, call, monkeypatch):
+    def lose_a_wheel(trainer, interruption):
+        raise RunFailed("a wheel is off")
+
+    run = cut()
+    monkeypatch.setattr(Trainer, "fit", lose_a_wheel)
+    ended = call("resume", run.name, "budget.iterations=6")
+    ended.assert_run_failed("run failed: a wheel is off")
+    assert ended.stderr.count("a wheel is off") == 1
+    assert "Traceback" not in ended.stderr
+    assert "Traceback" in (run / "log.txt").read_text()
 
 
 def test_a_run_killed_as_soon_as_it_is_one_begins_again_and_is_recorded_once(trained, start, call, tmp_path):
