@@ -1,16 +1,20 @@
 """What came of a run, and what to do next with it, as commands to paste."""
 
-import math
+import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
-from deepracer_exp.runs.files import RunRecord, read_config, sees_pictures
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.files import BEST, RunRecord, read_config, run_folders, sees_pictures
+from deepracer_exp.runs.resolve import best_of
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, FIGURES, INTERRUPTED, read_result
 
 COMMAND = "deepracer-exp"
+_RUNS = Path("runs")
+"""Where commands look for runs by themselves."""
 
 
 def outcome(run: RunRecord) -> list[tuple[str, str]]:
@@ -47,8 +51,8 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
 
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return commands for a run folder with its summary.json, each with what it does, the first to be used first."""
-    word, config = run_word(run), read_config(run)
-    resume = command_line("resume", word, config)
+    word, own, config = run_word(run), own_word(run), read_config(run)
+    resume = command_line("resume", own, config)
     steps = []
     if summary["iteration"]:
         evaluate = command_line("evaluate", word, config, OF_POLICY)
@@ -66,16 +70,22 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     spent = {
         "env_steps": summary["env_steps"],
         "iterations": summary["iteration"],
-        "minutes": math.ceil(summary["wall_clock_s"] / 60),
+        "minutes": summary["wall_clock_s"] / 60,
     }
     if rule:
-        resume = command_line("resume", word, config, [group for group in GROUPS if group != "stopping"])
+        resume = command_line("resume", own, config, [group for group in GROUPS if group != "stopping"])
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides
         budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}
-        again = [f"budget.{key}={2 * spent[key]}" for key, most in budget.items() if spent[key] >= most]
+        again = [f"budget.{key}={_twice(spent[key])}" for key, most in budget.items() if spent[key] >= most]
         steps.append((" ".join([resume, *again]), "continue it for as long again"))
     return steps
+
+
+def _twice(spent: float) -> str:
+    """Return twice a number of steps, iterations or minutes; of fractions of minutes two digits."""
+    twice = 2 * spent
+    return f"{twice:.2g}" if isinstance(twice, float) and twice < 10 else f"{round(twice)}"
 
 
 def command_line(command: str, word: str, config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> str:
@@ -84,5 +94,26 @@ def command_line(command: str, word: str, config: Mapping[str, Any], groups: Seq
 
 
 def run_word(run: Path) -> str:
-    """Return what a run is called on the command line: its name where commands look for runs, else its folder."""
-    return run.name if run.resolve().parent.parent == Path("runs").resolve() else str(run)
+    """Return what a run is called on the command line: `best:EXPERIMENT` if it is that, else as `own_word` says."""
+    if _is_in_runs(run):
+        with contextlib.suppress(BadInput):  # its experiment may have no best run
+            if best_of(run.parent.name, _RUNS).resolve() == run.resolve():
+                return f"{BEST}{run.parent.name}"
+    return own_word(run)
+
+
+def own_word(run: Path) -> str:
+    """Return what a run will be called on the command line whatever is trained later.
+
+    That is its name, shortened to the time it began if no other began then, or its folder, where commands do not look
+    for it by themselves.
+    """
+    if not _is_in_runs(run):
+        return str(run)
+    began = "-".join(run.name.split("-")[:2])
+    others = [folder for folder in run_folders(_RUNS) if folder.name.startswith(began)]
+    return began if len(others) == 1 else run.name
+
+
+def _is_in_runs(run: Path) -> bool:
+    return run.resolve().parent.parent == _RUNS.resolve()

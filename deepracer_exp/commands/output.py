@@ -6,6 +6,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import count
@@ -37,7 +38,8 @@ def table_console(piped_width: int = 200) -> "Console":
 def warnings_on_stderr() -> Iterator[None]:
     """Write the project's warnings to standard error within the block, one line each."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setLevel(logging.WARNING)
+    # Errors are the command's own to print, in one line; here they would come with a traceback.
+    handler.addFilter(lambda record: record.levelno == logging.WARNING)
     handler.setFormatter(logging.Formatter("warning: %(message)s"))
     logger = logging.getLogger("deepracer_exp")
     logger.addHandler(handler)
@@ -54,8 +56,12 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 def print_start() -> None:
-    """Say that the command is running: imports take seconds, and the first start after an installation compiles."""
-    print("starting", file=sys.stderr, flush=True)
+    """Say what takes the seconds before the first car drives."""
+    what = "starting: loading PyTorch and MuJoCo"
+    # Where numba keeps what it has compiled; the package itself is not imported yet.
+    if not any(Path(__file__).parents[1].glob("sim/__pycache__/tyres.*.nbi")):
+        what += ", and compiling the physics, once after an installation (about 20 s)"
+    print(what, file=sys.stderr, flush=True)
 
 
 def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
@@ -87,13 +93,21 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     if isinstance(tracking, MLflowTracking) and outcome.unrecorded is None:
         print(f"  compare runs  {_command()} ui{_store_word(outcome.folder.parent.parent, tracking.uri)}")
     steps = next_steps(outcome.folder, summary)
-    shown = [(line.replace(COMMAND, _command(), 1), what) for line, what in steps]
-    width = max((len(line) for line, _ in shown), default=0)
-    if shown:
-        print("\n  next")
-    for line, what in shown:
-        print(f"    {line:{width}}  # {what}")
+    print_steps([(line.replace(COMMAND, _command(), 1), what) for line, what in steps])
     _print_unrecorded([outcome], tracking)
+
+
+def print_steps(steps: Sequence[tuple[str, str]]) -> None:
+    """Print commands, each with what it does: beside it, or above it where the terminal is too narrow for that."""
+    if not steps:
+        return
+    print("\n  next")
+    width = max(len(line) for line, _ in steps)
+    beside = all(
+        4 + width + 4 + len(what) <= shutil.get_terminal_size((200, 24)).columns for _, what in steps
+    )
+    for line, what in steps:
+        print(f"    {line:{width}}  # {what}" if beside else f"    # {what}\n    {line}")
 
 
 def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:

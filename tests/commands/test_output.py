@@ -4,9 +4,25 @@ import json
 
 import pytest
 
-from deepracer_exp.commands.output import print_result
+from deepracer_exp.commands.output import print_result, print_steps
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.training.trainer import TrainResult
+
+
+@pytest.mark.parametrize(("columns", "lines"), [(80, 2), (46, 4)])
+def test_a_command_is_never_broken_by_what_it_does(capsys, monkeypatch, columns, lines):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    steps = [
+        ("deepracer-exp evaluate best:season", "race it"),
+        ("deepracer-exp clone best:season", "train it"),
+    ]
+    print_steps(steps)
+    shown = capsys.readouterr().out.split("next\n")[1].splitlines()
+    assert len(shown) == lines
+    assert all(len(line) <= columns for line in shown)
+    assert [line for line, _ in steps] == [
+        line.split("#")[0].strip() for line in shown if not line.lstrip().startswith("#")
+    ]
 
 
 @pytest.mark.parametrize(

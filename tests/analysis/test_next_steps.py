@@ -1,0 +1,50 @@
+"""What to do next with a run, as commands to paste."""
+
+import shlex
+import shutil
+
+import pytest
+
+from deepracer_exp.analysis.next_steps import next_steps, own_word, run_word
+from deepracer_exp.runs.files import read_object
+from deepracer_exp.runs.resolve import resolve
+
+
+@pytest.fixture
+def runs(copied, monkeypatch):
+    """Return two equal runs of one experiment, of which the later one is the best, in the folder's `runs`."""
+    first = copied("checkpoints.every=1")
+    monkeypatch.chdir(first.parents[2])
+    later = first.with_name(first.name.replace(first.name[:15], "20990101-000000"))
+    shutil.copytree(first, later, symlinks=True)
+    return first, later
+
+
+def test_the_best_run_has_a_short_name_and_so_has_another(runs):
+    first, later = runs
+    assert run_word(later) == f"best:{later.parent.name}"
+    assert own_word(later) == "20990101-000000"
+    assert run_word(first) == own_word(first) == first.name[:15]
+    for run in runs:
+        for word in (run_word(run), own_word(run)):
+            assert resolve(word, first.parents[1], None).path.samefile(run)
+
+
+def test_a_run_elsewhere_is_named_by_its_folder(runs, tmp_path_factory, monkeypatch):
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    assert run_word(runs[0].absolute()) == str(runs[0].absolute())
+
+
+@pytest.mark.parametrize(
+    ("limit", "spent_s", "more"),
+    [(1.5, 90.4, "3"), (0.5, 30.9, "1"), (10.0, 603.0, "20"), (0.05, 3.4, "0.11"), (120, 7201.0, "240")],
+)
+def test_as_long_again_is_twice_the_minutes_used(runs, limit, spent_s, more):
+    run = runs[0]
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("minutes: null", f"minutes: {limit}", 1))
+    reason = {"status": "finished", "reason": "budget reached: minutes", "wall_clock_s": spent_s}
+    line, what = next_steps(run, {**read_object(run / "summary.json"), **reason})[-1]
+    assert what == "continue it for as long again"
+    minutes = [word for word in shlex.split(line) if word.startswith("budget.minutes=")]
+    assert minutes == [f"budget.minutes={more}"]
