@@ -66,6 +66,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         import argcomplete
 
         argcomplete.autocomplete(parser)
+    if not arguments:
+        parser.print_help()
+        raise SystemExit(0)
     given = without_passwords(list(arguments))
     refuse_old_spellings(given)
     args, rest = parser.parse_known_args(runs.with_default_action(given))

@@ -94,8 +94,10 @@ def test_a_grid_without_m_is_refused(call):
     call("train", "experiment=tiny", "seed=1,2").assert_bad_input("seed=1,2")
 
 
-def test_no_command_is_bad_input(call):
-    assert call().code == 2
+def test_without_a_command_the_help_is_printed(call):
+    alone, asked = call(), call("--help")
+    assert (alone.code, alone.stdout, alone.stderr) == (0, asked.stdout, "")
+    assert "train" in alone.stdout
 
 
 def test_a_grid_runs_every_combination_and_prints_a_table(train_here):

@@ -69,7 +69,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=_EXPORT_EPILOG,
         entry="export",
     )
-    add_run(parser, "format=onnx|car|aws|aws-model|aws-logs | KEY=VALUE")
+    add_run(parser, "format=onnx|aws|aws-model|aws-logs|car | KEY=VALUE")
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
@@ -148,7 +148,6 @@ _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=onnx                      the network as one file, checked against itself
   deepracer-exp export RUN format=onnx checkpoint=last -o policy.onnx
   deepracer-exp export champion format=onnx                 the checkpoint with that alias (deepracer-exp runs promote)
-  deepracer-exp export RUN format=car -o my_model.tar.gz    for the console of a physical car, which calls it my_model
   deepracer-exp export RUN format=aws -o custom_files       reward_function.py, model_metadata.json and
                                                             hyperparameters.json
   deepracer-exp export RUN format=aws-model -o my_model     these and the weights: a pretrained model for
@@ -156,6 +155,8 @@ _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=aws-logs                  trace, metrics and logs of the training, as in an archive
                                                             of the AWS console (deepracer-utils reads it)
   deepracer-exp export RUN format=aws-logs layout=deepracer-for-cloud
+  deepracer-exp export RUN format=car -o my_model.tar.gz    for the console of a physical car, which calls it my_model;
+                                                            needs a policy that sees with the camera
 """
 
 

@@ -118,7 +118,8 @@ def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]
     composition = compose_entry("export", overrides)
     if composition.mapping["format"] is None:
         raise BadInput(
-            "format: missing; write format=onnx, format=car, format=aws, format=aws-model or format=aws-logs"
+            "format: missing; write format=onnx, format=aws, format=aws-model, format=aws-logs, or, for a policy that "
+            "sees with the camera, format=car"
         )
     return parse_config(composition.mapping, ExportConfig), composition
 
