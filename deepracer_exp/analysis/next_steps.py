@@ -9,6 +9,7 @@ from typing import Any
 from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import BEST, RunRecord, read_config, run_folders, sees_pictures
+from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.resolve import best_of
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, FIGURES, INTERRUPTED, read_result
 
@@ -18,7 +19,7 @@ _RUNS = Path("runs")
 
 
 def outcome(run: RunRecord) -> list[tuple[str, str]]:
-    """Return what was driven, how good the best policy is in evaluation and how the run ended, in names and values.
+    """Return what was driven, how good the best policy is in evaluation and the run's state, in names and values.
 
     Raises:
         BadInput: its summary.json is not what a training writes.
@@ -43,10 +44,14 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
         found.append(("Best checkpoint", f"{result.iteration:06d}"))
     elif run.summary:
         found.append(("Evaluated", "never"))
-    ended = (
-        f"{run.summary['status']}: {run.summary['reason']}" if run.summary else "not yet, or it was killed"
-    )
-    return [*found, ("How it ended", ended)]
+    return [*found, ("State", state(run))]
+
+
+def state(run: RunRecord) -> str:
+    """Return whether a run is running, was killed, or how it ended."""
+    if run.summary:
+        return f"{run.summary['status']}: {run.summary['reason']}"
+    return "running" if is_held(run.path) else "killed"
 
 
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -208,8 +208,9 @@ def _watch(args: argparse.Namespace) -> int:
         print(server.url, flush=True)
 
         from deepracer_exp.evaluation.live import serve_live
+        from deepracer_exp.training.budget import Budget
 
-        serve_live(stored, protocol, server)
+        serve_live(stored, protocol, server, Budget(stored.experiment.budget, stored.path).used)
     return 0
 
 

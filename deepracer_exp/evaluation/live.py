@@ -1,24 +1,28 @@
 """The command `watch --live`: a page with the newest evaluation laps of a training, while it runs."""
 
-import io
+import math
 import os
 import threading
 import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
-import pandas as pd
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from rich.console import Console
+from rich.table import Table
 
-from deepracer_exp.analysis.charts.run_pictures import TrackLines, learning_curves, lines_figure
-from deepracer_exp.analysis.next_steps import outcome
-from deepracer_exp.analysis.page import Glimpse, png_uri, render
+from deepracer_exp.analysis.charts.live import curves_so_far, newest_laps
+from deepracer_exp.analysis.charts.run_pictures import TrackLines
+from deepracer_exp.analysis.next_steps import outcome, state
+from deepracer_exp.analysis.page import Glimpse, Plot, plot_of, render
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoints import StoredPolicy, check, read_policy
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_head, read_metrics
+from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.resolve import StoredRun
 
 from .evaluate import results_table, trained_on
@@ -30,12 +34,27 @@ from .sight import glimpses
 
 _EVERY_S = 1.0
 """Seconds between two looks into the run's folder."""
+_CURVES_EVERY_S = 10.0
+"""Seconds between two drawings of the curves of a run that goes on: each loads the page again."""
 _LAST = "last"
 _NICENESS = 19
 
+Used: TypeAlias = Callable[[int, int, float], tuple[str, float]]
+"""What a training has used of its budget after control steps, iterations and seconds: `Budget.used`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Laps:
+    """What a checkpoint has driven, as the page shows it."""
+
+    words: str
+    plot: Plot
+    table: Table
+    strip: Sequence[Glimpse]
+
 
 class LivePage:
-    """The page of a run, drawn again when its folder has a newer checkpoint or the training has ended.
+    """The page of a run, drawn again when its folder has newer iterations, a newer checkpoint or the end.
 
     A training stores no steps of its evaluations, so the newest checkpoint drives their laps again here.
 
@@ -43,74 +62,110 @@ class LivePage:
         shown: a version, which changes with the page, and the page.
     """
 
-    def __init__(self, run: StoredRun, protocol: EvaluationConfig) -> None:
-        """Build the cars; `update` draws. The run need not have a checkpoint yet.
+    def __init__(self, run: StoredRun, protocol: EvaluationConfig, used: Used) -> None:
+        """Build the cars and draw the curves. The run need not have an iteration or a checkpoint yet.
 
         Raises:
             BadInput: a track or a condition is unknown or malformed.
         """
-        self._run, self._protocol = run, protocol
+        self._run, self._protocol, self._used = run, protocol, used
         self._evaluator = Evaluator(run.experiment, protocol, threads=1)
-        self._newest: tuple[str, bool] | None = None
+        self._driven = ""
+        self._laps: _Laps | None = None
         self.shown = ("0", "")
-        waiting = "its laps are being driven" if (run.checkpoints / _LAST).exists() else "no checkpoint yet"
-        self._draw(waiting, None, [], "")
+        self._draw()
 
     def update(self) -> bool:
         """Draw the page again if there is something newer; return whether there was."""
+        written, ended = _seen(self._run.path)
+        if ended != self._seen[1] or (
+            written != self._seen[0] and time.monotonic() - self._drawn_s >= _CURVES_EVERY_S
+        ):
+            self._draw()
+            return True
         link = self._run.checkpoints / _LAST
-        newest = (link.resolve().name, (self._run.path / SUMMARY).exists())
-        if not link.exists() or newest == self._newest:
+        newest = link.resolve().name
+        if not link.exists() or newest == self._driven:
             return False
         try:
             stored = read_policy(self._run.experiment, check(link))
         except BadInput:
-            if link.resolve().name != newest[0]:
+            if link.resolve().name != newest:
                 return False  # the training has replaced it meanwhile
             raise
-        self._drive(stored)
-        self._newest = newest
+        self._laps, self._driven = self._drive(stored), newest
+        self._draw()
         return True
 
-    def _drive(self, stored: StoredPolicy) -> None:
+    def _drive(self, stored: StoredPolicy) -> _Laps:
         policy, evaluator = stored.networks.policy, self._evaluator
         recorder = LapRecorder(evaluator)
         evaluation = evaluator(policy, recorder)
-        lines = lines_figure(track_lines(evaluator, evaluation, recorder))
         camera, strip = self._run.experiment.observation.camera, list[Glimpse]()
         if camera is not None:
             again = LapRecorder(evaluator, best_attempt(evaluation))
             evaluator(policy, again)
             best = again.lap(best_attempt(evaluation))
             strip = glimpses(best, again.acted, policy, evaluator.race.setup.actions, camera)
-        steps = stored.counters["env_steps"]
-        self._draw(f"checkpoint {stored.path.name}, {steps:,} steps", evaluation, strip, _png_of(lines))
+        known = trained_on(self._run.experiment, self._protocol, evaluation)
+        return _Laps(
+            words=f"checkpoint {stored.path.name}, {stored.counters['env_steps']:,} steps",
+            plot=plot_of(newest_laps(track_lines(evaluator, evaluation, recorder))),
+            table=results_table(evaluation, self._protocol, known, Console(width=200)),
+            strip=strip,
+        )
 
-    def _draw(self, headline: str, evaluation: Evaluation | None, strip: list[Glimpse], lines: str) -> None:
-        metrics, curves, table = self._run.path / METRICS, "", None
-        if metrics.exists() and (rows := read_metrics(metrics)):
-            curves = _png_of(learning_curves(pd.DataFrame(rows)))
-        if evaluation is not None:
-            known = trained_on(self._run.experiment, self._protocol, evaluation)
-            table = results_table(evaluation, self._protocol, known, Console(width=200))
+    def _draw(self) -> None:
+        self._seen, self._drawn_s = _seen(self._run.path), time.monotonic()
+        head, metrics = read_head(self._run.path), self._run.path / METRICS
+        rows = read_metrics(metrics) if metrics.exists() else []
+        curves = plot_of(curves_so_far(rows)) if rows else None
+        laps = self._laps
         version = str(int(self.shown[0]) + 1)
         page = render(
             __package__,
             "live.html.j2",
-            [],
+            [one for one in (curves, None if laps is None else laps.plot) if one is not None],
             is_live=True,
+            scripts=["live.js"],
             version=version,
+            title=self._run.experiment.name,
             name=self._run.path.name,
-            headline=headline,
-            outcome=outcome(read_head(self._run.path)),
-            heads=[] if table is None else [str(column.header) for column in table.columns],
-            rows=[] if table is None else list(zip(*(column.cells for column in table.columns), strict=True)),
-            note="" if table is None else str(table.caption),
-            lines=lines,
+            state=state(head),
+            clock=self._clock(rows[-1], self._seen[1] != "running") if rows else None,
+            outcome=[pair for pair in outcome(head) if pair[0] != "State"],
             curves=curves,
-            strip=strip,
+            laps=laps,
+            heads=[] if laps is None else [str(column.header) for column in laps.table.columns],
+            rows=[] if laps is None else list(zip(*(one.cells for one in laps.table.columns), strict=True)),
+            note="" if laps is None or laps.table.caption is None else str(laps.table.caption),
+            waiting="its laps are being driven"
+            if (self._run.checkpoints / _LAST).exists()
+            else "no checkpoint yet",
         )
         self.shown = (version, page)
+
+    def _clock(self, row: Mapping[str, Any], ended: bool) -> dict[str, Any]:
+        """Return what the page computes time and remaining time from, by the clock of this machine, in ms."""
+        used_s = float(row["wall_clock_s"])
+        _, share = self._used(int(row["env_steps"]), int(row["iteration"]), used_s)
+        now_ms = 1000 * (self._run.path / METRICS).stat().st_mtime
+        left_s = used_s * (1 / share - 1) if share else math.nan
+        return {
+            "percent": min(100, int(100 * share)),
+            "iteration": row["iteration"],
+            "env_steps": f"{row['env_steps']:,}",
+            "elapsed": round(1000 * used_s),
+            "since": "" if ended else round(now_ms - 1000 * used_s),
+            "until": "" if ended or not math.isfinite(left_s) else round(now_ms + 1000 * max(left_s, 0.0)),
+        }
+
+
+def _seen(run: Path) -> tuple[int, str]:
+    """Return what changes with the page: the size of the metrics, and how the run ended or whether it is running."""
+    metrics, summary = run / METRICS, run / SUMMARY
+    ended = "ended" if summary.exists() else "running" if is_held(run) else "killed"
+    return metrics.stat().st_size if metrics.exists() else 0, ended
 
 
 def track_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecorder) -> list[TrackLines]:
@@ -127,14 +182,7 @@ def track_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecor
     return shown
 
 
-def _png_of(figure: Figure) -> str:
-    file = io.BytesIO()
-    figure.set_dpi(110)
-    FigureCanvasAgg(figure).print_png(file)
-    return png_uri(file.getvalue())
-
-
-def serve_live(run: StoredRun, protocol: EvaluationConfig, server: LiveServer) -> None:
+def serve_live(run: StoredRun, protocol: EvaluationConfig, server: LiveServer, used: Used) -> None:
     """Serve the page of a run, which may be over, until Ctrl-C, at the lowest priority.
 
     Raises:
@@ -143,7 +191,7 @@ def serve_live(run: StoredRun, protocol: EvaluationConfig, server: LiveServer) -
     """
     os.nice(_NICENESS)
     torch.set_num_threads(1)
-    page = LivePage(run, protocol)
+    page = LivePage(run, protocol, used)
     server.shown = page.shown
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:

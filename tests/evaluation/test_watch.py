@@ -3,6 +3,8 @@
 import http.client
 import io
 import itertools
+import json
+import re
 import shutil
 import socket
 import struct
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
+from filelock import FileLock
 from imageio_ffmpeg import read_frames
 from rich.console import Console
 from tensordict import TensorDict
@@ -25,16 +28,19 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation import live
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, in_frames, write_film
 from deepracer_exp.evaluation.live import LivePage, track_lines
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
 from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames, rays
+from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import MOUNT_X_M
 from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track
+from tests.browser import needs_chromium
 from tests.page_html import Html
 
 STEREO = CameraConfig(width=80, height=60, color="rgb", frames=2, stereo_m=0.06, field_of_view_deg=65)
@@ -166,9 +172,14 @@ def test_between_steps_a_filmed_car_drives_on_but_not_where_it_was_put_back(circ
         assert shown.x_m[:4] == pytest.approx([0.0, 0.05, 0.1, 0.15])
 
 
+def half(*_: object) -> tuple[str, float]:
+    """Half of the budget is used."""
+    return "env_steps", 0.5
+
+
 def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protocol):
     run = StoredRun(run_dir)
-    page = LivePage(run, protocol("three_trials", trials=2, time_s=1))
+    page = LivePage(run, protocol("three_trials", trials=2, time_s=1), half)
     first = page.shown
     assert "its laps are being driven" in first[1]
     assert page.update()
@@ -186,6 +197,49 @@ def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protoco
     assert len({version for version, _ in (first, second, page.shown)}) == 3
     after = {path.relative_to(run.path) for path in run.path.rglob("*")}
     assert {path for path in after - before if path.parts[:2] != ("checkpoints", "999999")} == set()
+
+
+def test_the_live_page_tells_a_running_training_from_one_that_was_killed_or_has_ended(
+    run_dir, protocol, monkeypatch
+):
+    (run_dir / "summary.json").rename(run_dir / "kept.json")
+    monkeypatch.setattr(live, "_CURVES_EVERY_S", 0.0)
+    with FileLock(run_dir / ".running"):
+        page = LivePage(StoredRun(run_dir), protocol("three_trials", trials=1, time_s=0.5), half)
+        shown = Html(page.shown[1])
+        assert "tiny: running" in shown.text
+        assert "50% of the budget · iteration 4 · 4,096 steps" in shown.text
+        assert shown.ids.index("figure-curves_so_far") < shown.ids.index("laps")
+        page.update()
+        row = read_metrics(run_dir / "metrics.jsonl")[-1]
+        with (run_dir / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(row | {"iteration": 5, "env_steps": 5120}) + "\n")
+        assert page.update(), "a new iteration changes the curves"
+        assert "iteration 5 · 5,120 steps" in Html(page.shown[1]).text
+    assert page.update()
+    assert "tiny: killed" in Html(page.shown[1]).text
+    (run_dir / "kept.json").rename(run_dir / "summary.json")
+    assert page.update()
+    assert "tiny: finished: budget reached: env_steps" in Html(page.shown[1]).text
+
+
+@needs_chromium
+def test_the_clock_of_the_live_page_goes_on_and_its_curves_are_above_the_fold(
+    run_dir, protocol, tab, tmp_path
+):
+    (run_dir / "summary.json").unlink()
+    with FileLock(run_dir / ".running"):
+        page = LivePage(StoredRun(run_dir), protocol("three_trials", trials=1, time_s=0.5), half)
+    file = tmp_path / "live.html"
+    file.write_text(page.shown[1], encoding="utf-8")
+    tab.open(file, height=900)
+    elapsed, left = (f"document.querySelector('.clock .{name}').textContent" for name in ("elapsed", "left"))
+    assert re.fullmatch(r"\d+:\d\d", tab.evaluate(left))
+    shown = tab.evaluate(elapsed)
+    tab.wait_for(f"{elapsed} !== {json.dumps(shown)}")
+    box = "document.querySelector('[data-plot=curves_so_far]')"
+    tab.wait_for(f"{box}.dataset.state === 'drawn'")
+    assert tab.evaluate(f"{box}.getBoundingClientRect().bottom") < 900
 
 
 def test_a_lap_that_the_end_of_the_race_cuts_off_is_drawn_but_not_counted(experiment, protocol, driver):

@@ -1,0 +1,74 @@
+"""The figures of a page that follows a training: its curves so far, and the newest evaluation's laps."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from .figure import Chart, Layer, Panel, colored_points, in_rows, line
+from .maps import map_panel
+from .run_pictures import TrackLines
+from .style import BLUE, GREEN, ORANGE, PALE, PURPLE
+
+_CURVES: Mapping[str, tuple[str, Mapping[str, tuple[str | None, str]]]] = {
+    "Driven, per cent": (
+        "per cent",
+        {"completion": ("mean of an episode", BLUE), "eval_completion": ("evaluation", ORANGE)},
+    ),
+    "Lap time": (
+        "s",
+        {
+            "mean_lap_time_s": ("mean in training", BLUE),
+            "best_lap_time_s": ("best in training", GREEN),
+            "eval_lap_time_s": ("evaluation", ORANGE),
+        },
+    ),
+    "Return of an episode, mean": ("return", {"mean_return": (None, BLUE)}),
+    "Entropy of the policy": ("nats", {"entropy": (None, PURPLE)}),
+}
+"""Panels with their units, and their curves by column of metrics.jsonl, each with its name and colour."""
+
+
+def curves_so_far(rows: Sequence[Mapping[str, Any]]) -> Chart:
+    """Draw the learning curves of a run from the rows of its metrics.jsonl, at least one; of tracks their mean."""
+    table = pd.DataFrame(rows)
+    steps = table["env_steps"].to_numpy(np.float64) / 1000
+    panels = []
+    for title, (unit, curves) in _CURVES.items():
+        layers: list[Layer] = []
+        for column, (name, color) in curves.items():
+            columns = [one for one in table if one == column or one.startswith(f"{column}/")]
+            # Not every iteration ends an episode on every track, or is evaluated.
+            values = table[columns].astype(float).mean(axis=1).to_numpy()
+            known = np.isfinite(values)
+            if known.any():
+                layers.append(line(steps[known], values[known], color, name))
+        panels.append(Panel(title=title, y_label=unit, x_label="thousand control steps", layers=layers))
+    return Chart(
+        name="curves_so_far",
+        title="How it learns",
+        caption="In training the policy explores; in evaluation it takes its most probable actions.",
+        rows=in_rows(panels),
+        share_x=True,
+    )
+
+
+def newest_laps(shown: Sequence[TrackLines]) -> Chart:
+    """Draw laps on their tracks, coloured by measured speed, on one scale."""
+    speeds = np.concatenate([one[:, 2] for here in shown for one in here.lines] or [np.zeros(1)])
+    # The few steps after a standing start would take half of the colours.
+    colors = float(np.percentile(speeds, 5)), max(float(speeds.max()), float(np.percentile(speeds, 5)) + 0.1)
+    panels = []
+    for here in shown:
+        layers: list[Layer] = [line(one[:, 0], one[:, 1], PALE, width=1.0) for one in here.lines]
+        if here.lines:
+            x, y, speed_mps = np.concatenate(here.lines).T
+            layers.append(colored_points(x, y, speed_mps, "speed, m/s", size=5.0, value_range=colors))
+        panels.append(map_panel(here.track, layers, title=f"{here.track.title}: {here.words}"))
+    return Chart(
+        name="newest_laps",
+        title="The laps of the newest checkpoint",
+        caption="One dot for each control step on the usual conditions, coloured by the speed of the car.",
+        rows=in_rows(panels),
+    )
