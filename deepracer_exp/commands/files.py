@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -105,18 +106,23 @@ def _import(args: argparse.Namespace) -> int:
         raise BadInput(f"{args.overrides[0]}: {args.path} holds no model; accepted for one: KEY=VALUE")
 
     from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.config.custom_files import KEY, import_files, read_custom_files
+    from deepracer_exp.config.custom_files import KEY, read_custom_files
+    from deepracer_exp.config.imported_options import import_files
+    from deepracer_exp.config.job_overrides import job_overrides, several_of
     from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.env.action_space import action_remarks, build_action_space
     from deepracer_exp.rewards.source import load_reward_source
 
     files = read_custom_files(args.path)
     experiment, composition = compose_experiment([override_line(KEY, args.path)])
     load_reward_source(experiment.reward)
+    remarks = action_remarks(build_action_space(experiment.action_space), experiment.car)
     written = import_files(files, args.name, composition.mapping)
-    print_notes(composition.notes)
+    beside = shlex.join(line.replace("'", "") for line in several_of(job_overrides(files.workers, {})[0]))
+    print_notes((*composition.notes, *remarks))
     for path in written:
         print(path)
-    print(f"\n  train it  deepracer-exp train experiment={args.name}")
+    print(f"\n  train it  deepracer-exp train experiment={args.name} {beside}".rstrip())
     return 0
 
 
@@ -127,7 +133,6 @@ def _holds_model(path: str) -> bool:
 
 
 def _import_model(args: argparse.Namespace) -> int:
-    import shlex
     import zipfile
 
     from deepracer_exp.training.import_model import import_model
@@ -209,7 +214,7 @@ def _validate(args: argparse.Namespace) -> int:
     args.debug = experiment.debug
     print_notes(composition.notes)
     trial = compose_experiment([*overrides, *shorter]) if shorter else None
-    check_files(experiment)
+    print_notes(check_files(experiment))
     if trial is not None:
         start_workers_early(experiment.collector.forks)
 

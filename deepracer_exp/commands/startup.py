@@ -17,17 +17,20 @@ if TYPE_CHECKING:
     from deepracer_exp.runs.resolve import StoredRun
 
 
-def check_files(experiment: "Experiment") -> None:
+def check_files(experiment: "Experiment") -> list[str]:
     """Read the files that an experiment names, without running any of them.
+
+    Returns:
+        A line for each thing about its action space that a racer may not have meant.
 
     Raises:
         BadInput: one is missing or malformed.
     """
-    from deepracer_exp.env.action_space import build_action_space
+    from deepracer_exp.env.action_space import action_remarks, build_action_space
     from deepracer_exp.rewards.source import load_reward_source
 
     load_reward_source(experiment.reward)
-    build_action_space(experiment.action_space)
+    actions = build_action_space(experiment.action_space)
     if experiment.evaluation.real_car is not None:
         from deepracer_exp.env.real_car import require_car
 
@@ -38,6 +41,7 @@ def check_files(experiment: "Experiment") -> None:
 
         for track in files:
             Track.from_config(track)
+    return action_remarks(actions, experiment.car)
 
 
 def check_teacher(experiment: "Experiment") -> None:
@@ -102,8 +106,11 @@ def check_changes(run_dir: Path, overrides: "Sequence[str]") -> "Experiment":
     return parse_experiment(with_overrides(read_config(run_dir), {}, overrides).mapping)
 
 
-def check_sweep(request: "SweepRequest") -> None:
+def check_sweep(request: "SweepRequest") -> list[str]:
     """Check the files and options that all trials of a sweep share; its values are checked with its search space.
+
+    Returns:
+        As `check_files`.
 
     Raises:
         BadInput: there is no such file or option.
@@ -120,8 +127,9 @@ def check_sweep(request: "SweepRequest") -> None:
         or key.endswith(".file")
     ]
     experiment, _ = compose_experiment(named)
-    check_files(experiment)
+    remarks = check_files(experiment)
     check_teacher(experiment)
+    return remarks
 
 
 def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.worker") -> None:

@@ -130,7 +130,7 @@ def _train(args: argparse.Namespace) -> int:
         print("---\n".join(composition.yaml() for _, composition in composed), end="")
         return 0
     for experiment, _ in composed:
-        check_files(experiment)
+        print_notes(check_files(experiment))
         check_teacher(experiment)
     print_start()
     start_workers_early(any(experiment.collector.forks for experiment, _ in composed))
@@ -220,7 +220,7 @@ def _clone(args: argparse.Namespace) -> int:
     parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None)
     experiment = check_changes(parent.path, changes)
     import_own_classes(experiment)
-    check_files(experiment)
+    print_notes(check_files(experiment))
     refuse_other_networks(parent.experiment, experiment)
     print_start()
     start_workers_early(experiment.collector.forks)
@@ -278,7 +278,7 @@ def _sweep(args: argparse.Namespace) -> int:
 
     request = compose_sweep(args.overrides)
     args.debug = request.entry.debug
-    check_sweep(request)
+    print_notes(check_sweep(request))
     if not request.space:  # an existing study has its own
         from sweeps.space import SearchSpace
         from sweeps.study import load_request

@@ -138,15 +138,15 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
     for override in own:
         _check_key(entry, override)
     files = _files(given, {one.key_or_group: text for one, text in zip(given, overrides, strict=True)})
+    own = [*map(parse_single, files.lines), *own]
     has_tracks = TRACK in groups(entry)
     several = several_tracks(own) if has_tracks else None
     if several is not None:
         rest = [override for override in own if override.key_or_group.partition(".")[0] != TRACK]
         own = [*map(parse_single, several.choosing), *rest, *several.changing]
-    parsed = [*map(parse_single, files.lines), *own]
     with reading(" ".join(overrides) or entry):
         try:
-            config = _composed(entry, [line_for_hydra(override) for override in parsed])
+            config = _composed(entry, [line_for_hydra(override) for override in own])
             choices = {
                 str(group): str(option).removesuffix(".yaml")
                 for group, option in config.hydra.runtime.choices.items()
@@ -156,7 +156,7 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
                 del config["hydra"]
             mapping = _plain(config)
         except (HydraException, OmegaConfBaseException) as error:
-            raise BadInput(_explain(entry, parsed, error)) from error
+            raise BadInput(_explain(entry, own, error)) from error
     if has_tracks and TRACK in mapping and TRACK not in choices:
         raise BadInput(
             "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"

@@ -1,17 +1,15 @@
-"""The files of a DeepRacer model, as overrides (`custom_files=DIR`) and as option files of your own (`import`)."""
+"""The files of a DeepRacer model and of deepracer-for-cloud as overrides (`custom_files=DIR`)."""
 
-import contextlib
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import Any, NamedTuple
 
 from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperparameters
+from deepracer_exp.deepracer.job_settings import JobSettings, read_run_env, read_training_params
 from deepracer_exp.deepracer.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
@@ -19,20 +17,30 @@ from deepracer_exp.deepracer.model_metadata import (
     read_model_metadata,
 )
 from deepracer_exp.errors import BadInput
-from deepracer_exp.files import read_bytes
 
-from .experiment import safe_name
-from .options import conf_dirs
-from .overrides import override_line, parse_single
+from .job_overrides import job_overrides
+from .overrides import first_given, override_line
 
 KEY = "custom_files"
 
 PLACES = {
-    "reward_function.py": ("reward_function.py",),
-    "model_metadata.json": ("model_metadata.json", "model/model_metadata.json"),
-    "hyperparameters.json": ("hyperparameters.json", "ip/hyperparameters.json"),
+    "reward_function.py": ("", "custom_files/"),
+    "model_metadata.json": ("", "custom_files/", "model/"),
+    "hyperparameters.json": ("", "custom_files/", "ip/"),
+    "run.env": ("",),
+    "training_params.yaml": ("",),
 }
-"""Where each file is in deepracer-for-cloud's `custom_files/`, and in the folder of a trained model."""
+"""Folders in which each file is: of deepracer-for-cloud, of one of its `experiments/`, or of a trained model."""
+
+SIMILAR = {
+    "reward_function.py": "*reward*.py",
+    "model_metadata.json": "*metadata*.json",
+    "hyperparameters.json": "*hyper*param*.json",
+}
+"""Other names under which racers keep these files: one that is alone is used, several are named."""
+
+CARS = {4: "deepracer_v4", 5: "deepracer_v5", 6: "deepracer_v6"}
+"""Our cars by simulation version."""
 
 TAKEN = {
     "lr": "algorithm.lr",
@@ -57,10 +65,18 @@ NOT_APPLICABLE = {
     "sac_alpha": "for SAC only",
     "sensor": "here observation=NAME chooses what the policy sees; the same sensors:",
     "neural_network": "for camera images; here use network=NAME",
-    "version": "the service's physics; here use car=NAME",
+    "version": f"no car of that simulation version; the oldest is car={CARS[4]}",
     "lidar_config": "here values of observation.lidar",
 }
 """Keys of both JSON files that have no effect here, and why."""
+
+
+class Left(NamedTuple):
+    """Files that could be one of a model's, and are not used."""
+
+    wanted: str
+    """Name of the file that is looked for: the usual one, or the one that run.env chooses."""
+    paths: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -73,6 +89,12 @@ class CustomFiles:
     """Paths of the files found, by their names in PLACES."""
     metadata: ModelMetadata | None
     hyperparameters: Hyperparameters | None
+    workers: tuple[JobSettings, ...] = ()
+    """Track, starts and race type of each simulation worker, from run.env or training_params.yaml; empty without."""
+    left: Mapping[str, "Left"] = field(default_factory=dict)
+    """What is not used of files with similar names, by the name in PLACES."""
+    unused: tuple[str, ...] = ()
+    """A line for each other file of deepracer-for-cloud that is not used, with the reason."""
 
     @property
     def name(self) -> str:
@@ -94,6 +116,13 @@ class CustomFiles:
             "steering_angle": {"low": low.steering_deg, "high": high.steering_deg},
             "speed": {"low": low.speed_mps, "high": high.speed_mps},
         }
+
+    @property
+    def car(self) -> str | None:
+        """Return the option of the car of the model's simulation version; None if the version is not given."""
+        if self.metadata is None or "version" not in self.metadata.given:
+            return None
+        return CARS.get(self.metadata.version)
 
     @property
     def learning(self) -> dict[str, Any]:
@@ -122,7 +151,7 @@ class CustomFiles:
             "version": metadata.version,
         }
         for key in metadata.given:
-            if key in NOT_APPLICABLE:
+            if key in NOT_APPLICABLE and not (key == "version" and self.car):
                 shown = f"{key}={values[key]}" if key in values else key
                 same = [" ".join(sensor_overrides(metadata))] if key == "sensor" else []
                 yield shown, " ".join([f"not applicable: {NOT_APPLICABLE[key]}", *same])
@@ -189,29 +218,42 @@ def network_overrides(metadata: ModelMetadata) -> list[str]:
 
 
 def read_custom_files(folder: str) -> CustomFiles:
-    """Read the JSON files of a folder and find its reward function.
+    """Read the files of a folder and find its reward function.
 
     Raises:
         BadInput: there is no such folder, it has none of the files, or one of them cannot be used.
     """
-    accepted = "a folder with reward_function.py, model_metadata.json or hyperparameters.json"
+    accepted = f"a folder with {', '.join(list(PLACES)[:-1])} or {list(PLACES)[-1]}"
     if not folder:
         raise BadInput(f"{KEY}='': no folder; accepted: {accepted}")
     try:
-        names = [path.name for path in Path(folder).iterdir()]
+        names = sorted(path.name for path in Path(folder).iterdir())
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise BadInput(f"{KEY} {folder}: cannot be read ({reason}); accepted: {accepted}") from error
-    paths = {}
+    workers, unused = _workers(folder, names)
+    paths, left = {}, {}
     for name, places in PLACES.items():
+        # run.env may choose another file by its name.
+        wanted = workers[0].files.get(name, name) if workers else name
+        exact = [Path(folder, place, wanted) for place in places]
+        similar = [
+            path for place in places for path in sorted(Path(folder, place).glob(SIMILAR.get(name, name)))
+        ]
         # Any kind of file of that name is used: its reader reports what is wrong with it.
-        there = [Path(folder, place) for place in places if os.path.lexists(Path(folder, place))]
+        there = [path for path in exact if os.path.lexists(path)]
+        if not there and wanted == name and len(similar) == 1:
+            there = similar
         if there:
             paths[name] = str(there[0])
-    if not paths:
+        others = tuple(str(path) for path in similar if path not in there[:1])
+        if others or (wanted != name and not there):
+            left[name] = Left(wanted, others)
+    if not paths and not left:
         # A file's name may contain line breaks.
-        held = [" ".join(name.split()) for name in sorted(names)[:5]] + ["..."] * (len(names) > 5)
-        raise BadInput(f"{KEY} {folder}: holds {', '.join(held) or 'nothing'}; accepted: {accepted}")
+        held = [" ".join(name.split()) for name in names[:5]] + ["..."] * (len(names) > 5)
+        inside = f"; {unused[0]}" if unused else ""
+        raise BadInput(f"{KEY} {folder}: holds {', '.join(held) or 'nothing'}; accepted: {accepted}{inside}")
     metadata = paths.get("model_metadata.json")
     learning = paths.get("hyperparameters.json")
     files = CustomFiles(
@@ -219,6 +261,9 @@ def read_custom_files(folder: str) -> CustomFiles:
         paths,
         read_model_metadata(metadata) if metadata else None,
         read_hyperparameters(learning) if learning else None,
+        workers,
+        left,
+        tuple(unused),
     )
     if files.metadata is not None and files.metadata.training_algorithm != "clipped_ppo":
         raise BadInput(
@@ -226,6 +271,33 @@ def read_custom_files(folder: str) -> CustomFiles:
             "algorithm so far"
         )
     return files
+
+
+def _workers(folder: str, names: Sequence[str]) -> tuple[tuple[JobSettings, ...], list[str]]:
+    """Return the settings of each simulation worker, and a line for each file of such settings that is not used."""
+    numbered = {int(found[1]): name for name in names if (found := re.fullmatch(r"worker-(\d+)\.env", name))}
+    unused = []
+    if "run.env" in names:
+        others = {number: str(Path(folder, name)) for number, name in numbered.items()}
+        workers = read_run_env(str(Path(folder, "run.env")), others)
+        if not workers[0].has_several:
+            unused += [
+                f"{name}: not used, because run.env does not say DR_TRAIN_MULTI_CONFIG=True"
+                for name in numbered.values()
+            ]
+        if "training_params.yaml" in names:
+            unused.append("training_params.yaml: not used, because of run.env")
+    else:
+        params = str(Path(folder, "training_params.yaml"))
+        workers = read_training_params(params) if "training_params.yaml" in names else ()
+        unused += [f"{name}: not used, because there is no run.env beside it" for name in numbered.values()]
+    experiments = Path(folder, "experiments")
+    if experiments.is_dir():
+        for path in sorted(experiments.iterdir()):
+            if path.is_dir():
+                own = override_line(KEY, str(path)).replace("'", "")
+                unused.append(f"experiments/{' '.join(path.name.split())}: not used; {own} trains it")
+    return workers, unused
 
 
 @dataclass(frozen=True)
@@ -254,16 +326,16 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
 
     reward = files.paths.get("reward_function.py")
     if reward is not None:
-        winner = _first(own, "reward", "reward.name", "reward.file")
+        winner = first_given(own, "reward", "reward.name", "reward.file")
         if winner is None:
             names["reward"] = files.name
             lines += [override_line("reward.file", reward), override_line("reward.name", files.name)]
-            notes.append("reward_function.py: used as reward.file")
+            notes.append(f"{Path(reward).name}: used as reward.file")
         else:
-            notes.append(f"reward_function.py: not used, because of {winner}")
+            notes.append(f"{Path(reward).name}: not used, because of {winner}")
 
     if files.action_space:
-        winner = _first(own, "action_space", "action_space.kind", "action_space.file")
+        winner = first_given(own, "action_space", "action_space.kind", "action_space.file")
         if winner is None:
             # Values instead of the file's path, so that config.yaml lists the actions without the file.
             values = dict(files.action_space)
@@ -275,11 +347,21 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
         else:
             notes.append(f"model_metadata.json: action_space: not used, because of {winner}")
 
+    if files.car is not None and files.metadata is not None:
+        winner = first_given(own, "car", "car.name")
+        if winner is None:
+            lines.append(override_line("car", files.car))
+            notes.append(f"model_metadata.json: version={files.metadata.version}: used as car={files.car}")
+        else:
+            notes.append(
+                f"model_metadata.json: version={files.metadata.version}: not used, because of {winner}"
+            )
+
     taken = []
     for key, value in files.learning.items():
         target = TAKEN[key]
         group = target.partition(".")[0]
-        winner = _first(own, group, target)
+        winner = first_given(own, group, target)
         if key == "num_episodes_between_training":
             frames = own.get(FRAMES)
             if frames is not None and frames != f"{FRAMES}=null":
@@ -293,125 +375,42 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
             notes.append(f"hyperparameters.json: {key}={value}: not used, because of {winner}")
     if taken:
         notes.append(f"hyperparameters.json: used as {', '.join(taken)}")
-    return FileOverrides(tuple(lines), names, (*notes, *files.remarks()))
+    job, told = job_overrides(files.workers, own)
+    notes += [*told, *_left(files, own)]
+    return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
 
 
-def _first(own: Mapping[str, str], *keys: str) -> str | None:
-    """Return the first of these overrides that the user gave."""
-    return next((own[key] for key in keys if key in own), None)
+def _left(files: CustomFiles, own: Mapping[str, str]) -> list[str]:
+    """Return a line for each file that is not used.
+
+    Raises:
+        BadInput: several files could be the one that is missing, and the user chose none.
+    """
+    notes = list(files.unused)
+    for name, (wanted, others) in files.left.items():
+        group, key = _CHOSEN_BY[name]
+        winner = wanted if name in files.paths else first_given(own, group, key)
+        # A file's name may contain line breaks.
+        shown = ", ".join(" ".join(os.path.relpath(path, files.folder).split()) for path in others)
+        if winner is None:
+            raise BadInput(
+                f"{KEY} {files.folder}: holds {shown or 'none'} but no {wanted}; accepted: one file of that name, or "
+                f"{key}=... beside it"
+            )
+        if shown:
+            notes.append(f"{shown}: not used, because of {winner}")
+    return notes
+
+
+_CHOSEN_BY = {
+    "reward_function.py": ("reward", "reward.file"),
+    "model_metadata.json": ("action_space", "action_space.file"),
+    "hyperparameters.json": ("algorithm", "algorithm"),
+}
+"""The user's own overrides that stand for a file."""
 
 
 def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, str]]:
     unknown = [key for key in given if key not in known]
     if unknown:
         yield ", ".join(unknown), "ignored, as by the service"
-
-
-_GROUPS = {
-    "reward_function.py": "reward",
-    "model_metadata.json": "action_space",
-    "hyperparameters.json": "algorithm",
-}
-
-
-def import_files(
-    files: CustomFiles,
-    name: str,
-    mapping: Mapping[str, Any],
-    more: Sequence[str] = (),
-    source: str | None = None,
-) -> list[Path]:
-    """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
-
-    Args:
-        files: the files of a folder.
-        name: name of the new options.
-        mapping: the experiment that the files describe, validated.
-        more: overrides that belong to the experiment, too.
-        source: where the files come from, if their folder is a temporary one.
-
-    Returns:
-        The files written, the experiment's last.
-
-    Raises:
-        BadInput: the name cannot be used or is taken, or a file cannot be written; then none is.
-    """
-    _check_name(name)
-    texts: dict[Path, bytes] = {}
-    imported = {file: group for file, group in _GROUPS.items() if file in files.paths}
-    for file, group in imported.items():
-        values = dict(mapping[group])
-        if group == "reward":
-            texts[Path("conf/reward", f"{name}.py")] = read_bytes(files.paths[file], "a Python file")
-            values |= {"name": name, "file": f"${{conf:'reward/{name}.py'}}"}
-        elif group == "algorithm":
-            keys = [target.removeprefix("algorithm.") for target in (*TAKEN.values(), FRAMES)]
-            values = {"defaults": ["ppo"]} | {key: values[key] for key in keys if key in values}
-        texts[Path("conf", group, f"{name}.yaml")] = _option(source or files.paths[file], values)
-    experiment: dict[str, Any] = {
-        "defaults": [{f"override /{group}": name} for group in imported.values()],
-        "name": name,
-    }
-    for override in map(parse_single, more):
-        group, _, key = override.key_or_group.partition(".")
-        if key:
-            *above, leaf = group, *key.split(".")
-            node = experiment
-            for part in above:
-                node = node.setdefault(part, {})
-            node[leaf] = override.value()
-        else:
-            experiment["defaults"].append({f"override /{group}": override.value()})
-    if (iterations := files.learning.get("term_cond_max_episodes")) is not None:
-        experiment.setdefault("budget", {})["iterations"] = iterations
-    texts[Path("conf/experiment", f"{name}.yaml")] = b"# @package _global_\n" + _option(
-        source or files.folder, experiment
-    )
-    searched = conf_dirs()
-    for path in texts:
-        for folder in (Path("conf"), *searched):
-            taken = folder / path.relative_to("conf")
-            if os.path.lexists(taken):
-                raise BadInput(f"--name {name}: {taken} exists already; accepted: a new name")
-    _write_all(texts)
-    return list(texts)
-
-
-def _check_name(name: str) -> None:
-    try:
-        safe_name(name)
-        plain = parse_single(f"experiment={name}").value() == name == yaml.safe_load(name)
-    except ValueError as error:
-        raise BadInput(f"--name {name!r}: {error}") from error
-    if not plain or name.endswith(".yaml"):
-        raise BadInput(
-            f"--name {name}: would not be read as a name; accepted: a name that begins with a letter"
-        )
-
-
-def _option(source: str, values: Mapping[str, Any]) -> bytes:
-    """Return the text of an option file that says where its values come from."""
-    # On one line even if the path has line breaks.
-    comment = f"# Imported from {re.sub(r'[^ -~]+', ' ', str(Path(source).resolve()))}.\n"
-    return (comment + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)).encode()
-
-
-def _write_all(texts: Mapping[Path, bytes]) -> None:
-    """Write all files or none."""
-    try:
-        for path, text in texts.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(text)
-    except OSError as error:
-        remove_options(texts)
-        raise BadInput(
-            f"{error.filename}: cannot be written ({error.strerror}); your own options are written to ./conf"
-        ) from error
-
-
-def remove_options(paths: Iterable[Path]) -> None:
-    """Remove option files, and the folders that are empty then."""
-    for path in paths:
-        for remove in (path.unlink, path.parent.rmdir, path.parent.parent.rmdir):
-            with contextlib.suppress(OSError):  # not there, or a folder with other files
-                remove()

@@ -1,7 +1,7 @@
 """Override expressions as users type them: Hydra's grammar, extended for paths and addresses."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -135,3 +135,8 @@ def key_of(line: str) -> str:
 def group_of(line: str) -> str:
     """Return the first part of an override's key."""
     return key_of(line).partition(".")[0]
+
+
+def first_given(own: Mapping[str, str], *keys: str) -> str | None:
+    """Return the first of these overrides that the user gave, None if there is none; `own` has them by key or group."""
+    return next((own[key] for key in keys if key in own), None)

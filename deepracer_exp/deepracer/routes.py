@@ -302,6 +302,11 @@ def _check_knots(knots: np.ndarray, width_m: np.ndarray, closed: bool) -> None:
         raise BadInput(f"knots[{repeated[0] + 1}] repeats the knot before it; accepted are distinct knots")
 
 
+def runs_clockwise(rows: np.ndarray) -> bool:
+    """Return whether a closed course's rows (n, 6) run clockwise around it."""
+    return _signed_area(rows[:, :2]) < 0
+
+
 def _signed_area(ring: np.ndarray) -> float:
     x, y = ring.T
     return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) / 2)

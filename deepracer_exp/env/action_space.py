@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import (
     ActionSpaceConfig,
     ContinuousActionSpace,
@@ -118,6 +119,37 @@ def describe_actions(actions: ActionSpace) -> str:
         return f"{actions.n} actions " + " ".join(f"{steering:g}°/{speed:g}" for steering, speed in pairs)
     low, high = actions.low.tolist(), actions.high.tolist()
     return f"continuous {low[0]:g} to {high[0]:g}°, {low[1]:g} to {high[1]:g} m/s"
+
+
+def action_remarks(actions: ActionSpace, car: CarConfig) -> list[str]:
+    """Return a line for what the car makes of actions beyond its limits, and for actions that are equal then."""
+    low = np.array([-car.max_steering_deg, car.min_speed_mps])
+    high = np.array([car.max_steering_deg, car.max_speed_mps])
+    remarks = []
+    for axis, (name, unit, limits) in enumerate(
+        (
+            ("steering_angle", "degrees", f"{-high[0]:g} to {high[0]:g}"),
+            ("speed", "m/s", f"{low[1]:g} to {high[1]:g}"),
+        )
+    ):
+        lowest, highest = actions.low[axis], actions.high[axis]
+        if lowest < low[axis] or highest > high[axis]:
+            remarks.append(
+                f"action_space: {name} from {lowest:g} to {highest:g} {unit}: the car cuts it to {limits} "
+                f"(car={car.name}), as the service does"
+            )
+    if isinstance(actions, DiscreteActions):
+        cut = np.clip(np.column_stack([actions.steering_deg, actions.speed_mps]), low, high)
+        alike: dict[tuple[float, ...], list[int]] = {}
+        for number, action in enumerate(cut.tolist()):
+            alike.setdefault(tuple(action), []).append(number)
+        for (steering, speed), numbers in alike.items():
+            if len(numbers) > 1:
+                remarks.append(
+                    f"action_space: actions {', '.join(map(str, numbers))} are the same, {steering:g} degrees at "
+                    f"{speed:g} m/s: {len(alike)} of {actions.n} actions differ"
+                )
+    return remarks
 
 
 def _discrete(steering_deg: ArrayLike, speed_mps: ArrayLike) -> DiscreteActions:

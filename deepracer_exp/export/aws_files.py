@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.config.custom_files import TAKEN
+from deepracer_exp.config.custom_files import CARS, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
@@ -35,9 +35,10 @@ def aws_files(experiment: Experiment, reward: str) -> tuple[dict[str, str], list
 
 
 def services_metadata(experiment: Experiment) -> ModelMetadata:
-    """Return the action space and the sensors of an experiment in the service's terms."""
+    """Return the action space, the sensors and the car's simulation version of an experiment in the service's terms."""
     actions = metadata_of(build_action_space(experiment.action_space))
-    return replace(actions, **sensor_keys(experiment.observation))
+    version = next((number for number, car in CARS.items() if car == experiment.car.name), actions.version)
+    return replace(actions, version=version, **sensor_keys(experiment.observation))
 
 
 def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:

@@ -14,23 +14,20 @@ from deepracer_exp.config.custom_files import (
     KEY,
     PLACES,
     CustomFiles,
-    import_files,
     network_overrides,
     read_custom_files,
-    remove_options,
     sensor_overrides,
     services_network,
 )
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.imported_options import import_files, remove_options
 from deepracer_exp.config.learning import CNNConfig
-from deepracer_exp.config.overrides import override_line
+from deepracer_exp.config.overrides import key_of, override_line
 from deepracer_exp.deepracer.model_archive import StoredModel, read_model
 from deepracer_exp.deepracer.model_metadata import NEURAL_NETWORKS, ModelMetadata
-from deepracer_exp.deepracer.worlds import find_world
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
-from deepracer_exp.files import read_yaml
 from deepracer_exp.rewards.source import load_reward_source
 
 from .run import store_run
@@ -38,6 +35,8 @@ from .run import store_run
 _CHECKPOINT = "checkpoint="
 _CHOSEN_HERE = tuple(f"model_metadata.json: {key}" for key in ("sensor", "neural_network", "lidar_config"))
 """Remarks on keys that have no effect where only options are made of the files."""
+_SETTINGS = ("training_params.yaml: ", "model_metadata.json: version=")
+"""How remarks on track, starts and car begin."""
 
 
 @dataclass(frozen=True)
@@ -88,11 +87,12 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
         )
     files = read_custom_files(aside)
     assert files.metadata is not None
-    world = _world(model, path)
-    seen = [*sensor_overrides(files.metadata), *([override_line("track", world)] if world else [])]
+    seen = sensor_overrides(files.metadata)
     experiment, composition, networks, network, absent = _fit(model, files, seen, name, changes)
     load_reward_source(experiment.reward)
-    options = import_files(files, name, composition.mapping, [*network, *seen], path)
+    own = {key_of(line): line for line in changes}
+    options = import_files(files, name, composition.mapping, [*network, *seen], path, own)
+    told = [note for note in composition.notes if note.startswith(_SETTINGS)]
     try:
         experiment, composition = compose_experiment([f"experiment={name}", *changes])
         result = store_run(experiment, composition, networks, f"imported from {model.source}")
@@ -100,7 +100,7 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
         remove_options(options)
         raise
     notes = [f"{model.source}: {', '.join([*seen, *network])}", *model.notes]
-    notes += _remarks(files, model, world, absent)
+    notes = list(dict.fromkeys([*notes, *_remarks(files, model, absent), *told]))
     return Imported(result.folder, options, notes, model.has_logs)
 
 
@@ -152,19 +152,7 @@ def _kinds(metadata: ModelMetadata, model: StoredModel) -> Iterator[str]:
             yield kind
 
 
-def _world(model: StoredModel, path: str) -> str | None:
-    """Return the track of the training, None if it is not known."""
-    raw = model.files.get("training_params.yaml")
-    if raw is None:
-        return None
-    params = read_yaml(f"{path}/training_params.yaml", "parameters of a training, KEY: VALUE", raw=raw)
-    world = params.get("WORLD_NAME") if isinstance(params, dict) else None
-    # One for each worker.
-    first = world[0] if isinstance(world, list) and world else world
-    return find_world(first) if isinstance(first, str) else None
-
-
-def _remarks(files: CustomFiles, model: StoredModel, world: str | None, absent: Sequence[str]) -> list[str]:
+def _remarks(files: CustomFiles, model: StoredModel, absent: Sequence[str]) -> list[str]:
     notes = []
     if VALUE in absent:
         notes.append(
@@ -179,9 +167,8 @@ def _remarks(files: CustomFiles, model: StoredModel, world: str | None, absent: 
         notes.append(
             "reward_function.py: not among the files; clones learn from the default reward unless given reward="
         )
-    notes.append(
-        f"training_params.yaml: track={world}"
-        if world
-        else "the track of the training is not known: the default is used; track=NAME chooses another"
-    )
+    if not any(worker.world for worker in files.workers):
+        notes.append(
+            "the track of the training is not known: the default is used; track=NAME chooses another"
+        )
     return notes

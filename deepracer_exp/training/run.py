@@ -26,6 +26,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.own_class import own_classes
 from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
+from deepracer_exp.env.action_space import action_remarks
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
@@ -260,7 +261,7 @@ def _begin(
             raise BadInput(reason) from error
         raise
     acting.remember()
-    for note in composition.notes:
+    for note in (*composition.notes, *action_remarks(setup.actions, experiment.car)):
         logger.info(note)
     if teacher is not None:
         logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)

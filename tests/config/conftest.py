@@ -71,7 +71,7 @@ def custom_files(tmp_path: Path) -> Callable[..., Path]:
         folder: str = "my model",
     ) -> Path:
         path = tmp_path / folder
-        path.mkdir(exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
         for name, content in (
             ("hyperparameters.json", hyperparameters),
             ("model_metadata.json", metadata),

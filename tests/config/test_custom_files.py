@@ -153,7 +153,8 @@ def test_every_key_of_the_metadata_is_taken_or_named(custom_files):
     notes = overrides_of(custom_files()).notes
     for key in model_metadata.KEYS:
         named = any(re.match(rf"model_metadata.json: {key}\b.*: not applicable: ", note) for note in notes)
-        assert named == (key not in ("action_space", "action_space_type", "training_algorithm"))
+        assert named == (key not in ("action_space", "action_space_type", "training_algorithm", "version"))
+    assert "model_metadata.json: version=5: used as car=deepracer_v5" in notes
 
 
 def test_notes_name_unknown_keys_and_ignored_indices(custom_files):

@@ -1,11 +1,13 @@
 import dataclasses
+import shlex
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from deepracer_exp.config.compose import Composition, compose_experiment
-from deepracer_exp.config.custom_files import import_files, read_custom_files
+from deepracer_exp.config.custom_files import read_custom_files
+from deepracer_exp.config.imported_options import import_files
 from tests.conftest import refused
 
 from .conftest import CONTINUOUS, METADATA, REWARD
@@ -53,6 +55,29 @@ def test_the_imported_experiment_is_the_one_of_the_files(custom_files, metadata,
     assert copy.read_text() == REWARD
     for group in ("reward", "action_space", "algorithm", "experiment"):
         assert composition.choices[group] == "mine"
+
+
+def test_an_imported_experiment_has_the_track_the_starts_and_the_car_of_the_files(custom_files):
+    folder = custom_files(metadata=METADATA | {"version": 4})
+    (folder / "run.env").write_text(
+        "DR_WORLD_NAME=Bowtie_track\nDR_TRAIN_REVERSE_DIRECTION=True\nDR_TRAIN_CHANGE_START_POSITION=False\n"
+    )
+    bring(folder, "mine")
+    files, _ = compose_experiment([f"custom_files={folder}"])
+    imported, composition = compose_experiment(["experiment=mine"])
+    assert (imported.track, imported.episode, imported.car) == (files.track, files.episode, files.car)
+    assert (composition.choices["track"], composition.choices["car"]) == ("Bowtie_track", "deepracer_v4")
+    assert (imported.track.direction, imported.episode.start_advance) == ("reversed", 0.0)
+
+
+def test_several_tracks_are_given_beside_an_imported_experiment(custom_files, call_at, here):
+    folder = custom_files()
+    (folder / "training_params.yaml").write_text("WORLD_NAME: [Oval_track, Bowtie_track]\n")
+    ended = call_at(here, "import", str(folder), "--name", "mine")
+    assert ended.code == 0, ended.stderr
+    words = shlex.split(ended.stdout.partition("deepracer-exp train ")[2])
+    assert words == ["experiment=mine", "track=[Oval_track,Bowtie_track]"]
+    assert list(compose_experiment(["experiment=mine"])[0].tracks) == ["reinvent_base"]
 
 
 def test_an_imported_option_combines_with_others(custom_files):

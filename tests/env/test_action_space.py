@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import (
     ActionSpaceConfig,
@@ -20,7 +21,12 @@ from deepracer_exp.config.driving import (
     SteeringRange,
 )
 from deepracer_exp.config.options import options
-from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions, build_action_space
+from deepracer_exp.env.action_space import (
+    ContinuousActions,
+    DiscreteActions,
+    action_remarks,
+    build_action_space,
+)
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 
@@ -173,3 +179,67 @@ def test_a_missing_file_is_bad_input(tmp_path: Path) -> None:
         build_action_space(
             with_file(compose_option("action_space", "discrete", ActionSpaceConfig), tmp_path / "none.json")
         )
+
+
+CAR = compose_option("car", "deepracer", CarConfig)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([-45.0, -30.0, -10.0, 0.0, 30.0, 60.0]),
+            st.sampled_from([0.05, 0.1, 2.0, 4.0, 6.0]),
+        ),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_actions_that_the_car_makes_equal_are_named_and_no_others(actions: list[tuple[float, float]]) -> None:
+    space = DiscreteActions(*np.array(actions).T)
+    driven = [(min(max(steering, -30.0), 30.0), min(max(speed, 0.1), 4.0)) for steering, speed in actions]
+    equal = {
+        tuple(at for at, one in enumerate(driven) if one == each) for each in driven if driven.count(each) > 1
+    }
+    named = [line for line in action_remarks(space, CAR) if "are the same" in line]
+    assert {
+        tuple(map(int, line.split("actions ")[1].split(" are")[0].split(", "))) for line in named
+    } == equal
+    beyond = {line.split(" ")[1] for line in action_remarks(space, CAR) if "cuts it" in line}
+    assert ("steering_angle" in beyond) == any(abs(steering) > 30 for steering, _ in actions)
+    assert ("speed" in beyond) == any(not 0.1 <= speed <= 4 for _, speed in actions)
+
+
+@pytest.mark.parametrize("name", options("action_space"))
+def test_none_of_our_own_spaces_has_a_remark(name: str) -> None:
+    assert (
+        action_remarks(build_action_space(compose_option("action_space", name, ActionSpaceConfig)), CAR) == []
+    )
+
+
+def test_ranges_beyond_the_cars_are_named_with_its_own() -> None:
+    (line,) = action_remarks(build_action_space(continuous((-45, 45), (1, 2))), CAR)
+    assert "steering_angle from -45 to 45 degrees: the car cuts it to -30 to 30" in line
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        (
+            "metadata_45_degrees.json",
+            ["from -45 to 45 degrees", "actions 3, 4, 5 are the same", "3 of 6 actions differ"],
+        ),
+        (
+            "metadata_same_actions.json",
+            ["actions 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11", "1 of 12 actions differ"],
+        ),
+    ],
+)
+def test_a_racer_is_told_before_a_training_starts(
+    train_here: Any, reference: Path, file: str, words: list[str]
+) -> None:
+    ended = train_here(f"action_space.file={reference / 'inputs' / file}")
+    assert ended.code == 0, ended.stderr
+    log = (ended.folder / "log.txt").read_text(encoding="utf-8")
+    for word in words:
+        assert word in ended.stderr
+        assert word in log

@@ -40,6 +40,12 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
     assert notes == []
 
 
+@pytest.mark.parametrize("car", ["deepracer_v4", "deepracer_v5", "deepracer_v6"])
+def test_an_exported_model_comes_back_to_its_car(tmp_path, car):
+    write_files(files(f"car={car}")[0], tmp_path / "aws")
+    assert compose_experiment([f"custom_files={tmp_path / 'aws'}"])[0].car.name == car
+
+
 @pytest.mark.parametrize(
     "overrides",
     [

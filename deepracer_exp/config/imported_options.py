@@ -1,0 +1,135 @@
+"""The files of a DeepRacer model as option files of your own (`deepracer-exp import`)."""
+
+import contextlib
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_bytes
+
+from .custom_files import FRAMES, TAKEN, CustomFiles
+from .experiment import safe_name
+from .job_overrides import job_overrides, several_of
+from .options import conf_dirs
+from .overrides import override_line, parse_single
+
+_GROUPS = {
+    "reward_function.py": "reward",
+    "model_metadata.json": "action_space",
+    "hyperparameters.json": "algorithm",
+}
+
+
+def import_files(
+    files: CustomFiles,
+    name: str,
+    mapping: Mapping[str, Any],
+    more: Sequence[str] = (),
+    source: str | None = None,
+    own: Mapping[str, str] | None = None,
+) -> list[Path]:
+    """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
+
+    Several tracks are left out, because no option file can choose them (`job_overrides.several_of`).
+
+    Args:
+        files: the files of a folder.
+        name: name of the new options.
+        mapping: the experiment that the files describe, validated.
+        more: overrides that belong to the experiment, too.
+        source: where the files come from, if their folder is a temporary one.
+        own: the user's own overrides by key or group, in whose place none is written.
+
+    Returns:
+        The files written, the experiment's last.
+
+    Raises:
+        BadInput: the name cannot be used or is taken, or a file cannot be written; then none is.
+    """
+    _check_name(name)
+    texts: dict[Path, bytes] = {}
+    imported = {file: group for file, group in _GROUPS.items() if file in files.paths}
+    for file, group in imported.items():
+        values = dict(mapping[group])
+        if group == "reward":
+            texts[Path("conf/reward", f"{name}.py")] = read_bytes(files.paths[file], "a Python file")
+            values |= {"name": name, "file": f"${{conf:'reward/{name}.py'}}"}
+        elif group == "algorithm":
+            keys = [target.removeprefix("algorithm.") for target in (*TAKEN.values(), FRAMES)]
+            values = {"defaults": ["ppo"]} | {key: values[key] for key in keys if key in values}
+        texts[Path("conf", group, f"{name}.yaml")] = _option(source or files.paths[file], values)
+    experiment: dict[str, Any] = {
+        "defaults": [{f"override /{group}": name} for group in imported.values()],
+        "name": name,
+    }
+    job, _ = job_overrides(files.workers, own or {})
+    lines = [*([override_line("car", files.car)] if files.car else ()), *job, *more]
+    left_out = several_of(job)
+    for override in map(parse_single, (line for line in lines if line not in left_out)):
+        group, _, key = override.key_or_group.partition(".")
+        if key:
+            *above, leaf = group, *key.split(".")
+            node = experiment
+            for part in above:
+                node = node.setdefault(part, {})
+            node[leaf] = override.value()
+        else:
+            experiment["defaults"].append({f"override /{group}": override.value()})
+    if (iterations := files.learning.get("term_cond_max_episodes")) is not None:
+        experiment.setdefault("budget", {})["iterations"] = iterations
+    texts[Path("conf/experiment", f"{name}.yaml")] = b"# @package _global_\n" + _option(
+        source or files.folder, experiment
+    )
+    searched = conf_dirs()
+    for path in texts:
+        for folder in (Path("conf"), *searched):
+            taken = folder / path.relative_to("conf")
+            if os.path.lexists(taken):
+                raise BadInput(f"--name {name}: {taken} exists already; accepted: a new name")
+    _write_all(texts)
+    return list(texts)
+
+
+def _check_name(name: str) -> None:
+    try:
+        safe_name(name)
+        plain = parse_single(f"experiment={name}").value() == name == yaml.safe_load(name)
+    except ValueError as error:
+        raise BadInput(f"--name {name!r}: {error}") from error
+    if not plain or name.endswith(".yaml"):
+        raise BadInput(
+            f"--name {name}: would not be read as a name; accepted: a name that begins with a letter"
+        )
+
+
+def _option(source: str, values: Mapping[str, Any]) -> bytes:
+    """Return the text of an option file that says where its values come from."""
+    # On one line even if the path has line breaks.
+    comment = f"# Imported from {re.sub(r'[^ -~]+', ' ', str(Path(source).resolve()))}.\n"
+    return (comment + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)).encode()
+
+
+def _write_all(texts: Mapping[Path, bytes]) -> None:
+    """Write all files or none."""
+    try:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(text)
+    except OSError as error:
+        remove_options(texts)
+        raise BadInput(
+            f"{error.filename}: cannot be written ({error.strerror}); your own options are written to ./conf"
+        ) from error
+
+
+def remove_options(paths: Iterable[Path]) -> None:
+    """Remove option files, and the folders that are empty then."""
+    for path in paths:
+        for remove in (path.unlink, path.parent.rmdir, path.parent.parent.rmdir):
+            with contextlib.suppress(OSError):  # not there, or a folder with other files
+                remove()

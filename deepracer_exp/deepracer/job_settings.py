@@ -1,0 +1,186 @@
+"""run.env, worker-N.env and training_params.yaml: where, from which starts and against whom the service trains."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.files import read_text, read_yaml
+
+ENV_KEYS = {
+    "WORLD_NAME": "DR_WORLD_NAME",
+    "RACE_TYPE": "DR_RACE_TYPE",
+    "REVERSE_DIR": "DR_TRAIN_REVERSE_DIRECTION",
+    "ALTERNATE_DRIVING_DIRECTION": "DR_TRAIN_ALTERNATE_DRIVING_DIRECTION",
+    "CHANGE_START_POSITION": "DR_TRAIN_CHANGE_START_POSITION",
+    "ROUND_ROBIN_ADVANCE_DIST": "DR_TRAIN_ROUND_ROBIN_ADVANCE_DIST",
+    "START_POSITION_OFFSET": "DR_TRAIN_START_POSITION_OFFSET",
+    "ENABLE_DOMAIN_RANDOMIZATION": "DR_ENABLE_DOMAIN_RANDOMIZATION",
+    "MULTI_CONFIG": "DR_TRAIN_MULTI_CONFIG",
+    "PRETRAINED": "DR_LOCAL_S3_PRETRAINED",
+}
+"""Keys of training_params.yaml that decide a training, and deepracer-for-cloud's for the same values.
+
+The last two are of run.env alone.
+"""
+RACE_TYPES = ("TIME_TRIAL", "OBJECT_AVOIDANCE", "HEAD_TO_BOT", "HEAD_TO_MODEL", "HEAD_TO_HEAD_RACING", "F1")
+FILE_KEYS = {
+    "reward_function.py": "DR_LOCAL_S3_REWARD_KEY",
+    "model_metadata.json": "DR_LOCAL_S3_MODEL_METADATA_KEY",
+    "hyperparameters.json": "DR_LOCAL_S3_HYPERPARAMETERS_KEY",
+}
+"""Keys of run.env that choose the three files of a model."""
+_LINE = re.compile(r"(?:export\s+)?([A-Za-z_]\w*)=(.*)")
+_TRUE, _FALSE = ("true", "t", "yes", "y", "on", "1"), ("false", "f", "no", "n", "off", "0", "")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobSettings:
+    """What one simulation worker of the service was to do; None: the file does not say."""
+
+    file: str
+    """Path of the file."""
+    keys: Mapping[str, str]
+    """How the file calls the keys of training_params.yaml."""
+    given: tuple[str, ...]
+    """The file's own keys, in its order."""
+    world: str | None
+    is_clockwise: bool | None
+    """Which of the two worlds is meant that are sampled for one direction each (deepracer-on-aws)."""
+    race_type: str
+    reverse: bool | None
+    alternate: bool | None
+    changes_start: bool | None
+    start_advance: float | None
+    """Share of the lap by which the start advances after an episode."""
+    start_offset: float | None
+    """Share of the lap at which the first episode starts."""
+    randomizes: bool
+    has_several: bool
+    """Whether each worker has a file of its own (run.env)."""
+    is_pretrained: bool
+    """Whether the training continues that of another model (run.env)."""
+    files: Mapping[str, str]
+    """Names of the three files of a model where run.env chooses others than the usual ones."""
+
+    @property
+    def name(self) -> str:
+        """Return the file's name."""
+        return Path(self.file).name
+
+
+def read_run_env(path: str, workers: Mapping[int, str]) -> tuple[JobSettings, ...]:
+    """Read deepracer-for-cloud's run.env, and the worker-N.env that hold for its further workers.
+
+    A worker's file has what differs from the worker before it.
+
+    Args:
+        path: of run.env.
+        workers: paths of worker-N.env by N, which count if run.env says that workers differ.
+
+    Raises:
+        BadInput: a file cannot be read or has a value that the service does not accept.
+
+    Source of the rules: deepracer-for-cloud, scripts/training/prepare-config.py.
+    """
+    values = _read_env(path)
+    first = _settings(path, values, ENV_KEYS, tuple(values))
+    if not first.has_several:
+        return (first,)
+    found = [first]
+    for number in sorted(workers):
+        own = _read_env(workers[number])
+        values = values | own
+        found.append(_settings(workers[number], values, ENV_KEYS, tuple(own)))
+    return tuple(found)
+
+
+def read_training_params(path: str, raw: bytes | None = None) -> tuple[JobSettings, ...]:
+    """Read the training_params.yaml of a model, in which a key has one value, or one for each worker.
+
+    Raises:
+        BadInput: as for `read_run_env`.
+    """
+    accepted = "parameters of a training, KEY: VALUE"
+    data = read_yaml(path, accepted, raw=raw)
+    if not isinstance(data, dict):
+        raise BadInput(f"{path}: holds no keys; accepted: {accepted}")
+    lists = {str(key): value if isinstance(value, list) else [value] for key, value in data.items()}
+    workers = max(len(lists.get(key, ())) for key in ENV_KEYS)
+    same = {key: key for key in ENV_KEYS}
+    return tuple(
+        _settings(
+            path,
+            {key: str(value[min(k, len(value) - 1)]) for key, value in lists.items() if value},
+            same,
+            tuple(lists),
+        )
+        for k in range(max(1, workers))
+    )
+
+
+def _read_env(path: str) -> dict[str, str]:
+    accepted = "lines KEY=VALUE and comments (#)"
+    values = {}
+    for number, line in enumerate(read_text(path, accepted).splitlines(), 1):
+        if not (text := line.strip()) or text.startswith("#"):
+            continue
+        if (found := _LINE.fullmatch(text)) is None:
+            raise BadInput(f"{path}: line {number}: {text[:80]}; accepted: {accepted}")
+        value = found[2].strip()
+        quoted = re.match(r"""(["'])(.*?)\1""", value)
+        # A shell ends an unquoted value at a blank.
+        values[found[1]] = quoted[2] if quoted else (value.split() or [""])[0]
+    return values
+
+
+def _settings(
+    path: str, values: Mapping[str, str], keys: Mapping[str, str], given: tuple[str, ...]
+) -> JobSettings:
+    def truth(key: str) -> bool | None:
+        if (word := values.get(keys.get(key, key))) is None:
+            return None
+        if word.lower() not in (*_TRUE, *_FALSE):
+            raise BadInput(f"{path}: {keys.get(key, key)}={word[:80]}; accepted: True, False")
+        return word.lower() in _TRUE
+
+    def share(key: str) -> float | None:
+        if (word := values.get(keys[key])) is None:
+            return None
+        try:
+            number = float(word)
+        except ValueError:
+            number = -1.0
+        if not 0.0 <= number <= 1.0:
+            raise BadInput(f"{path}: {keys[key]}={word[:80]}; accepted: a share of the lap, 0 to 1")
+        return number
+
+    race_type = values.get(keys["RACE_TYPE"], RACE_TYPES[0]).upper()
+    if race_type not in RACE_TYPES:
+        known = ", ".join(RACE_TYPES)
+        raise BadInput(
+            f"{path}: {keys['RACE_TYPE']}={race_type[:80]}; accepted: {known}{nearest(race_type, RACE_TYPES)}"
+        )
+    return JobSettings(
+        file=path,
+        keys=keys,
+        given=given,
+        world=values.get(keys["WORLD_NAME"]) or None,
+        is_clockwise=truth("TRACK_DIRECTION_CLOCKWISE"),
+        race_type=race_type,
+        reverse=truth("REVERSE_DIR"),
+        alternate=truth("ALTERNATE_DRIVING_DIRECTION"),
+        changes_start=truth("CHANGE_START_POSITION"),
+        start_advance=share("ROUND_ROBIN_ADVANCE_DIST"),
+        start_offset=share("START_POSITION_OFFSET"),
+        randomizes=bool(truth("ENABLE_DOMAIN_RANDOMIZATION")),
+        has_several=bool(truth("MULTI_CONFIG")),
+        is_pretrained=bool(truth("PRETRAINED")),
+        # A key in an S3 bucket, often with a variable in front: $DR_LOCAL_S3_CUSTOM_FILES_PREFIX/reward_function.py.
+        files={
+            name: found[0]
+            for name, key in FILE_KEYS.items()
+            if (found := re.search(r"[A-Za-z0-9][\w.-]*\.(py|json)$", values.get(key, "")))
+        },
+    )
