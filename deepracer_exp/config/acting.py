@@ -146,14 +146,13 @@ def take_over(config: dict[str, Any], where: str) -> list[str]:
     return left_out
 
 
-def refuse_reward(config: Mapping[str, Any], where: str) -> None:
-    """Refuse to run a reward function that only a stored configuration names.
+def refuse_reward(file: str | None, where: str) -> None:
+    """Refuse to run a file as reward function that only a stored configuration names; None: there is no file.
 
     Raises:
         BadInput: the message says how the user names it.
     """
-    file = _part(config, "reward").get("file")
-    if isinstance(file, str) and not reward_file(file).is_own:
+    if file is not None and not reward_file(file).is_own:
         raise BadInput(
             f"{REWARD}={file}: named by {where}, and not a reward function that you have trained with, or changed "
             f"since; read it, and if you trust it, give {REWARD}={file}"

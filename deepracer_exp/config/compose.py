@@ -92,7 +92,7 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
     composition = compose_entry("train", overrides, stored=stored)
     experiment = parse_experiment(composition.mapping)
     _check_names(experiment.evaluation)
-    acting.refuse_reward(composition.mapping, "the study")
+    acting.refuse_reward(experiment.reward.file, "the study")
     import_own_classes(experiment)
     return experiment, composition
 

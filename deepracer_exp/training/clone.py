@@ -63,7 +63,7 @@ def prepare_clone(
     checkpoint = read_checkpoint(parent.experiment, parent.checkpoints, name)
     composition = _changed(parent, changes, stored)
     experiment = parse_experiment(composition.mapping)
-    acting.refuse_reward(composition.mapping, parent.path.name)
+    acting.refuse_reward(experiment.reward.file, parent.path.name)
     refuse_other_networks(parent.experiment, experiment)
     above = read_lineage(parent.path)
     lineage = Lineage(
