@@ -5,8 +5,10 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from tests.conftest import command
@@ -26,6 +28,14 @@ def scratch():
 def left(scratch: Path) -> set[str]:
     """Return what lies there, without the one cache that PyTorch keeps for all processes."""
     return {one.name for one in scratch.iterdir() if not one.name.startswith("torchinductor_")}
+
+
+def is_over(process: psutil.Process) -> bool:
+    """Return whether a process has closed its files."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
 
 
 def semaphores(names: set[str]) -> list[str]:
@@ -54,9 +64,12 @@ def test_the_next_command_clears_what_kill_9_has_left(start, scratch):
 
     another()
     assert left(scratch) == names, "the folder of a living command is gone"
-    for process in training.processes():
+    killed = training.processes()
+    for process in killed:
         process.kill()
     training.popen.wait()
+    while not all(map(is_over, killed)):  # a killed process first gives its memory back
+        time.sleep(0.05)
     assert left(scratch) == names
     another()
     assert not left(scratch)
