@@ -5,10 +5,12 @@ import json
 import pytest
 
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.tracking.calls import StoreRefusedError
 from deepracer_exp.tracking.delivery import deliver, deliver_evaluation, is_delivered
+from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracker import MLflowTracker
-from deepracer_exp.tracking.tracking_file import read_tracked_run
+from deepracer_exp.tracking.tracking_file import TrackedRun, read_tracked_run
 
 from .conftest import points, runs_of
 
@@ -113,3 +115,17 @@ def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, mlfl
     deliver_evaluation(run_dir, away, tmp_path, 300, metrics, {film: "films"})
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "this evaluation was not recorded" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "place", ["http://127.0.0.1:1/files", "s3://bucket/files", "ftp://127.0.0.1:1/files"]
+)
+def test_no_file_goes_to_a_machine_that_only_a_database_file_names(store, mlflow, tmp_path, place):
+    mlflow.create_experiment("race", place)
+    run = MLflowRun(store)
+    run.connect()
+    run.create(TrackedRun(None, "run", "race", 1, store.shown), again=False)
+    file = tmp_path / "summary.json"
+    file.write_text("{}")
+    with pytest.raises(StoreRefusedError, match="another machine"):
+        run.log_artifact(file, None)
