@@ -5,12 +5,23 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 _WALL_FACTOR = 10
 """Wall-clock limit over CPU limit: the machine may be that busy, and `sleep` uses no CPU."""
 _STREAMS = ("stdin", "stdout", "stderr")
+_REFUSED: tuple[tuple[Any, str], ...] = (
+    *(
+        (signal, name)
+        for name in ("signal", "setitimer", "alarm", "pthread_sigmask")
+        if hasattr(signal, name)
+    ),
+    *((owner, "start") for owner in (threading.Thread, BaseProcess)),
+)
+"""What guarded code must not call, as owner and name."""
 
 
 class Misconduct(BaseException):
@@ -25,26 +36,52 @@ class CtrlC(KeyboardInterrupt):
     """The user's Ctrl-C; any other KeyboardInterrupt is one that the guarded code raised."""
 
 
+_set_handler = signal.signal
+_set_timer: Any = getattr(signal, "setitimer", None)
+_inside: set[int] = set()
+"""Threads that are in a guarded block."""
+
+
+def _refusal(owner: Any, name: str) -> Callable[..., Any]:
+    """Return what stands for a function that guarded code must not call; other threads may call it."""
+    original = getattr(owner, name)
+
+    def refused(*args: Any, **options: Any) -> Any:
+        if threading.get_ident() in _inside:
+            raise Misconduct(f"called {owner.__name__}.{name}, which a reward function must not")
+        return original(*args, **options)
+
+    return refused
+
+
+_ORIGINALS = [(owner, name, getattr(owner, name)) for owner, name in _REFUSED]
+_REFUSALS = [(owner, name, _refusal(owner, name)) for owner, name in _REFUSED]
+
+
 class Guard:
     """Runs a block of untrusted code; a context manager.
 
     The limit is CPU time of this thread: however busy the machine is, only the code itself can use it up. Code that
     waits without computing is stopped after `_WALL_FACTOR` times the limit; time in which the whole process was
-    stopped does not count. The error is raised repeatedly, to get out of a loop whose bare `except:` swallowed it.
+    stopped does not count. The error is raised again and again, to get out of a loop whose bare `except:` swallows it.
     There is no limit outside the main thread, to which Python delivers signals, and on platforms without interval
     timers; C code that never returns to the interpreter cannot be stopped.
 
-    Shared objects are restored at the end: built-ins, standard streams, the handlers of the two signals used.
+    Shared objects are restored at the end: built-ins, standard streams, the handlers of the two signals used. What
+    could switch the limit off, or outlive the block and keep the process from ending, is refused meanwhile: see
+    `_REFUSED`.
 
     Raises:
         DeadlinePassed: inside the block: it exceeded its time limit.
-        Misconduct: at the end: the block replaced a built-in, or replaced or closed a standard stream.
+        Misconduct: inside the block: it called what is refused. At the end: it replaced a built-in, or replaced or
+            closed a standard stream.
         CtrlC: the user's, even where the block swallowed it.
     """
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
         self._interrupted = False
+        self._raised = 0
         self._has_signals = (
             hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
         )
@@ -59,25 +96,33 @@ class Guard:
             # Only a handler in Python can raise an exception.
             self._sigint = signal.getsignal(signal.SIGINT)
             if callable(self._sigint):
-                signal.signal(signal.SIGINT, self._on_ctrl_c)
-            self._sigalrm = signal.signal(signal.SIGALRM, self._on_alarm)
+                _set_handler(signal.SIGINT, self._on_ctrl_c)
+            self._sigalrm = _set_handler(signal.SIGALRM, self._on_alarm)
             self._timer = self._arm(self._limit_s)
+        for owner, name, refusal in _REFUSALS:
+            setattr(owner, name, refusal)
+        self._is_outermost = threading.get_ident() not in _inside
+        _inside.add(threading.get_ident())
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         violation = self._restore()
+        if self._is_outermost:
+            _inside.discard(threading.get_ident())
+            for owner, name, original in _ORIGINALS:
+                setattr(owner, name, original)
         if self._has_signals:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, self._sigalrm)
+            _set_timer(signal.ITIMER_REAL, 0.0)
+            _set_handler(signal.SIGALRM, self._sigalrm)
             if callable(self._sigint):
-                signal.signal(signal.SIGINT, self._sigint)
+                _set_handler(signal.SIGINT, self._sigint)
             left, interval = self._timer
             if left:
                 # A timer that has expired meanwhile fires at once; 0 would switch it off.
                 left = max(left - (time.monotonic() - self._entered_s), 1e-3)
-                signal.setitimer(signal.ITIMER_REAL, left, interval)
+                _set_timer(signal.ITIMER_REAL, left, interval)
         if self._interrupted and not isinstance(error, CtrlC):
             raise CtrlC
         if violation and not isinstance(error, Misconduct | CtrlC):  # it may be the cause of any other error
@@ -91,21 +136,27 @@ class Guard:
     def _arm(self, after_s: float) -> tuple[float, float]:
         """Set the timer to so many seconds, and from then on to intervals of the limit; return the previous timer."""
         self._armed_s = after_s
-        return signal.setitimer(signal.ITIMER_REAL, after_s, self._limit_s)
+        return _set_timer(signal.ITIMER_REAL, after_s, self._limit_s)
 
     def _on_alarm(self, signum: int, frame: FrameType | None) -> None:
         # Not the clock: a pause of the whole process counts as one interval at most.
         self._waited_s += self._armed_s
+        if frame is not None and frame.f_code.co_filename == __file__:
+            self._arm(1e-3)  # what was replaced is being restored, which must not be interrupted
+            return
         used_s = time.thread_time() - self._cpu_began_s
         wait_s = self._limit_s * _WALL_FACTOR
         left_s = min(self._limit_s - used_s, wait_s - self._waited_s)
         if left_s > 0:
             self._arm(max(left_s, 1e-3))
             return
-        self._armed_s = self._limit_s
         limit = f"the time limit of {self._limit_s:g} s of CPU for one step"
         waits = f"{wait_s:g} s without computing: {_WALL_FACTOR} times {limit}"
-        raise DeadlinePassed(f"took longer than {limit if used_s >= self._limit_s else waits}")
+        error = DeadlinePassed(f"took longer than {limit if used_s >= self._limit_s else waits}")
+        # Again after a microsecond, two, four, ...: one of these meets a loop outside the `try` that catches the error.
+        self._raised += 1
+        self._arm(1e-6 * 2 ** (self._raised % 10))
+        raise error
 
     def _on_ctrl_c(self, signum: int, frame: FrameType | None) -> None:
         assert callable(self._sigint)

@@ -4,8 +4,10 @@ import io
 import pickle
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.rewards.guard import Guard
 from deepracer_exp.rewards.params import COLUMNS, TrackParams, batch_params, rows, scalar_params, select
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
@@ -238,6 +241,60 @@ def test_time_in_which_the_whole_process_was_stopped_does_not_count() -> None:
     )
     body = f"{stop}; os.kill(os.getpid(), signal.SIGSTOP); return 1.0"
     np.testing.assert_array_equal(function(body, n_cars=1, time_limit_s=0.05)(columns(1), ROAD), [1.0])
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        ("import threading, time; threading.Thread(target=time.sleep, args=(600,)).start()", "Thread.start"),
+        (
+            "import time; from concurrent.futures import ThreadPoolExecutor;"
+            " ThreadPoolExecutor().submit(time.sleep, 600)",
+            "Thread.start",
+        ),
+        (
+            "import multiprocessing, time; multiprocessing.Process(target=time.sleep, args=(600,)).start()",
+            "BaseProcess.start",
+        ),
+        (
+            "import signal; signal.signal(signal.SIGALRM, signal.SIG_IGN)\n    while True: pass",
+            "signal.signal",
+        ),
+        ("import signal; signal.setitimer(signal.ITIMER_REAL, 0)\n    while True: pass", "signal.setitimer"),
+    ],
+)
+def test_what_would_keep_the_command_from_ending_is_refused(body: str, name: str) -> None:
+    error = failure(function(body))
+    assert f"reward_function called {name}, which a reward function must not in line 2" in str(error)
+    assert threading.active_count() == 1
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [
+        "while True:\n        try:\n            while True: pass\n        except: pass",
+        "while True:\n        try: pass\n        except BaseException: continue\n        finally: x = 1",
+        "for i in range(10**12):\n        try: sum(range(1000))\n        except: print(i)",
+    ],
+)
+def test_a_loop_that_catches_everything_ends_at_its_limit(loop: str) -> None:
+    assert "took longer than the time limit" in str(failure(function(loop, time_limit_s=0.05)))
+
+
+def test_the_threads_of_others_start_while_a_reward_runs() -> None:
+    started = threading.Event()
+
+    def start_another() -> None:
+        thread = threading.Thread(target=started.set)
+        thread.start()
+        thread.join()
+
+    with ThreadPoolExecutor(1) as others:
+        others.submit(int).result()
+        with Guard(60.0):
+            others.submit(start_another).result()
+    assert started.is_set()
+    threading.Thread(target=started.clear).start()
 
 
 def test_timer_and_handler_found_are_put_back() -> None:
