@@ -278,18 +278,26 @@ def _choose_graphics() -> None:
     """Set MUJOCO_GL, which MuJoCo reads when it is imported, to a library that this machine has, unless it is set.
 
     Raises:
-        BadInput: the machine has no such library.
+        BadInput: the machine has no such library, or MuJoCo cannot draw with it.
     """
-    if os.environ.get("MUJOCO_GL") or sys.platform != "linux":
-        return
-    for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-        if ctypes.util.find_library(library):
-            os.environ["MUJOCO_GL"] = name
-            return
-    raise BadInput(
-        "--video: this machine has neither EGL nor OSMesa to draw with; install libegl1 (with libgl1-mesa-dri) or "
-        "libosmesa6, or set MUJOCO_GL"
-    )
+    if not os.environ.get("MUJOCO_GL") and sys.platform == "linux":
+        libraries = (("egl", "EGL"), ("osmesa", "OSMesa"))
+        name = next((name for name, library in libraries if ctypes.util.find_library(library)), None)
+        if name is None:
+            raise BadInput(
+                "--video: this machine has neither EGL nor OSMesa to draw with; install libegl1 (with "
+                "libgl1-mesa-dri) or libosmesa6, or set MUJOCO_GL"
+            )
+        os.environ["MUJOCO_GL"] = name
+    chosen = os.environ.get("MUJOCO_GL", "")
+
+    from deepracer_exp.evaluation.video import can_draw
+
+    if not can_draw():
+        raise BadInput(
+            f"--video: MuJoCo cannot draw with MUJOCO_GL={chosen} here; accepted: egl or osmesa with its library, glfw "
+            "with a display"
+        )
 
 
 def _checkpoints(args: argparse.Namespace) -> int:

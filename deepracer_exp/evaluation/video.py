@@ -1,16 +1,17 @@
 """Video of a lap, rendered by MuJoCo."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.sim import mujoco
 from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
 from deepracer_exp.tracks.picture import draw_track, extent
 from deepracer_exp.tracks.track import Track
@@ -28,6 +29,17 @@ _HEAD = 0.2
 _MARK_RGBA = (1.0, 0.75, 0.0, 0.55)
 _SMOOTHING = 0.13
 """Share of a heading change that the chase camera follows per frame."""
+
+
+def can_draw() -> bool:
+    """Return whether MuJoCo can draw with the graphics library that it was imported with."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # glfw's, before it fails
+            mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
+    except Exception:  # noqa: BLE001 - graphics libraries raise anything
+        return False
+    return True
 
 
 def render_lap(lap: Lap, car: CarConfig, view: View) -> Iterator[NDArray[np.uint8]]:
