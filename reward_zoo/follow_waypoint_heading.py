@@ -36,10 +36,10 @@ def reward_function(params: dict) -> float:
 def _directions(params: dict) -> tuple:
     """Return what `_direction` does, for many cars."""
     points = params["waypoints"]
-    behind, ahead = params["closest_waypoints"].T
-    same = (points[behind] == points[ahead]).all(axis=1)
+    behind, ahead = np.transpose(params["closest_waypoints"])
+    same = np.all(points[behind] == points[ahead], axis=1)
     ahead = np.where(same, (ahead + 1) % len(points), ahead)
-    dx, dy = (points[ahead] - points[behind]).T
+    dx, dy = np.transpose(points[ahead] - points[behind])
     length = np.hypot(dx, dy)
     length[length == 0.0] = 1.0
     return dx / length, dy / length

@@ -47,8 +47,8 @@ def reward_batch(params: dict) -> np.ndarray:
     """Apply the same formula to many cars."""
     points = params["waypoints"]
     n = len(points)
-    behind, ahead = params["closest_waypoints"].T
-    ahead = np.where((points[behind] == points[ahead]).all(axis=1), (ahead + 1) % n, ahead)
+    behind, ahead = np.transpose(params["closest_waypoints"])
+    ahead = np.where(np.all(points[behind] == points[ahead], axis=1), (ahead + 1) % n, ahead)
     index = (ahead[:, None] + np.arange(n)) % n
     dx = points[index, 0] - params["x"][:, None]
     dy = points[index, 1] - params["y"][:, None]
@@ -56,9 +56,9 @@ def reward_batch(params: dict) -> np.ndarray:
     first = np.where(found.any(axis=1), found.argmax(axis=1), n - 1)
     far = index[np.arange(len(ahead)), first]
     beyond = (far + 1) % n
-    beyond = np.where((points[beyond] == points[far]).all(axis=1), (beyond + 1) % n, beyond)
-    ax, ay = (points[ahead] - points[behind]).T
-    bx, by = (points[beyond] - points[far]).T
+    beyond = np.where(np.all(points[beyond] == points[far], axis=1), (beyond + 1) % n, beyond)
+    ax, ay = np.transpose(points[ahead] - points[behind])
+    bx, by = np.transpose(points[beyond] - points[far])
     turn = np.abs(np.degrees(np.arctan2(ax * by - ay * bx, ax * bx + ay * by)))
     target = TOP_SPEED_MPS - (TOP_SPEED_MPS - LOW_SPEED_MPS) * np.minimum(1.0, turn / SHARP_TURN_DEG)
     right = np.maximum(0.0, 1.0 - np.abs(params["speed"] - target) / (TOP_SPEED_MPS - LOW_SPEED_MPS))

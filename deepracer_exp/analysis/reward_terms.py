@@ -13,7 +13,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.deepracer.recording import LogProblem
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.guard import CtrlC, Guard
-from deepracer_exp.rewards.reward import RewardFunction, Unusable
+from deepracer_exp.rewards.reward import RewardFunction, Unusable, what_happened
 from deepracer_exp.rewards.source import RewardSource, is_of_zoo
 
 from .log_view import LogView
@@ -91,7 +91,7 @@ def contributed_terms(
     except CtrlC:
         raise
     except BaseException as error:  # noqa: BLE001 - raised again as BadInput
-        what, cause = function.what_happened(error)
+        what, cause = what_happened(error, source.path, time_limit_s)
         at = steps.iloc[evaluated[min(len(found), len(evaluated) - 1)]]
         place = f"episode {at['episode']}, step {at['steps']}"
         raise BadInput(f"{source.path}: terms {what} ({place})") from cause

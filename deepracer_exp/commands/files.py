@@ -26,7 +26,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         _validate,
         help="find out what a reward function pays for",
         description=(
-            "Check a reward function as the AWS console does, call it in many situations on the track, draw what it "
+            "Check a reward function as deepracer-on-aws does, call it in many situations on the track, draw what it "
             "pays for, and warn of common mistakes."
         ),
         epilog=_VALIDATE_EPILOG,
@@ -36,7 +36,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         *("-o", "--output"), type=_picture, help="picture to write (default: runs/validate/REWARD-TRACK.png)"
     )
-    parser.add_argument("--strict", action="store_true", help="refuse what the AWS console would refuse")
+    parser.add_argument("--strict", action="store_true", help="refuse what deepracer-on-aws would refuse")
 
     parser = add_command(
         commands,
@@ -196,7 +196,7 @@ _VALIDATE_EPILOG = """\
   deepracer-exp validate reward.file=my_reward.py track=Oval_track
   deepracer-exp validate reward.file=my_reward.py trial=60s also train for that long: do reward and progress rise?
 
-exit code: 0 it can be trained, even if there are warnings; 2 it cannot, or with --strict the console would refuse it
+exit code: 0 it can be trained, even with warnings; 2 it cannot, or with --strict deepracer-on-aws would refuse it
 """
 
 

@@ -24,7 +24,7 @@ from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.runs.result import read_result
-from deepracer_exp.validation.console import console_findings
+from deepracer_exp.validation.aws_rules import text_findings
 
 from .aws_files import aws_files, write_files
 from .aws_logs import write_aws_logs
@@ -150,7 +150,7 @@ def _aws(run: StoredRun, _: ExportConfig, folder: Path) -> _Written:
     texts, notes = aws_files(run.experiment, reward)
     write_files(texts, folder)
     refused = [
-        f"reward_function.py: the AWS console would reject it: {one}" for one in console_findings(reward)
+        f"reward_function.py: deepracer-on-aws would refuse it: {one}" for one in text_findings(reward)
     ]
     return (folder / name for name in texts), notes + refused
 

@@ -88,7 +88,7 @@ class RewardFunction:
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            what, cause = self.what_happened(error)
+            what, cause = what_happened(error, source.path, time_limit_s)
             how = "" if isinstance(error, Unusable) else "cannot be run: "
             raise BadInput(f"{source.path}: {how}{what}") from cause
         self._track_params: Sequence[TrackParams] = ()
@@ -220,36 +220,9 @@ class RewardFunction:
         """Raise RewardFailed for an error of the function."""
         function = "reward_batch" if self.is_batch else "reward_function"
         where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
-        what, cause = self.what_happened(error)
+        what, cause = what_happened(error, self.source.path, self.time_limit_s)
         message = f"reward {self.source.name}: {function} {what} ({where})"
         raise RewardFailed(message, params, car, what, isinstance(error, DeadlinePassed)) from cause
-
-    def what_happened(self, error: BaseException) -> tuple[str, Exception | None]:
-        """Describe an error of the module's code in one line with its place; also return its traceback as a cause.
-
-        The error itself is not passed on: printing it would run code of the module (`__str__`, `__repr__`) without a
-        guard.
-        """
-        if isinstance(error, Unusable):
-            return str(error), None
-        line, trace = 0, error.__traceback__
-        while trace is not None:
-            if trace.tb_frame.f_code.co_filename == self.source.path:
-                line = trace.tb_lineno
-            trace = trace.tb_next
-        place = f" in line {line} of {self.source.path}" if line else ""
-        try:
-            with Guard(self.time_limit_s):
-                if isinstance(error, Misconduct):
-                    said = str(error)
-                else:
-                    message = _one_line(str(error))
-                    said = f"raised {type(error).__name__}{': ' + message if message else ''}"
-                return said + place, _Traceback("".join(traceback.format_exception(error)))
-        except CtrlC:
-            raise
-        except BaseException:  # noqa: BLE001 - of the error's own code
-            return f"raised an error that cannot be printed{place}", None
 
 
 class _Traceback(Exception):  # noqa: N818 - as `multiprocessing` has it for errors of other processes
@@ -261,6 +234,34 @@ class _Traceback(Exception):  # noqa: N818 - as `multiprocessing` has it for err
 
 class Unusable(Exception):  # noqa: N818 - reads as what it is at the raise site
     """A reward module returned or defined something that cannot be used."""
+
+
+def what_happened(error: BaseException, path: str, time_limit_s: float) -> tuple[str, Exception | None]:
+    """Describe an error of the code of module `path` in one line with its place; also return its traceback as a cause.
+
+    The error itself is not passed on: printing it would run code of the module (`__str__`, `__repr__`) without a
+    guard.
+    """
+    if isinstance(error, Unusable):
+        return str(error), None
+    line, trace = 0, error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == path:
+            line = trace.tb_lineno
+        trace = trace.tb_next
+    place = f" in line {line} of {path}" if line else ""
+    try:
+        with Guard(time_limit_s):
+            if isinstance(error, Misconduct):
+                said = str(error)
+            else:
+                message = _one_line(str(error))
+                said = f"raised {type(error).__name__}{': ' + message if message else ''}"
+            return said + place, _Traceback("".join(traceback.format_exception(error)))
+    except CtrlC:
+        raise
+    except BaseException:  # noqa: BLE001 - of the error's own code
+        return f"raised an error that cannot be printed{place}", None
 
 
 def _as_reward(value: object) -> float:

@@ -15,7 +15,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.guard import Guard, Misconduct
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
 
-from .situations import Situations
+from .situations import Situations, start
 
 NOT_CALLED = "not called"
 """The failure of a call that was skipped because an earlier one hung."""
@@ -32,11 +32,12 @@ class Answer:
 
 
 class Probe:
-    """A reward module loaded for one car.
+    """A reward module loaded for one car, whose first call is that at the start of an episode.
 
     Attributes:
-        calls: number of calls made.
-        failures: error messages and the params that caused them, in the order of the calls.
+        start: the answer at the start.
+        calls: number of calls made since.
+        failures: error messages and the params that caused them, in the order of these calls.
         hangs: a call exceeded the time limit or damaged the interpreter's shared state; every later call counts as
             failed without being made.
 
@@ -45,11 +46,16 @@ class Probe:
     """
 
     def __init__(self, setup: RaceSetup):
-        """Load the module of a race."""
+        """Load the module of a race and call it at the start, where functions with a memory set themselves up."""
         self._function = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None, scalar=True)
+        self.hangs = False
+        self._forget()
+        self.start = self.call(next(start(setup).params()))
+        self._forget()
+
+    def _forget(self) -> None:
         self.calls = 0
         self.failures: list[tuple[str, dict[str, Any]]] = []
-        self.hangs = False
 
     def call(self, params: dict[str, Any]) -> Answer:
         """Call the function once."""

@@ -129,10 +129,12 @@ class NamedSituation:
     """A situation with a name, and the step before it."""
 
     name: str
+    setup: RaceSetup
+    """The race in which it is."""
     now: Situations
     """One situation."""
-    before: Situations | None
-    """One step earlier; None at the start."""
+    before: Situations
+    """One step earlier."""
 
 
 def middle_speed_mps(setup: RaceSetup) -> float:
@@ -140,18 +142,21 @@ def middle_speed_mps(setup: RaceSetup) -> float:
     return float(setup.actions.low[1] + setup.actions.high[1]) / 2
 
 
+def start(setup: RaceSetup) -> Situations:
+    """Return the first rewarded step of an episode, its second; in the first the car stood on the start line."""
+    at = setup.car.front_point_m / setup.track.length_m
+    return situations(setup, poses(setup, at, 0.0, 0.0, middle_speed_mps(setup), lateness=0.0))
+
+
 def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
-    """Return start, mid-lap, off-track, finish, wrong way, and mid-lap on the track driven in reverse."""
+    """Return mid-lap, off-track, finish, wrong way, and mid-lap on the track driven in reverse."""
     speed = middle_speed_mps(setup)
     track = setup.track
-    # The second step is the first that is rewarded; in the first the car stood on the start line.
-    start = poses(setup, setup.car.front_point_m / track.length_m, 0.0, 0.0, speed, lateness=0.0)
     line = np.array([1.0 if not track.closed else 0.05 / track.length_m])
     steps = np.array([2 + int(track.length_m / speed / setup.car.control_period_s)])
     finish = replace(poses(setup, line, 0.0, 0.0, speed), progress_before=np.array([99.5]), steps=steps)
     backwards = setup.on(against)
     return [
-        NamedSituation("start", situations(setup, start), None),
         _named("mid-lap", setup, poses(setup, 0.5, 0.0, 0.0, speed)),
         _named("off the track", setup, _off_track(setup, speed)),
         _named("finish", setup, finish),
@@ -161,7 +166,7 @@ def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
 
 
 def _named(name: str, setup: RaceSetup, at: Poses) -> NamedSituation:
-    return NamedSituation(name, situations(setup, at), situations(setup, at, earlier=True))
+    return NamedSituation(name, setup, situations(setup, at), situations(setup, at, earlier=True))
 
 
 def seam(setup: RaceSetup) -> Situations:

@@ -26,11 +26,12 @@ from deepracer_exp.runs.files import METRICS, read_metrics
 from deepracer_exp.tracks.track import Track
 
 from . import pitfalls
-from .console import ConsoleFinding, console_findings
+from .aws_dry_run import dry_run_findings
+from .aws_rules import AwsFinding, text_findings
 from .pitfalls import action_space_laps
 from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
-from .situations import NamedSituation, Situations, named_situations, sample, seam, situations
+from .situations import NamedSituation, Situations, named_situations, sample, seam, situations, start
 
 _MOST = 12
 """Most lines of one kind that are printed."""
@@ -68,12 +69,7 @@ def validate_reward(
     check = read(experiment)
     setup = check.setup
     out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
-    _line(
-        out,
-        f"AWS console: would {'reject' if check.console else 'accept'} it",
-        "yellow" * bool(check.console),
-    )
-    _print_first(out, list(map(str, check.console)))
+    _print_aws(out, check.aws)
     waypoints = setup.track.waypoints
     same = recognise(waypoints, np.arange(len(waypoints)))[:1]
     if not same or same[0].distance_m > 1 / UNITS_PER_M:
@@ -88,7 +84,7 @@ def validate_reward(
         _draw(out, check, _default_picture(experiment, check) if output is None else Path(output))
     _print_lines(out, "Warnings", "yellow", check.warnings)
     _print_lines(out, "Failures", "red", check.failures)
-    if trial is not None and not check.failures and not (strict and check.console):
+    if trial is not None and not check.failures and not (strict and check.aws):
         _train_shortly(out, err, *trial)
     return _verdict(out, check, strict)
 
@@ -100,7 +96,8 @@ class Check:
     setup: RaceSetup
     against: Track
     """The same track, driven the other way."""
-    console: list[ConsoleFinding]
+    aws: list[AwsFinding]
+    """Reasons why deepracer-on-aws would refuse the function."""
     tried: dict[str, Answer] = field(default_factory=dict)
     """The answers in the named situations."""
     failures: list[str] = field(default_factory=list)
@@ -116,7 +113,7 @@ class Check:
 
 
 def read(experiment: Experiment) -> Check:
-    """Read an experiment's files and check the text of its reward function without running it.
+    """Read an experiment's files and find what AWS would refuse in its reward function.
 
     Raises:
         BadInput: a file cannot be used; the reward is not valid Python or lacks a one-argument `reward_function`;
@@ -133,25 +130,29 @@ def read(experiment: Experiment) -> Check:
     return Check(
         setup=setup.on(setup.track),
         against=Track.from_config(track, reversed=track.direction != "reversed"),
-        console=console_findings(setup.reward.text),
+        aws=[*text_findings(setup.reward.text), *dry_run_findings(setup.reward, setup.track)],
     )
 
 
 def try_named_situations(check: Check) -> None:
-    """Call the function in the named situations, each time in a freshly loaded module, and add the results to `check`.
+    """Call the function at the start and in the named situations, and add the results to `check`.
+
+    Each situation comes after the start and the step before it, in a freshly loaded module.
 
     Raises:
         BadInput: the module cannot be loaded.
     """
     setup = check.setup
-    hangs = False
+    probe = Probe(setup)
+    check.tried["start"] = _with_its_line(setup, probe.start, next(start(setup).params()))
+    hangs = probe.hangs
     for case in named_situations(setup, check.against):
-        probe = Probe(setup)
-        answer = Answer(float("nan"), NOT_CALLED) if hangs else _act(probe, case)
-        if probe.failures:
-            answer = replace(answer, failure=_with_line(setup, *probe.failures[0]))
-        hangs = hangs or probe.hangs
-        check.tried[case.name] = answer
+        answer = Answer(float("nan"), NOT_CALLED)
+        if not hangs:
+            probe = Probe(case.setup)
+            answer = _act(probe, case)
+            hangs = probe.hangs
+        check.tried[case.name] = _with_its_line(setup, answer, *(params for _, params in probe.failures[:1]))
     failed = {answer.failure for answer in check.tried.values()} - {None, NOT_CALLED}
     for what in sorted(map(str, failed)):
         names = [name for name, answer in check.tried.items() if answer.failure == what]
@@ -160,11 +161,8 @@ def try_named_situations(check: Check) -> None:
 
 def _act(probe: Probe, case: NamedSituation) -> Answer:
     """Return the reward of a named situation, after the step before it."""
-    if case.before is not None:
-        before = probe.call(next(case.before.params()))
-        if before.failure:
-            return before
-    return probe.call(next(case.now.params()))
+    before = probe.call(next(case.before.params()))
+    return before if before.failure else probe.call(next(case.now.params()))
 
 
 def look_closer(check: Check) -> None:
@@ -251,6 +249,13 @@ def _cpu_s_per_call(probe: Probe, setup: RaceSetup) -> float:
     return float(np.median(times))
 
 
+def _with_its_line(setup: RaceSetup, answer: Answer, params: dict[str, Any] | None = None) -> Answer:
+    """Return an answer with the line number in its failure, if it failed with these params."""
+    if answer.failure is None or params is None:
+        return answer
+    return replace(answer, failure=_with_line(setup, answer.failure, params))
+
+
 def _with_line(setup: RaceSetup, what: str, params: dict[str, Any]) -> str:
     """Prefix a bad return value with its line number, found by calling the function once more."""
     if not what.startswith("returned"):
@@ -298,6 +303,26 @@ def _default_picture(experiment: Experiment, check: Check) -> Path:
 def _line(out: Console, text: str, style: str | None = None) -> None:
     """Print one line without markup; a terminal may wrap it, a file gets it whole."""
     out.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def _print_aws(out: Console, findings: list[AwsFinding]) -> None:
+    """Print what deepracer-on-aws would refuse, style apart, and what the documentation of the AWS console forbids."""
+    documented, validator, style = (
+        [str(finding) for finding in findings if finding.rule == rule]
+        for rule in ("documented", "validator", "style")
+    )
+    _line(out, f"deepracer-on-aws: would {'refuse' if findings else 'accept'} it", "yellow" * bool(findings))
+    _print_first(out, documented + validator)
+    if style:
+        _line(out, "  style (flake8; the AWS console trained functions with such findings):")
+        _print_first(out, [f"  {line}" for line in style])
+    console = "forbids what is named first above" if documented else "forbids nothing of this"
+    _line(out, f"AWS console: its documentation {console}", "yellow" * bool(documented))
+
+
+def _counted(findings: list[AwsFinding]) -> str:
+    style = sum(finding.rule == "style" for finding in findings)
+    return count(len(findings), "finding") + (f", {style} of style" if style else "")
 
 
 def _print_situations(out: Console, check: Check) -> None:
@@ -388,15 +413,14 @@ def _verdict(out: Console, check: Check, strict: bool) -> int:
     if check.failures:
         _line(out, f"Verdict: cannot be used: {check.failures[0]}", "bold red")
         return 2
-    findings = count(len(check.console), "finding")
-    if strict and check.console:
-        _line(out, f"Verdict: the AWS console would reject it: {findings}", "bold red")
+    refused = f"deepracer-on-aws would refuse it: {_counted(check.aws)}" if check.aws else ""
+    if strict and refused:
+        _line(out, f"Verdict: {refused}", "bold red")
         return 2
     warnings = f", with {count(len(check.warnings), 'warning')}" if check.warnings else ""
-    refused = f"; the AWS console would reject it: {findings}" if check.console else ""
     _line(
         out,
-        f"Verdict: can be trained{warnings}{refused}",
+        f"Verdict: can be trained here{warnings}{'; ' * bool(refused)}{refused}",
         "bold yellow" if warnings or refused else "bold green",
     )
     return 0

@@ -29,7 +29,7 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
     run = trained(f"reward.file={reward}", "budget.iterations=1")
     ended = call("export", str(run.folder), "format=aws", "-o", "files")
     assert ended.code == 0, ended.stderr
-    assert "reward_function.py: the AWS console would reject it: line 1: import of os" in ended.stdout
+    assert "reward_function.py: deepracer-on-aws would refuse it: line 1: import of os" in ended.stdout
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None
     """Check a reward function given as text, completely."""
 
     def build(text: str, time_limit_s: float = 60.0) -> Check:
-        check = Check(setup=race_with(text, time_limit_s), against=against, console=[])
+        check = Check(setup=race_with(text, time_limit_s), against=against, aws=[])
         try_named_situations(check)
         if not check.failures:
             look_closer(check)

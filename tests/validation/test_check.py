@@ -176,6 +176,24 @@ def test_stateful_and_random_rewards_are_distinguished(race_with, text, memory):
     assert state_of(race, Probe(race)) == memory
 
 
+SET_UP_AT_THE_START = [
+    "if params['steps'] <= 2:\n    global last\n    last = 0.0",
+    "global last\nif params['steps'] == 2:\n    last = 0.0",
+]
+
+
+@pytest.mark.parametrize("set_up", SET_UP_AT_THE_START)
+def test_a_function_that_sets_its_state_up_at_the_start_of_an_episode_can_be_used(check_of, set_up):
+    """It trains: no call of an episode comes before that of its start."""
+    gained = (
+        "gained, last = params['progress'] - last, params['progress']\nreturn gained - params['is_offtrack']"
+    )
+    check = check_of(function(f"{set_up}\n{gained}"))
+    assert check.failures == []
+    assert check.state == "earlier calls"
+    assert all(answer.failure is None for answer in check.tried.values())
+
+
 def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with):
     first = "done = []\n" + function(
         "if not done:\n    done.append(sum(i % 3 for i in range(2000000)))\nreturn params['speed']"

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.validation.pitfalls import drive_laps
-from deepracer_exp.validation.situations import named_situations, poses, sample, seam, situations
+from deepracer_exp.validation.situations import named_situations, poses, sample, seam, situations, start
 
 
 def test_situations_are_where_they_were_requested(race):
@@ -22,7 +22,8 @@ def test_the_named_situations_are_what_they_are_called(race, against):
     named = {
         case.name: {k: v[0] for k, v in case.now.columns.items()} for case in named_situations(race, against)
     }
-    assert list(named) == ["start", "mid-lap", "off the track", "finish", "wrong way", "reversed track"]
+    named["start"] = {k: v[0] for k, v in start(race).columns.items()}
+    assert list(named) == ["mid-lap", "off the track", "finish", "wrong way", "reversed track", "start"]
     assert named["start"]["steps"] == 2
     assert named["start"]["progress"] < 2
     assert named["mid-lap"]["progress"] == pytest.approx(50)
@@ -37,8 +38,7 @@ def test_the_named_situations_are_what_they_are_called(race, against):
 
 
 def test_the_step_before_is_a_step_behind(race, against):
-    case = named_situations(race, against)[1]
-    assert case.before is not None
+    case = named_situations(race, against)[0]
     now, before = case.now.columns, case.before.columns
     assert now["steps"] - before["steps"] == 1
     moved_m = np.hypot(now["x"] - before["x"], now["y"] - before["y"])

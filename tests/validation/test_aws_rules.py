@@ -1,6 +1,6 @@
 import pytest
 
-from deepracer_exp.validation.console import console_findings, style_findings
+from deepracer_exp.validation.aws_rules import style_findings, text_findings
 
 GOOD = '''\
 import math
@@ -13,7 +13,7 @@ def reward_function(params):
 
 
 def findings(text: str) -> list[str]:
-    return [str(finding) for finding in console_findings(text)]
+    return [str(finding) for finding in text_findings(text)]
 
 
 def test_a_plain_function_is_taken():
@@ -33,19 +33,46 @@ def test_other_modules_are_not(line):
     assert found.startswith("line 1: import of ")
 
 
-def test_an_import_inside_a_function_is_refused():
-    text = GOOD.replace('    """Pay', '    import random\n    """Pay')
-    assert any("line 5: an import that is not at the top of the file" in line for line in findings(text))
-
-
 @pytest.mark.parametrize("name", ["open", "exec", "eval", "compile", "input"])
-def test_forbidden_built_ins_are_found_even_where_they_are_not_called(name):
-    text = GOOD.replace("return", f"f = {name}\n    return f and")
-    assert f"line 6: use of {name}, which is forbidden" in findings(text)
+def test_a_call_of_a_forbidden_built_in_is_found_even_as_an_argument(name):
+    for text in (f"{name}('x')", f"max(1.0, float({name}('x')))"):
+        assert findings(GOOD.replace("return", f"n = {text}\n    return n *")) == [
+            f"line 6: use of {name}, which is forbidden"
+        ]
+
+
+def test_a_forbidden_built_in_is_not_found_where_the_validator_does_not_look():
+    """It looks for the whole dotted name, and not into keyword arguments."""
+    for text in ("open", "open('x').read()", "max((1, 2), key=eval('x'))"):
+        assert findings(GOOD.replace("return", f"n = {text}\n    return n and")) == []
+
+
+UNNAMED = [
+    *(
+        "'{}'.format(1)",
+        "params['waypoints'].copy()",
+        "(1.0 + 2.0).real",
+        "(lambda: 1.0)()",
+        "[1.0].index(1.0)",
+    ),
+    *("max(0, params['x'].real)", "math.floor(-params['x'].real)"),
+]
+
+
+@pytest.mark.parametrize("expression", UNNAMED)
+def test_a_call_or_attribute_that_does_not_begin_with_a_name_is_refused(expression):
+    (found,) = text_findings(GOOD.replace("1e-3", f"float(bool({expression}))"))
+    assert (found.line, found.rule) == (6, "validator")
+    assert "give this part a name first" in found.text
+
+
+@pytest.mark.parametrize("expression", ["str(1).format(1)", "math.pi.real", "max(1, 2).real", "f'{math.pi}'"])
+def test_a_chain_that_begins_with_a_name_is_accepted(expression):
+    assert findings(GOOD.replace("1e-3", f"float(bool({expression}))")) == []
 
 
 def test_a_method_of_a_forbidden_name_is_no_built_in():
-    assert findings(GOOD.replace("params['speed']", "params['speed'].real.compile")) == []
+    assert findings(GOOD.replace("params['speed']", "math.pi.compile")) == []
 
 
 @pytest.mark.parametrize(
@@ -103,6 +130,14 @@ def test_style_codes_of_flake8s_e_and_f_are_reported(text, code):
 )
 def test_what_the_console_does_not_look_at_is_not_reported(text):
     assert style_findings(text) == []
+
+
+def test_each_finding_says_whose_rule_it_is():
+    text = "import os\n" + GOOD.replace("\n\n\ndef", "\n\ndef").replace("1e-3", "float(os.sep.join('load'))")
+    rules = {finding.rule: str(finding) for finding in text_findings(text)}
+    assert rules["documented"].startswith("line 1: import of os")
+    assert rules["validator"] == "line 6: the word load, forbidden anywhere in the text"
+    assert rules["style"] == "line 4: E302 expected 2 blank lines, found 1"
 
 
 def test_a_noqa_of_another_code_excuses_nothing():

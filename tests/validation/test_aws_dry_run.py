@@ -1,0 +1,111 @@
+import pytest
+
+from deepracer_exp.validation.aws_dry_run import dry_run_findings, validator_params
+from deepracer_exp.validation.aws_rules import text_findings
+
+ACCEPTED = [
+    *("1.0", "float(params['steps'])", "np.float64(2.0)", "params['x']", "params['track_width']", "-1e5"),
+    *("float(np.sum(params['waypoints']) > 0)", "float(len(params['objects_location']) == 6)"),
+]
+REFUSED = [
+    ("1", "line 5 returned 1 of type int; accepted: a float from -100000 to 100000"),
+    ("params['progress'] > 50", "of type bool"),
+    ("np.float32(1)", "of type float32"),
+    ("params['progress']", "returned 0 of type int"),
+    (
+        "params['speed']",
+        "returned 1 of type int; accepted: a float from -100000 to 100000, called off the track",
+    ),
+    ("float('nan')", "returned nan of type float"),
+    ("100001.0", "returned 100001.0 of type float"),
+    ("params['steps'] / params['progress']", "raised ZeroDivisionError: division by zero in line 5 of"),
+    ("1.0 if params['waypoints'] else 0.1", "raised ValueError: The truth value of an array"),
+    ("float(params['waypoints'].index((0, 0)))", "raised AttributeError"),
+    ("params['sim_time']", "raised KeyError: 'sim_time'"),
+    ("params['projection_distance']", "raised KeyError"),
+    ("params['objects_distance_from_center'][0]", "raised KeyError"),
+]
+
+
+def function(expression: str, head: str = "") -> str:
+    return f"import numpy as np\n\n\ndef reward_function(params):\n    {head}return {expression}\n"
+
+
+@pytest.fixture
+def findings(race_with):
+    def find(text: str) -> list[str]:
+        setup = race_with(text)
+        return [str(finding) for finding in dry_run_findings(setup.reward, setup.track)]
+
+    return find
+
+
+@pytest.mark.parametrize("expression", ACCEPTED)
+def test_a_float_within_the_bounds_is_accepted(findings, expression):
+    assert findings(function(expression)) == []
+
+
+@pytest.mark.parametrize(("expression", "words"), REFUSED)
+def test_what_the_validator_refuses_after_a_call_is_found(findings, expression, words):
+    assert words in findings(function(expression))[0]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "accepted"),
+    [("params", True), ("*params", True), ("params, debug=False", False), ("params, *, debug=False", False)],
+)
+def test_one_parameter_is_accepted(findings, parameters, accepted):
+    text = f"def reward_function({parameters}):\n    return 1.0\n"
+    assert ["exactly one parameter" in line for line in findings(text)] == [True] * (not accepted)
+
+
+def test_an_import_is_refused_where_it_is_executed_while_the_function_is_called(findings):
+    body = "if params['steps'] {}:\n        import random\n        random.random()\n    "
+    (found,) = findings(function("1.0", body.format("== 1")))
+    assert found == (
+        "line 6: random is imported while the function is called; imports belong at the top of the file"
+    )
+    assert findings(function("1.0", body.format("> 1"))) == []
+
+
+@pytest.mark.parametrize("expression", ["{}.sum()", "{}.all()", "{}.max()", "np.average({})"])
+def test_methods_of_arrays_that_import_a_module_in_the_validator_are_found(findings, expression):
+    text = function(f"float({expression.format('a')})", "a = np.ones(3)\n    ")
+    (found,) = findings(text)
+    assert found.startswith("numpy._core._methods is imported while the function is called")
+
+
+@pytest.mark.parametrize("name", ["sum", "all", "max", "mean", "std", "linalg.norm", "argmin"])
+def test_functions_of_numpy_are_accepted(findings, name):
+    assert findings(function(f"float(np.{name}(a))", "a = np.ones(3)\n    ")) == []
+
+
+def test_a_function_that_hangs_is_called_once(findings, monkeypatch):
+    monkeypatch.setattr("deepracer_exp.validation.aws_dry_run._LIMIT_S", 0.2)
+    text = function("1.0", "while params['progress'] == 0:\n        pass\n    ")
+    assert findings(text) == []
+    assert "took longer" in findings(text.replace("progress'] == 0", "progress'] == 50"))[0]
+
+
+def test_what_only_the_function_assigns_is_kept_and_what_the_module_assigns_is_not(findings):
+    body = (
+        "global seen, last\n    if params['steps'] == 1:\n        seen = 1.0\n    was, last = last, 2.0\n    "
+    )
+    assert findings("last = 0.0\n" + function("seen / (was == 0.0)", body)) == []
+
+
+def test_the_situations_are_those_of_the_validator(race):
+    situations = validator_params(race.track)
+    assert [len(params) for params in situations.values()] == [24] * 5
+    assert [params["progress"] for params in situations.values()] == [0, 0, 50, 0, 100]
+    assert [params["steps"] for params in situations.values()] == [1, 1, 100, 1, 10_000]
+    beside = situations["off the track"]
+    assert beside["is_offtrack"]
+    assert beside["distance_from_center"] == beside["track_width"]
+
+
+def test_what_the_validator_itself_refused_is_refused_here(race_with, findings, reference):
+    """Every file of the folder was refused by the validator itself."""
+    for file in sorted((reference / "inputs/validator").glob("*.py")):
+        text = file.read_text(encoding="utf-8")
+        assert [found for found in text_findings(text) if found.rule != "style"] or findings(text), file.name
