@@ -162,8 +162,8 @@ def recorded_wheels_on_road(
 def _of_another_width(logged: str, world: _Recognised) -> str:
     who = f"track {logged!r}" if logged else "the track, which the log does not name,"
     return (
-        f"{who} has the shape of {world.name} but not its width: {world.misjudged:.0%} of the rows have wheels on the "
-        "other side of its borders; `--track ROUTE` takes the file of its route (.npy)"
+        f"{who} has the shape of {world.name}, but {world.misjudged:.0%} of the rows have wheels on the other side of "
+        "its borders than logged, so its width may be another; `--track ROUTE` takes the file of its route (.npy)"
     )
 
 

@@ -84,7 +84,7 @@ def test_a_course_as_wide_as_no_world_of_its_shape_is_reported() -> None:
         replace(recording, steps=recording.steps.assign(all_wheels_on_track=narrow))
     )
     assert tracks[""].name == "Vegas_track"
-    assert "has the shape of Vegas_track but not its width: 4" in problems[0].reason
+    assert "has the shape of Vegas_track, but 4" in problems[0].reason
 
 
 @pytest.mark.parametrize(
