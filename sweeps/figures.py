@@ -6,6 +6,7 @@ and with one trace per trial, which is slow for hundreds.
 
 import html
 import math
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
@@ -36,12 +37,20 @@ FEWEST_COMPLETE = 20
 """Complete trials below which importance is chance: the best quarter would be fewer than five trials."""
 _EVALUATOR = PedAnovaImportanceEvaluator(target_quantile=0.25)
 _MOST_PARAMETERS = 12
-_COLUMNS = 4
+_COLUMNS = 3
 _PANEL, _GAP = 210.0, 62.0
 """Height of a panel and the distance between two of them, pixels."""
 _FAR, _NEAR = 5.0, 0.25
 """A trial is off the axis if it is farther from the best than this many times the median is, and worse than the best
 by more than this share of it."""
+_PER_AXIS, _LONGEST_CHOICE = 120, 16
+"""Pixels from one parallel axis to the next, and the characters of a choice that fit between them."""
+_PANEL_WIDTH, _NARROW_PANEL_WIDTH = 260.0, 160.0
+"""Least width of a panel on a wide and on a narrow screen, pixels."""
+_CHARACTER, _LINE = 6.3, 13.0
+"""Width of a character and height of a line of the labels below a panel, pixels."""
+_FEWEST_UPRIGHT = 9
+"""Characters that must fit below each choice for its name to be written upright; else it is turned."""
 _MOST_POINTS, _FEWEST_POINTS = 15_000, 12
 """Of all entropy curves together (0.3 MB of the page), and of one curve."""
 
@@ -96,6 +105,7 @@ def narrowed(figure: go.Figure) -> go.Figure:
     names = {trace.name for trace in figure.data if trace.name} if layout.showlegend else ()
     foot = layout.margin.b + 22.0 * len(names)
     body = layout.height - layout.margin.t - layout.margin.b
+    narrow.for_each_xaxis(lambda axis: _label_choices(axis, _NARROW_PANEL_WIDTH), {"type": "category"})
     if len(_panels(figure)) > 1:
         body = _arrange(narrow, _panels(figure), 1)
     return narrow.update_layout(
@@ -107,7 +117,9 @@ def narrowed(figure: go.Figure) -> go.Figure:
 
 def least_width(figure: go.Figure) -> int:
     """Return the pixels below which a figure cannot be read: each parallel axis needs room for its values."""
-    return max((95 * len(trace.dimensions) for trace in figure.data if trace.type == "parcoords"), default=0)
+    return max(
+        (_PER_AXIS * len(trace.dimensions) for trace in figure.data if trace.type == "parcoords"), default=0
+    )
 
 
 def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
@@ -159,15 +171,63 @@ def _panels(figure: go.Figure) -> list[str]:
 
 def _arrange(figure: go.Figure, panels: Sequence[str], columns: int) -> float:
     """Arrange panels in a grid; return its height, pixels."""
-    body = math.ceil(len(panels) / columns) * (_PANEL + _GAP) - _GAP
+    gap = _label_height(figure)
+    body = math.ceil(len(panels) / columns) * (_PANEL + gap) - gap
     for at, number in enumerate(panels):
         row, column = divmod(at, columns)
-        top = 1 - row * (_PANEL + _GAP) / body
+        top = 1 - row * (_PANEL + gap) / body
         domain = column / columns + 0.03 * (column > 0), (column + 1) / columns - 0.01 * (columns > 1)
         rows = {"domain": (max(0.0, top - _PANEL / body), top), "showticklabels": column == 0}
         figure.layout[f"yaxis{number}"].update(rows)
         figure.layout[f"xaxis{number}"].update(domain=domain)
     return body
+
+
+def _label_height(figure: go.Figure) -> float:
+    """Return the pixels that the tick labels and titles below a panel take, the most of all panels."""
+    texts = [axis.ticktext or () for axis in figure.select_xaxes()]
+    lines = max((text.count("<br>") for some in texts for text in some), default=0)
+    turned = any(axis.tickangle == -90 for axis in figure.select_xaxes())
+    return _GAP + max(_LINE * lines, _CHARACTER * _LONGEST_CHOICE - _LINE if turned else 0.0)
+
+
+def _label_choices(axis: go.layout.XAxis, panel_width: float) -> None:
+    """Write the choices of a parameter below their places so that no two of them meet."""
+    choices = [value.strip("'") for value in axis.categoryarray]
+    width = int(panel_width / len(choices) / _CHARACTER)
+    upright = width >= min(_FEWEST_UPRIGHT, max(map(len, choices)))
+    texts = [wrapped(one, width) if upright else _plain(one, _LONGEST_CHOICE) for one in choices]
+    axis.update(range=[-0.5, len(choices) - 0.5], tickvals=axis.categoryarray, ticktext=texts)
+    axis.update(tickangle=0 if upright else -90)
+
+
+def wrapped(text: str, width: int, most: int = 4) -> str:
+    """Return a text in up to `most` lines of at most `width` characters, broken after `_`, `-` and `,` if possible."""
+    lines = [""]
+    for part in re.split(r"(?<=[_,\- ])", text):
+        while part:
+            room = width - len(lines[-1])
+            if len(part) > room and lines[-1]:
+                lines.append("")
+                continue
+            lines[-1] += part[:room]
+            part = part[room:]
+    if len(lines) > most:
+        lines = [*lines[: most - 1], f"{lines[most - 1][: width - 1]}…"]
+    return "<br>".join(html.escape(line, quote=False) for line in lines)
+
+
+def _decades(values: Sequence[float]) -> dict[str, Any]:
+    """Return the ticks of a logarithmic axis: up to four powers of ten, or the ends where it has less than two."""
+    low, high = min(values), max(values)
+    powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+    if len(powers) < 2:
+        return {"tickvals": [low, high], "ticktext": [f"{low:.2g}", f"{high:.2g}"]}
+    some = list(powers)[:: math.ceil(len(powers) / 4)]
+    return {
+        "tickvals": [10.0**power for power in some],
+        "ticktext": [f"10<sup>{power}</sup>" for power in some],
+    }
 
 
 def _history(
@@ -205,7 +265,8 @@ def _importance(
     ranked = sorted(keys, key=dict(zip(bars.y, bars.x, strict=True)).__getitem__, reverse=True)
     bars.update(y=[_plain(keys[key], 40) for key in bars.y], hovertemplate="%{y}: %{x:.0%}<extra></extra>")
     _styled(figure, f"Which parameters mattered most{title}", 150 + 34 * len(keys), legend=False)
-    figure.update_xaxes(title_text="importance for being in the best quarter", tickformat=".0%")
+    # Room for the figures beside the bars.
+    figure.update_xaxes(title_text="importance", tickformat=".0%", range=(0, 1.2 * max(*bars.x, 1e-9)))
     figure.update_yaxes(title_text="", automargin=True, ticksuffix="  ")
     return figure if any(bars.x) else None, ranked
 
@@ -223,18 +284,17 @@ def _slices(
     panels = _panels(figure)
     _styled(figure, f"Each parameter against the value{title}", _PANEL, legend=False)
     figure.update_traces(marker={"size": 7, "colorscale": "Viridis", "line": {"width": 0}})
-    body = _arrange(figure, panels, min(_COLUMNS, len(panels)))
-    figure.update_layout(height=round(body + 120), margin={"r": 90})
-    figure.update_xaxes(tickangle=0, nticks=4, exponentformat="power")
-    figure.for_each_xaxis(
-        lambda one: one.update(
-            range=[-0.5, len(one.categoryarray) - 0.5],
-            tickvals=one.categoryarray,
-            ticktext=[value.strip("'") for value in one.categoryarray],
-        ),
-        {"type": "category"},
-    )
+    figure.update_xaxes(tickangle=0, nticks=4, exponentformat="power", title_standoff=6, tickfont_size=11)
+    figure.for_each_xaxis(lambda axis: _label_choices(axis, _PANEL_WIDTH), {"type": "category"})
+    for trace in figure.data:
+        at = figure.layout[f"xaxis{(trace.xaxis or 'x')[1:]}"]
+        if at.type == "log":
+            at.update(_decades(trace.x))
     figure.for_each_xaxis(lambda one: one.title.update(text=_plain(keys[one.title.text], 40)))
+    body = _arrange(figure, panels, min(_COLUMNS, len(panels)))
+    figure.update_layout(
+        height=round(body + 60 + _label_height(figure)), margin={"r": 90, "b": _label_height(figure)}
+    )
     figure.update_yaxes({**axis, "title_text": ""})
     for number in panels[::_COLUMNS]:
         figure.layout[f"yaxis{number}"].title.text = MEASURES[objective].label
@@ -262,6 +322,8 @@ def _parallel(
             "colorbar": {"title": {"text": axes[0]["label"], "side": "right"}, "thickness": 14},
         },
         labelangle=-12 if crowded else 0,
+        tickfont={"size": 10},
+        rangefont={"size": 1, "color": "rgba(0,0,0,0)"},  # the ends are among the ticks
         unselected={"line": {"opacity": 0.06}},
     )
     figure = _styled(go.Figure(lines), "Every complete trial a line: drag along an axis to choose", 480)
@@ -276,7 +338,7 @@ def _parameter_axis(key: str, label: str, trials: Sequence[FrozenTrial]) -> dict
     axis: dict[str, Any] = {"label": _plain(label, 40)}
     if isinstance(distribution, CategoricalDistribution):
         choices = [one for one in distribution.choices if one in params]
-        ticks = lacking + [_plain(one, 24) for one in choices]
+        ticks = lacking + [_plain(one, _LONGEST_CHOICE) for one in choices]
         places = [0 if one is None else len(lacking) + choices.index(one) for one in params]
         return axis | {"values": places, "tickvals": list(range(len(ticks))), "ticktext": ticks}
     scale: Callable[[float], float] = math.log10 if distribution.log else float

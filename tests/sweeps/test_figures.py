@@ -3,6 +3,7 @@ import random
 
 import numpy as np
 import pytest
+from optuna.distributions import CategoricalDistribution
 
 from sweeps.figures import FEWEST_COMPLETE, figures, narrowed, thinned
 from sweeps.labels import OUTCOMES, outcome_of, short_keys
@@ -169,3 +170,28 @@ def test_two_outcomes_differ_in_colour_or_dash(sight):
         apart = np.linalg.norm(lab(one.color, sight) - lab(other.color, sight))
         assert apart > 6, (one, other, apart)
         assert apart > 20 or one.dash != other.dash, (one, other, apart)
+
+
+NAMES = ["discrete_small", "continuous", "discrete_21_steps_fast", "grid_5x3_slow_corners", "x" * 60]
+
+
+@pytest.mark.parametrize("choices", [1, 2, 3, 5, 12])
+def test_no_two_labels_below_a_panel_meet(tmp_path, choices):
+    names = (NAMES + [f"reward_function_{n}" for n in range(9)])[:choices]
+    kinds = {"action_space": CategoricalDistribution(names), "algorithm.lr": DISTRIBUTIONS["algorithm.lr"]}
+    study = new_study(tmp_path)
+    for number in range(24):
+        params = {"action_space": names[number % choices], "algorithm.lr": 10 ** (-5 + number / 12)}
+        add(study, [8.0 + number], params=params, distributions=kinds)
+    drawn = figures(study)["slice"]
+    for layout, width in ((drawn.layout, 260), (narrowed(drawn).layout, 160)):
+        (axis,) = (one for one in (layout.xaxis, layout.xaxis2) if one.type == "category")
+        lines = [line for text in axis.ticktext for line in text.split("<br>")]
+        assert len(axis.ticktext) == choices
+        if axis.tickangle == -90:
+            assert 13 * choices <= width
+            assert max(map(len, lines)) <= 16
+        else:
+            assert max(map(len, lines)) * 6.3 <= width / choices
+        (axis,) = (one for one in (layout.xaxis, layout.xaxis2) if one.type == "log")
+        assert 2 <= len(axis.tickvals) <= 4
