@@ -34,9 +34,9 @@ from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
 from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY
-from deepracer_exp.tracking.metadata import PARENT
+from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
-from deepracer_exp.tracking.study_run import STUDY, TRIAL, end_trial_run, open_trial_run
+from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.clone import prepare_clone

@@ -59,6 +59,9 @@ PARENT = "mlflow.parentRunId"
 END_TAG = "end"
 """Tag of an ended run: its status and the reason."""
 
+STUDY = "sweep.study"
+"""Tag of a study's runs and of its experiment: the study's name."""
+
 HOST = "host"
 """Tag of a run: the machine on which it began."""
 
@@ -226,6 +229,12 @@ def experiment_note(best_run: str, run_id: str, experiment_id: str, metrics: Map
     """Return an experiment's description with its best run."""
     link = f"[{best_run}](#/experiments/{experiment_id}/runs/{run_id}?{WORKFLOW})"
     return f"{OURS} Lowest race score so far: {link}, {race_result(metrics)}.\n\n{picture(run_id)}"
+
+
+def study_experiment_note(experiment_id: str, run_id: str, winner: str) -> str:
+    """Return the description of a study's experiment with its winner, in words."""
+    link = f"[study](#/experiments/{experiment_id}/runs/{run_id}?{WORKFLOW})"
+    return f"{OURS} Winner of the {link}: {winner}."
 
 
 def picture(run_id: str) -> str:

@@ -38,6 +38,13 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "collect_s": ("time/collect_s", "seconds of collection in this iteration"),
     "update_s": ("time/update_s", "seconds of updates in this iteration"),
     "wall_clock_s": ("time/wall_clock_s", "seconds since the start of the run"),
+    "cpu_percent": (
+        "system/cpu_utilization_percentage",
+        "use of all cores of the machine since the last row",
+    ),
+    "memory_mb": ("system/system_memory_usage_megabytes", "memory of the machine in use"),
+    "memory_percent": ("system/system_memory_usage_percentage", "the same, of all it has"),
+    "gpu_memory_mb": ("system/gpu_0_memory_usage_megabytes", "memory of the GPU in use, with device=cuda"),
 }
 """Columns of metrics.jsonl: their names in MLflow and their meaning; recorded against env steps.
 

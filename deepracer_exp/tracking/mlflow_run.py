@@ -21,7 +21,17 @@ from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_B
 from deepracer_exp.addresses import without_passwords
 
 from .calls import FileGoneError, StoreRefusedError, pages, store_errors
-from .metadata import END_TAG, EXPERIMENT_TAGS, NOTE, OURS, PARENT, experiment_note, result_note
+from .metadata import (
+    END_TAG,
+    EXPERIMENT_TAGS,
+    NOTE,
+    OURS,
+    PARENT,
+    STUDY,
+    experiment_note,
+    result_note,
+    study_experiment_note,
+)
 from .metrics import BEST, Point, best_metrics, points_at
 from .store import Store, client_of, silence_mlflow
 from .tracking_file import TrackedRun
@@ -158,8 +168,19 @@ class MLflowRun:
                 self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
             self._describe_experiment(run.info.experiment_id)
 
+    def describe_study(self, winner: str) -> None:
+        """Name a study's winner, in words, in the description of its experiment; an edited one is kept."""
+        with store_errors():
+            experiment_id = self._client.get_run(self.run_id).info.experiment_id
+            note = study_experiment_note(experiment_id, str(self.run_id), winner)
+            now = self._client.get_experiment(experiment_id).tags.get(NOTE, OURS)
+            if now != note and now.startswith(OURS):
+                self._client.set_experiment_tag(experiment_id, NOTE, note)
+
     def _describe_experiment(self, experiment_id: str) -> None:
         tags = self._client.get_experiment(experiment_id).tags
+        if STUDY in tags:  # whose winner is chosen by its own objective, over seeds and fresh laps
+            return
         score = f"metrics.`{BEST}score_s`"
         found = self._client.search_runs(
             [experiment_id], f"{score} > 0", max_results=1, order_by=[f"{score} ASC"]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .calls import StoreRefusedError, StoreUnavailableError
-from .metadata import END_TAG, NOTE, PARENT, param_text, study_view, user_tags
+from .metadata import END_TAG, NOTE, PARENT, STUDY, param_text, study_view, user_tags
 from .metrics import now_ms, points_at, trial_metrics
 from .store import Store
 from .store_thread import StoreThread
@@ -21,8 +21,8 @@ from .tracking_file import Status, TrackedRun
 if TYPE_CHECKING:
     from .mlflow_run import MLflowRun
 
-STUDY, SEARCH, KIND, TRIAL = "sweep.study", "sweep.search", "sweep.kind", "sweep.trial"
-"""Tags: the study's name, a hash of what it searches, `study` or `trial`, the number of the trial."""
+SEARCH, KIND, TRIAL = "sweep.search", "sweep.kind", "sweep.trial"
+"""Tags: a hash of what the study searches, `study` or `trial`, the number of the trial."""
 _SOURCE = {"mlflow.source.name": "deepracer-exp sweep", "mlflow.source.type": "LOCAL"}
 _ENDS = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "interrupted"}
 
@@ -131,7 +131,8 @@ class StudyRun:
 
     def _show_trials(self, run: "MLflowRun", _: bool) -> None:
         self._adopt(run)
-        run.set_experiment_tags(study_view(self._objectives, self._searched))
+        study = self._tracked.tags[STUDY]
+        run.set_experiment_tags({STUDY: study, **study_view(self._objectives, self._searched)})
 
     def _adopt(self, run: "MLflowRun") -> None:
         run.adopt({STUDY: self._tracked.tags[STUDY]}, but=KIND)
@@ -159,6 +160,8 @@ class StudyRun:
         counts = ("complete", "pruned", "failed", "env_steps")
         metrics |= {f"study/{name}": getattr(progress, name) for name in counts}
         run.set_tags(tags)
+        if progress.best_trial is not None:
+            run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
         if self._is_late:
             self._adopt(run)
         # Also when no trial has ended since: in the end another one may be the best.

@@ -99,6 +99,9 @@ class Tracker:
     def log(self, metrics: Mapping[str, float | None], step: int) -> None:
         """Record a row of metrics.jsonl at `step` (env steps), without None, NaN and infinite values."""
 
+    def log_machine(self, use: Mapping[str, float], step: int) -> None:
+        """Record the use of the machine at `step`, which is not part of the run's record."""
+
     def safe_until(self, step: int) -> None:
         """Report that a checkpoint covers all steps until `step`: no resumed run will start before it."""
 
@@ -180,6 +183,10 @@ class MLflowTracker(Tracker):
                 self._logged += len(points)
                 self._held.append(points)
             self._release()
+
+    @override
+    def log_machine(self, use: Mapping[str, float], step: int) -> None:
+        self.log(use, step)
 
     @override
     def safe_until(self, step: float) -> None:

@@ -41,6 +41,7 @@ from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
+from .machine import machine_use
 from .metrics import NOT_EVALUATED, Finished, Ranking, eval_columns
 from .trainer import Callback, Trainer, TrainResult
 
@@ -250,9 +251,14 @@ class TrackingCallback(Callback):
         """Log the row again: the store may lack some, and takes none twice."""
         self._log(trainer)
 
+    def on_fit_start(self, trainer: Trainer) -> None:
+        """Begin to measure the use of the machine."""
+        machine_use(trainer.experiment.device)
+
     def on_iteration_end(self, trainer: Trainer) -> None:
-        """Log the row."""
+        """Log the row, and the use of the machine, which is not part of the record."""
         self._log(trainer)
+        self._tracker.log_machine(machine_use(trainer.experiment.device), step=trainer.env_steps)
 
     def on_save(self, trainer: Trainer) -> None:
         """Let the tracker write the points up to here: no resumed run goes back behind them."""

@@ -1,11 +1,15 @@
+import json
 import math
+import socket
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from mlflow import MlflowClient
 
+from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracker import MLflowTracker
@@ -153,3 +157,19 @@ def test_two_processes_that_begin_at_once_in_a_new_folder_lose_nothing(tmp_path)
         assert points(client, run_id.strip(), "kl") == [(step, step + seed / 8) for step in range(50)]
         assert [file.path for file in client.list_artifacts(run_id.strip())] == ["__init__.py"]
     assert {path.name for path in runs.iterdir()} == {"mlflow.db", "mlflow.db.lock", "mlflow-artifacts"}
+
+
+@pytest.mark.slow
+def test_a_training_records_the_use_of_the_machine_beside_its_rows(train_here, tmp_path):
+    ended = train_here("tracking=mlflow")
+    assert ended.code == 0, ended.stderr
+    client = MlflowClient(tracking_uri=resolve_store(None, tmp_path / "runs").uri)
+    run_id = json.loads((ended.folder / "tracking.json").read_text())["run_id"]
+    steps = [row["env_steps"] for row in ended.metrics]
+    for column in ("cpu_percent", "memory_mb", "memory_percent"):
+        assert metric_name(column).startswith("system/")
+        assert [step for step, _ in points(client, run_id, column)] == steps
+        assert column not in ended.metrics[0]
+    tags = client.get_run(run_id).data.tags
+    assert tags["host"] == socket.gethostname()
+    assert tags["mlflow.user"]

@@ -189,3 +189,20 @@ def test_a_store_that_hangs_holds_up_a_trial_for_its_deadline_at_most(store, mon
     assert open_trial_run(store, "spring", 7, "0" * 32, [], deadline_s=0.2) is None
     goes_on.set()
     assert "trial 7 has no run there" in caplog.text
+
+
+def test_the_experiment_names_the_winner_of_the_study_and_not_the_run_of_the_lowest_score(store, mlflow):
+    run = begin(store)
+    run.wait_for_id(60)
+    run.update(progress())
+    assert run.finish("FINISHED", 60)
+    # A seed of another trial, and a training under the same name, have lower scores than the mean that won.
+    lucky = MLflowRun(store)
+    lucky.connect()
+    tracked = TrackedRun(None, "lucky", "spring", 1, store.shown)
+    lucky.create(tracked, again=False)
+    best = {"iteration": 1, "env_steps": 1, "eval_race_score_s": 1.5}
+    lucky.conclude(tracked, {"status": "finished", "reason": "budget", "best": best})
+    note = mlflow.get_experiment_by_name("spring").tags["mlflow.note.content"]
+    assert "trial 7, race score 9.50 s" in note
+    assert "1.50" not in note
