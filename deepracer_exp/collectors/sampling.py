@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Categorical, Distribution, Independent
 
 NOISE = "noise"
 """Standard normal numbers of each car for its next action, float64: one for an index, two for steering and speed."""
@@ -25,12 +25,15 @@ class SamplingPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add action, log-probability and the distribution's parameters."""
+        # Apart, since a trunk's output is left there, too.
         acted = tensordict.select(*self.policy.in_keys)
         distribution = self.policy.get_dist(acted)
         action = _drawn(distribution, tensordict.get(NOISE))
         acted.set("action", action)
         acted.set("action_log_prob", distribution.log_prob(action))
-        return tensordict.update(acted.select(*self.out_keys))
+        for key in self.out_keys:
+            tensordict.set(key, acted.get(key))
+        return tensordict
 
 
 def _drawn(distribution: Distribution, noise: Tensor) -> Tensor:
@@ -38,4 +41,6 @@ def _drawn(distribution: Distribution, noise: Tensor) -> Tensor:
     if isinstance(distribution, Categorical):
         below = distribution.probs.cumsum(-1)[..., :-1]  # the last is 1, up to rounding
         return (torch.special.ndtr(noise) >= below).sum(-1)
-    return distribution.mean + distribution.stddev * noise.to(distribution.mean.dtype)
+    assert isinstance(distribution, Independent)
+    normal = distribution.base_dist
+    return normal.loc + normal.scale * noise.to(normal.loc.dtype)
