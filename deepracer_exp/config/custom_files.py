@@ -291,12 +291,10 @@ def _workers(folder: str, names: Sequence[str]) -> tuple[tuple[JobSettings, ...]
         params = str(Path(folder, "training_params.yaml"))
         workers = read_training_params(params) if "training_params.yaml" in names else ()
         unused += [f"{name}: not used, because there is no run.env beside it" for name in numbered.values()]
-    experiments = Path(folder, "experiments")
-    if experiments.is_dir():
-        for path in sorted(experiments.iterdir()):
-            if path.is_dir():
-                own = override_line(KEY, str(path)).replace("'", "")
-                unused.append(f"experiments/{' '.join(path.name.split())}: not used; {own} trains it")
+    for path in sorted(Path(folder).glob("experiments/*/")):
+        # A folder's name may contain line breaks.
+        shown = " ".join(str(path).split())
+        unused.append(f"experiments/{' '.join(path.name.split())}: not used; {KEY}={shown} trains it")
     return workers, unused
 
 
