@@ -49,6 +49,7 @@ class _Laps:
 
     words: str
     plot: Plot
+    caption: str
     table: Table
     strip: Sequence[Glimpse]
 
@@ -108,9 +109,11 @@ class LivePage:
             best = again.lap(best_attempt(evaluation))
             strip = glimpses(best, again.acted, policy, evaluator.race.setup.actions, camera)
         known = trained_on(self._run.experiment, self._protocol, evaluation)
+        chart = newest_laps(track_lines(evaluator, evaluation, recorder))
         return _Laps(
             words=f"checkpoint {stored.path.name}, {stored.counters['env_steps']:,} steps",
-            plot=plot_of(newest_laps(track_lines(evaluator, evaluation, recorder))),
+            plot=plot_of(chart),
+            caption=chart.caption,
             table=results_table(evaluation, self._protocol, known, Console(width=200)),
             strip=strip,
         )
