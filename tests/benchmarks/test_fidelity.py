@@ -88,6 +88,25 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
     assert "version 6, car=deepracer_v6" in capsys.readouterr().out
 
 
+def test_the_car_of_version_6_is_as_fast_as_the_recorded_one_and_turns_as_far_in_sustained_bends(reference):
+    (fast,) = read_recorded([reference / "race_pace/droa_v6_fast.tar.gz"])
+    some = fast.windows["one_second"]
+    path = replay(CAR, some)
+    assert np.median(errors(path, some).distance_m[:, -1]) < 0.065
+    driven, recorded = (
+        np.hypot(*np.diff(poses[..., :2], axis=1).transpose(2, 0, 1)).sum(axis=1)
+        for poses in (path, some.truth)
+    )
+    assert np.median(driven / recorded) == pytest.approx(1.0, abs=0.01)
+    steering = some.action[:, WARM_UP_STEPS:, 1]
+    bend = (np.abs(steering.mean(axis=1)) > np.radians(8)) & (
+        np.sign(steering) == np.sign(steering[:, :1])
+    ).all(axis=1)
+    turned, turned_recorded = (poses[bend, -1, 2] - some.start[bend, 2] for poses in (path, some.truth))
+    assert bend.sum() > 200
+    assert np.median(turned / turned_recorded) == pytest.approx(1.0, abs=0.04)
+
+
 def test_a_recording_left_out_is_predicted_by_a_car_that_has_not_seen_it(
     reference, tmp_path, monkeypatch, capsys
 ):
