@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import BEST_OF_SWEEP
 from deepracer_exp.runs.resolve import best_run_of_sweep, read_best_of_sweep, resolve
@@ -49,6 +50,16 @@ def test_without_a_complete_trial_there_is_no_best(tmp_path):
     add(study, None, "collapsed")
     with pytest.raises(BadInput, match="none of its 1 trials is complete"):
         best_line(study)
+
+
+def test_the_command_names_the_threads_on_which_a_networks_last_digits_depend(tmp_path):
+    study = new_study(tmp_path)
+    where = ["collector.mode=in_process", "collector.processes=null", "collector.threads=1"]
+    add(study, [9.0], overrides=["observation=camera_small"], where=where)
+    words = shlex.split(best_line(study))
+    assert words == ["deepracer-exp", "train", "observation=camera_small", *where]
+    collector = compose_experiment(words[2:])[0].collector
+    assert (collector.mode, collector.processes, collector.threads) == ("in_process", None, 1)
 
 
 def test_a_shell_reads_every_override_back_from_the_command(tmp_path):
