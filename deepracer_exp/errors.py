@@ -1,11 +1,15 @@
 """The two errors that end a command, their exit codes, guards around user input, and helpers for messages."""
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 _LONGEST_LINE = 4000
 """Characters of a message; the longest lists of options have fewer."""
+_HEAD, _TAIL = 120, 60
+_LONG_VALUE = re.compile(r"\S{400,}|(?<!\w)('|\")(?:(?!\1).){400,}\1(?!\w)")
+"""A value that a message repeats: one word, or quoted. What would be accepted is neither."""
 
 NO_MEMORY = "needs more memory than there is"
 
@@ -89,10 +93,11 @@ def _reason(error: Exception) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Return a text without line breaks and control characters; a very long one without its middle."""
+    """Return a text without line breaks and control characters, and without the middle of what is very long."""
     line = "".join(
         letter if letter.isprintable() else repr(letter)[1:-1] for letter in " ".join(text.split())
     )
+    line = _LONG_VALUE.sub(lambda value: f"{value[0][:_HEAD]} … {value[0][-_TAIL:]}", line)
     if len(line) <= _LONGEST_LINE:
         return line
     half = _LONGEST_LINE // 2

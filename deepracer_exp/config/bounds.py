@@ -4,6 +4,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+Divisor = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""A divisor of quantities in SI units; the quotient stays finite in float32."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

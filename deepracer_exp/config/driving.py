@@ -5,7 +5,7 @@ from typing import Annotated, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, Field
 
-from .bounds import Finite, Fraction, Natural, NonNegative, Positive, Seconds, UpTo100
+from .bounds import Divisor, Finite, Fraction, Natural, NonNegative, Positive, Seconds, UpTo100
 from .own_class import OwnClass
 
 SpeedMps = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
@@ -136,9 +136,9 @@ class ObservationConfig:
 
     lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
     """Distances ahead along the centre line at which the road is observed."""
-    lookahead_scale_m: Positive
-    speed_scale_mps: Positive
-    yaw_rate_scale_radps: Positive
+    lookahead_scale_m: Divisor
+    speed_scale_mps: Divisor
+    yaw_rate_scale_radps: Divisor
     parts: tuple[OwnClass, ...] = ()
     """Classes of your own that add features."""
     camera: CameraConfig | None = None

@@ -118,13 +118,16 @@ def _decode(path: str, data: bytes) -> str:
 
 
 def _parse(path: str, text: str) -> ast.Module:
+    before, null, _ = text.partition("\0")
+    if null:  # the compiler names no line
+        raise BadInput(f"{path}: line {before.count(chr(10)) + 1}: a null byte; this is not valid Python")
     try:
         # Compiling finds what parsing lets through, such as a `return` outside a function.
         compile(text, path, "exec", dont_inherit=True)
         return ast.parse(text, filename=path)
     except SyntaxError as error:
         raise BadInput(f"{path}: line {error.lineno}: {error.msg}; this is not valid Python") from error
-    except (ValueError, RecursionError, MemoryError) as error:  # null bytes; nesting too deep for the parser
+    except (ValueError, RecursionError, MemoryError) as error:  # nesting too deep for the parser
         raise BadInput(f"{path}: is not valid Python: {error or 'too deeply nested'}") from error
 
 

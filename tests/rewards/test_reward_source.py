@@ -60,7 +60,7 @@ def test_only_names_of_the_zoo_reach_a_file(name: str) -> None:
         (b"# \xff\n", "not UTF-8 text (byte 2 is 0xff)"),
         ("x = 1\ndef reward_function(params:\n", "line 2: "),
         ("x = 1\nreturn 2\n", "line 2: 'return' outside function"),
-        ("x = 1\0\n", "null bytes"),
+        ("x = 1\ny = 2\0\n", "line 2: a null byte; this is not valid Python"),
         ("", "has no function reward_function(params)"),
         ("def rewardfunction(params): return 1\n", "(did you mean rewardfunction?)"),
         ("def reward_function(): return 1\n", "line 1: reward_function() must take one argument"),
