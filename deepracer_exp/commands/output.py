@@ -120,14 +120,14 @@ def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig")
 
 def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
     """Say last, on standard error, what was not recorded, and how to send it later."""
-    from deepracer_exp.analysis.next_steps import run_word
+    from deepracer_exp.analysis.next_steps import own_word
     from deepracer_exp.config.running import MLflowTracking
 
     lacking = [one for one in outcomes if one.unrecorded is not None]
     for reason in dict.fromkeys(one.unrecorded for one in lacking):
         print(f"\nwarning: {reason}", file=sys.stderr)
     if lacking and isinstance(tracking, MLflowTracking):
-        words = shlex.join(run_word(one.folder) for one in lacking)
+        words = shlex.join(own_word(one.folder) for one in lacking)
         store = _store_word(lacking[0].folder.parent.parent, tracking.uri)
         print(
             f"  the run folder has everything; send it later: {_command()} runs send {words}{store}",
@@ -145,10 +145,13 @@ def print_unsent(study: "Path") -> None:
     stores = list(undelivered(sorted(file.parent for file in study.glob(f"*/{CONFIG}"))).values())
     own = resolve_store(None, runs_dir).shown
     for store in dict.fromkeys(stores):
-        words = f" {shlex.quote(str(study))}/*{_store_word(runs_dir, None if store == own else store)}"
+        words = [f"runs_dir={runs_dir}"] * (str(runs_dir) != "runs") + [f"tracking.uri={store}"] * (
+            store != own
+        )
+        command = shlex.join([_command(), "runs", "send", *words])
         print(
             f"\nwarning: MLflow ({store}): something of {count(stores.count(store), 'run')} was not recorded\n"
-            f"  the run folders have everything; send it later: {_command()} runs send{words}",
+            f"  the run folders have everything; send it later: {command}",
             file=sys.stderr,
         )
 

@@ -1,10 +1,11 @@
 """What a training prints at its end."""
 
 import json
+from pathlib import Path
 
 import pytest
 
-from deepracer_exp.commands.output import print_result, print_steps
+from deepracer_exp.commands.output import print_result, print_steps, print_unsent
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.training.trainer import TrainResult
 
@@ -38,3 +39,25 @@ def test_a_finished_training_names_the_store_that_recorded_it(trained, capsys, u
     assert f" ui {shown}" in line
     print_result(result, None)
     assert "compare runs" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("store", ["http://127.0.0.1:9", None])
+def test_what_mlflow_lacks_of_a_sweep_is_counted_with_the_command_that_sends_it(
+    tmp_path, capsys, store, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    shown = store or f"sqlite:///{tmp_path}/runs/mlflow.db"
+    for number, complete in enumerate([True, False, False]):
+        run = tmp_path / "runs" / "study" / f"run-{number}"
+        run.mkdir(parents=True)
+        (run / "config.yaml").write_text("name: study\n")
+        (run / "summary.json").write_text('{"status": "finished", "reason": "budget"}')
+        tracked = {"run_id": None, "run_name": "x", "experiment": "study", "start_ms": 0, "store": shown}
+        (run / "tracking.json").write_text(json.dumps(tracked | {"complete": complete}))
+    print_unsent(Path("runs/study"))
+    warning, command = capsys.readouterr().err.strip().splitlines()
+    assert f"MLflow ({shown}): something of 2 runs was not recorded" in warning
+    assert command.endswith(f" runs send tracking.uri={store}" if store else " runs send")
+    (tmp_path / "runs" / "study" / "run-1" / "summary.json").unlink()  # it runs again
+    print_unsent(Path("runs/study"))
+    assert "something of 1 run was" in capsys.readouterr().err
