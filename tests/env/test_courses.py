@@ -191,7 +191,7 @@ def test_gym_cars_are_shared_out_and_each_track_needs_one():
 
 
 def test_all_tracks_drive_together(race_of):
-    race = race_of("track=all", n_cars=63)
-    drive(race, np.full((3, 63), 2))
+    race = race_of("track=all", n_cars=100)
+    drive(race, np.full((3, 100), 2))
     assert np.isfinite(race.observation).all()
     assert len(set(race.trace[:, PACKED["track"]])) == len(race.setup.courses)
