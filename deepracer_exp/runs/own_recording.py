@@ -52,6 +52,11 @@ def read_log(path: Path) -> Recording:
     Raises:
         BadInput: nothing is there, or nothing of it can be read.
     """
+    if is_run(path) and not (path / TRACE).is_dir():
+        raise BadInput(
+            f"{path}: has no trace: `deepracer-exp runs clean` removed it, or the run never drove; accepted: a run "
+            "with its trace, or logs of the service"
+        )
     return read_own_recording(path) if is_own_run(path) else read_recording(path)
 
 

@@ -88,8 +88,10 @@ def deliver_evaluation(
     run_id = read_run_id(run_dir)
     if run_id is None or not has_store(uri, runs_dir):
         return
-    store = resolve_store(uri, runs_dir)
+    store, recorded = resolve_store(uri, runs_dir), read_object(run_dir / TRACKING).get("store")
     try:
+        if recorded not in (None, store.shown):
+            raise StoreRefusedError(f"its run is in {recorded}; give tracking.uri={recorded}")
         with _connected(store) as run:
             run.run_id = run_id
             run.log_metrics(points_at(metrics, env_steps, now_ms()))

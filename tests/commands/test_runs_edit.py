@@ -149,3 +149,9 @@ def test_the_traces_of_finished_runs_are_offered_with_their_size_and_go_only_if_
     assert call("runs", "clean", "--traces", "drop", "--apply").code == 0
     assert not (run / "trace").exists()
     assert (run / "summary.json").exists()
+
+
+def test_a_run_without_its_trace_says_so_to_who_analyses_it(season, call):
+    run = season.run("20261101-120000-a")
+    assert call("runs", "clean", "--traces", "drop", "--apply").code == 0
+    call("analyze", run.name).assert_refused("has no trace", "runs clean")
