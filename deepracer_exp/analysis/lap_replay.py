@@ -16,6 +16,7 @@ from .charts.figure import Chart, Layer, Panel, line, points
 from .charts.laps import ordinary_lap
 from .charts.maps import map_panel
 from .charts.style import BLUE, ORANGE, PAPER
+from .line_file import driven_speed_mps
 from .log_tables import Table
 from .log_view import LogView
 from .page import plot_of, render
@@ -23,8 +24,6 @@ from .statistics import Values
 from .tables import first_rows
 
 COLORS = (BLUE, ORANGE)
-_SMOOTHED = 3
-"""Control steps in the mean of the driven speed of a log: the service's steps are uneven."""
 _DIGITS = 4
 _SAME_START = 0.02
 """Share of the track that two laps may begin apart: else one would drive elsewhere, not beside the other."""
@@ -108,7 +107,6 @@ def _lap(view: LogView, episode: int, which: str) -> ReplayedLap:
         raise BadInput(f"{view.name}: its track is not known; accepted: with --track NAME or a file")
     row, rows = view.episodes.loc[episode], view.steps[view.episode_index == episode]
     lap_time_s, tstamp = float(row["lap_time_s"]), rows["tstamp"].to_numpy(np.float64)
-    speed_mps = rows["track_speed_mps"].rolling(_SMOOTHED, center=True, min_periods=1).mean()
     where = f"iteration {row['iteration']}, " if view.trained else f"{row['stream']}, "
     return ReplayedLap(
         name=view.name,
@@ -120,7 +118,7 @@ def _lap(view: LogView, episode: int, which: str) -> ReplayedLap:
         x_m=rows["X"].to_numpy(np.float64),
         y_m=rows["Y"].to_numpy(np.float64),
         yaw_deg=rows["yaw"].to_numpy(np.float64),
-        speed_mps=speed_mps.bfill().to_numpy(np.float64),
+        speed_mps=driven_speed_mps(rows["track_speed_mps"]).to_numpy(np.float64),
         steering_deg=rows["steer"].to_numpy(np.float64),
     )
 

@@ -37,6 +37,7 @@ _ANALYZE_EPILOG = """\
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
   deepracer-exp analyze RUN --compare logs/ --replay laps.html
                                                             the fastest lap of each, driven beside each other
+  deepracer-exp analyze RUN --line line.py                  the line of its fastest lap, for a reward function
 
 The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
 read and why.
@@ -80,6 +81,10 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
     add_replay(parser, "its fastest lap and that of the first of --compare, or an ordinary one")
+    parser.add_argument(
+        "--line", metavar="FILE", help="write the line of its fastest lap (.csv, .npy, or .py: a Python list)"
+    )
+    parser.add_argument("--lap", metavar="EPISODE", help="the lap of --line: a complete episode of the log")
     _add_page(parser, "report.html of a run, else NAME-analysis.html")
 
     parser = add_command(
@@ -108,6 +113,8 @@ def _add_page(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _analyze(args: argparse.Namespace) -> int:
+    from deepracer_exp.analysis.line_file import check_line_file, recorded_line, write_line
+
     target_s = None if args.target is None else _seconds(args.target)
 
     # `--compare RUN LOGS runs_dir=DIR` takes all three words.
@@ -122,6 +129,8 @@ def _analyze(args: argparse.Namespace) -> int:
     beside = [_place(what, stores) for what in args.compare if not is_override(what)]
     _check_output(args.output)
     check_replay(args.replay)
+    check_line_file(args.line)
+    episode = None if args.lap is None else _episode(args.lap, args.line)
     reward = None
     if args.reward is not None:
         from deepracer_exp.rewards.source import named_reward_source
@@ -145,6 +154,7 @@ def _analyze(args: argparse.Namespace) -> int:
         config = {}
     car = _car(config)
     view, terms = run_terms(prepare(recording, args.track), car)
+    line = None if args.line is None else recorded_line(view, episode)
     strip: list[Glimpse] = []
     if sees_pictures(config):
         from deepracer_exp.evaluation.sight import run_glimpses
@@ -163,6 +173,9 @@ def _analyze(args: argparse.Namespace) -> int:
         write_page(out, LogPage(view, found, others, replay, terms, strip))
     if args.replay is not None:
         write_laps(args.replay, laps_of_log(view, rival))
+    if line is not None:
+        with writing(f"--line {args.line}"):
+            write_line(Path(args.line), line[0])
 
     print(f"{view.name}: {headline(view)}")
     for number, one in enumerate(found, 1):
@@ -174,6 +187,8 @@ def _analyze(args: argparse.Namespace) -> int:
     _end(out, args.open)
     if args.replay is not None:
         print(f"  laps  {args.replay}")
+    if line is not None:
+        print(f"  line  {args.line} ({line[1]})")
     return 0
 
 
@@ -302,6 +317,16 @@ def _light(view: "LogView") -> "LogView":
 def _page(kind: str, name: str) -> Path:
     safe = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name).strip("-.")
     return Path(f"{safe[:80] or 'log'}-{kind}.html")
+
+
+def _episode(lap: str, line: str | None) -> int:
+    try:
+        episode = int(lap)
+    except ValueError:
+        episode = -1
+    if line is None or episode < 0:
+        raise BadInput(f"--lap {lap}: accepted: the number of an episode, beside --line FILE")
+    return episode
 
 
 def _seconds(text: str) -> float:

@@ -85,6 +85,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
     name.completer = _names  # type: ignore[attr-defined]
     parser.add_argument("-o", "--output", type=_picture, metavar="FILE", help="also write a picture of it")
+    parser.add_argument(
+        "--line", metavar="FILE", help="also write its racing line (.csv, .npy, or .py: a Python list)"
+    )
 
 
 def _picture(output: str) -> str:
@@ -254,10 +257,12 @@ def _names(**_: object) -> list[str]:
 
 
 def _tracks(args: argparse.Namespace) -> int:
-    if args.name is None:
-        _list_tracks()
+    if args.name is not None:
+        _show_track(args.name, args.output, args.line)
+    elif args.output is not None or args.line is not None:
+        raise BadInput(f"tracks: no track to write {args.output or args.line} of; accepted: tracks NAME")
     else:
-        _show_track(args.name, args.output)
+        _list_tracks()
     return 0
 
 
@@ -301,16 +306,21 @@ def _list_tracks() -> None:
     )
 
 
-def _show_track(name: str, output: str | None) -> None:
-    """Draw a track, or a route file (.npy, .yaml), in the terminal, and as a picture where one is asked for."""
+def _show_track(name: str, output: str | None, line: str | None) -> None:
+    """Draw a track, or a route file (.npy, .yaml), in the terminal; write a picture and its racing line where asked."""
+    from deepracer_exp.analysis.line_file import check_line_file, racing_line, write_line
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
 
     is_file = Path(name).suffix in (".npy", ".yaml", ".yml")
+    check_line_file(line)
     track = _track(override_line("track.file" if is_file else "track", name))
     if output is not None:
         with writing(f"--output {output}", "", BadInput, ValueError):  # an unknown ending
             draw_picture(track, output)
+    if line is not None:
+        with writing(f"--line {line}"):
+            write_line(Path(line), racing_line(track))
     wide, high = shutil.get_terminal_size((COLUMNS, ROWS))
     print(
         f"{track.title} ({track.name}): {track.length_m:.2f} m, {track.width_m:.2f} m wide, "
@@ -319,6 +329,8 @@ def _show_track(name: str, output: str | None) -> None:
     print(draw_terminal(track, columns=min(wide, COLUMNS), rows=max(12, min(high - 6, ROWS))))
     if output is not None:
         print(f"\npicture: {output}")
+    if line is not None:
+        print(f"\nracing line: {line}")
 
 
 def _track(override: str) -> "Track":
