@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import shapely
 from scipy.optimize import lsq_linear
 
 from deepracer_exp.tracks.track import Track
 
-from .log_course import waypoint_positions
 from .statistics import Values
 
 MARGIN_M = 0.1
@@ -68,14 +68,8 @@ def minimum_curvature_line(course: Track) -> Line:
     first, second = _differences(course.closed, len(center))
     along = first @ center
     sideways = _turned_left(along) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-    own, rooms_m = waypoint_positions(course), []
-    for border in (course.inner, course.outer):
-        points = np.column_stack([np.interp(lap_position, own, axis) for axis in border.T])
-        rooms_m.append(((points - center) * sideways).sum(axis=1))
-    bounds = (
-        np.minimum(np.minimum(*rooms_m) + MARGIN_M, -1e-6),
-        np.maximum(np.maximum(*rooms_m) - MARGIN_M, 1e-6),
-    )
+    right_m, left_m = _road_across(course, center, sideways)
+    bounds = np.minimum(right_m + MARGIN_M, -1e-6), np.maximum(left_m - MARGIN_M, 1e-6)
     offset_m = np.zeros(len(center))
     for _ in range(ROUNDS):
         velocity = first @ (center + offset_m[:, None] * sideways)
@@ -91,6 +85,27 @@ def minimum_curvature_line(course: Track) -> Line:
 def _places(course: Track) -> Values:
     count = int(np.clip(course.length_m / SAMPLE_M, 20, MOST))
     return np.linspace(0.0, 1.0, count, endpoint=not course.closed)
+
+
+def _road_across(course: Track, center: Values, sideways: Values) -> tuple[Values, Values]:
+    """Return how far the road reaches to the right (negative) and to the left of points of the centre line, m, (n,).
+
+    It is measured on the road itself: the two border points of a waypoint may lie far ahead of it or behind.
+    """
+    reach = course.width_max_m * sideways
+    across = shapely.linestrings(np.stack([center - reach, center + reach], axis=1))
+    parts, point = shapely.get_parts(shapely.intersection(across, course.road), return_index=True)
+    # Another stretch of the road may be within reach; the nearest part is the one that the point is on.
+    away_m = shapely.distance(parts, shapely.points(center)[point])
+    nearest = np.lexsort((away_m, point))
+    nearest = nearest[np.unique(point[nearest], return_index=True)[1]]
+    ends, part = shapely.get_coordinates(parts[nearest], return_index=True)
+    at = point[nearest][part]
+    side_m = ((ends - center[at]) * sideways[at]).sum(axis=1)
+    right_m, left_m = np.zeros(len(center)), np.zeros(len(center))
+    np.minimum.at(right_m, at, side_m)
+    np.maximum.at(left_m, at, side_m)
+    return right_m, left_m
 
 
 def _differences(closed: bool, n: int) -> tuple[Values, Values]:
