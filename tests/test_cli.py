@@ -139,6 +139,13 @@ def test_tracks_draws_a_picture_of_one_and_says_where_it_is(call, tmp_path, outp
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_tracks_writes_the_racing_line_of_one_and_says_where_it_is(call, tmp_path):
+    ended = call("tracks", "Oval_track", "--line", "line.csv")
+    assert ended.code == 0
+    assert ended.stdout.endswith("\nracing line: line.csv\n")
+    assert (tmp_path / "line.csv").read_text().startswith("x_m,y_m,progress\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
@@ -146,6 +153,9 @@ def test_tracks_draws_a_picture_of_one_and_says_where_it_is(call, tmp_path, outp
         (["tracks", "missing.npy"], "missing.npy"),
         (["tracks", "reinvent_base", "-o", "no/such/folder.png"], "no/such/folder.png"),
         (["tracks", "reinvent_base", "-o", "picture.nothing"], "picture.nothing"),
+        (["tracks", "-o", "picture.png"], "picture.png"),
+        (["tracks", "--line", "line.csv"], "line.csv"),
+        (["tracks", "reinvent_base", "--line", "line.json"], "line.json"),
     ],
 )
 def test_a_picture_that_cannot_be_drawn_is_bad_input(call, arguments, word):

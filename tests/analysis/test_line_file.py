@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 
 from deepracer_exp.analysis.line_file import SUFFIXES, racing_line, recorded_line, write_line
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.deepracer.worlds import leaders
 from deepracer_exp.tracks.track import world_track
 from tests.conftest import refused
 
@@ -71,12 +71,16 @@ def test_an_episode_that_is_no_complete_lap_is_refused_with_those_that_are(view)
     assert "has no complete lap" in refused(recorded_line, prepare(made_up_recording([HALF])), None)
 
 
-@pytest.mark.parametrize("name", leaders())
+NOT_BESIDE = ("AWS_track", "China_track", "Tokyo_Training_track")
+"""Tracks where the border points of some waypoints are far ahead of them or behind."""
+
+
+@pytest.mark.parametrize("name", [*NOT_BESIDE, "Straight_track", "reinvent_base"])
 def test_the_racing_line_stays_on_the_road_from_waypoint_0_to_the_end(name):
     track = world_track(name)
     line = racing_line(track)
     points = line[["x_m", "y_m"]].to_numpy()
-    assert track.on_road(points).all()
+    assert shapely.dwithin(track.road, shapely.points(points), 1e-6).all()
     assert line["progress"].iloc[[0, -1]].tolist() == [0.0, 100.0]
     assert (line["progress"].diff()[1:] > 0).all()
     assert np.array_equal(points[0], points[-1]) == track.closed

@@ -110,6 +110,18 @@ def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
     assert not (tmp_path / "trapped").exists()
 
 
+def test_the_lap_whose_line_is_written_is_named_and_can_be_asked_for(run_dir, call, tmp_path):
+    ended = call("analyze", str(run_dir), "--line", "line.py")
+    assert ended.code == 0, ended.stderr
+    told = re.fullmatch(
+        r"  line  line\.py \(the fastest lap, iteration \d+, episode (\d+), \d\.\d{3} s\)",
+        ended.stdout.splitlines()[-1],
+    )
+    assert told
+    assert call("analyze", str(run_dir), "--line", "same.py", "--lap", told[1]).code == 0
+    assert (tmp_path / "same.py").read_text() == (tmp_path / "line.py").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -120,6 +132,11 @@ def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
         (["RUN", "--reward", "racing_lime"], ["racing_lime"]),
         (["RUN", "--track", "Atlantis"], ["Atlantis"]),
         (["RUN", "--compare", "nowhere"], ["nowhere"]),
+        (["RUN", "--line", "line.txt"], ["--line line.txt", "accepted", ".csv, .npy, .py"]),
+        (["RUN", "--line", "nowhere/line.csv"], ["--line nowhere/line.csv", "accepted"]),
+        (["RUN", "--line", "line.csv", "--lap", "99999"], ["--lap 99999", "accepted", "fastest"]),
+        (["RUN", "--line", "line.csv", "--lap", "best"], ["--lap best", "accepted"]),
+        (["RUN", "--lap", "3"], ["--lap 3", "beside --line"]),
     ],
 )
 def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
@@ -127,7 +144,7 @@ def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
     (tmp_path / "text.txt").write_text("hello\n")
     ended = call("analyze", *(str(run_dir) if word == "RUN" else word for word in arguments))
     ended.assert_refused(*words)
-    assert not list(tmp_path.glob("*.html"))
+    assert not [*tmp_path.glob("*.html"), *tmp_path.glob("line.*")]
 
 
 def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from deepracer_exp.analysis.line_file import racing_line, write_line
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.rewards.source import zoo_names
+from deepracer_exp.tracks.track import world_track
 from deepracer_exp.validation import validate as checking
 from deepracer_exp.validation.validate import compare_thirds
 
@@ -41,6 +43,19 @@ def test_waypoint_numbers_that_no_world_has_are_noted(call, tmp_path, track, own
     ended = call("validate", "reward=speed_on_track", track)
     assert ("not as in a track of the service" in ended.stdout) == own
     assert {path.parent.name for path in tmp_path.rglob("*.png")} == {"validate"}
+
+
+@pytest.mark.parametrize("speed", [(), (1.5,)])
+def test_a_line_pasted_into_a_reward_function_is_accepted(call, tmp_path, speed):
+    line = racing_line(world_track("reinvent_base"))
+    write_line(tmp_path / "mine.py", line.assign(speed_mps=speed[0]) if speed else line)
+    uses = "1 / (0.1 + min(abs(params['x'] - point[0]) + abs(params['y'] - point[1]) for point in LINE))"
+    with (tmp_path / "mine.py").open("a") as file:
+        file.write("\n\n" + REWARD.format(pay=uses))
+    ended = call("validate", "reward.file=mine.py", "--strict")
+    assert ended.code == 0, ended.stdout
+    assert "deepracer-on-aws: would accept it" in ended.stdout
+    assert "style" not in ended.stdout
 
 
 def test_what_aws_would_reject_is_reported_and_fails_with_strict(call, tmp_path):
