@@ -61,7 +61,12 @@ class Tab:
         self.wait_for("document.readyState === 'complete'")
 
     def draw_all(self) -> None:
-        """Let all figures be drawn by printing the page."""
+        """Unfold the page and let all figures be drawn."""
+        self.evaluate("document.querySelectorAll('main details').forEach((part) => { part.open = true; })")
+        self.prepare_print()
+
+    def prepare_print(self) -> None:
+        """Let the page do what it does before and after it is printed."""
         for event in ("beforeprint", "afterprint"):
             self.evaluate(f"window.dispatchEvent(new Event('{event}'))")
 

@@ -94,12 +94,13 @@ class Laps:
         laps, rows = self.episodes, self.driven
         tried = max(int(laps["ended"].sum()), 1)
         time_s = float(laps["time_s"].sum())
+        complete = int((laps["complete"] & (laps["resets"] == 0)).sum())
         status = self.steps["episode_status"].astype(str)
         mistake = status.isin(_MISTAKES).to_numpy()
         began = mistake & ~np.r_[False, mistake[:-1]]
         turned_deg = rows["steer"].diff().abs()[np.diff(self.number[rows.index], prepend=-1) == 0]
         return {
-            "complete laps, %": np.nan if self.chosen else 100.0 * float(laps["complete"].sum()) / tried,
+            "complete laps, %": np.nan if self.chosen else 100.0 * complete / tried,
             "best lap, s": float(laps["lap_time_s"].min()),
             "median lap, s": float(laps["lap_time_s"].median()),
             "mean speed, m/s": float(laps["dist_m"].sum()) / time_s if time_s else np.nan,

@@ -14,11 +14,11 @@ from deepracer_exp.runs.convergence import POOR, convergence, convergence_rule, 
 from deepracer_exp.runs.result import RunResult
 
 from . import off_track
-from .log_view import LEAST_LAPS, LogView
+from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .statistics import wilson
-from .tables import CANDIDATE_LAPS, DENSE, evaluated_candidates
+from .tables import CANDIDATE_LAPS, DENSE
 
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""
@@ -57,27 +57,29 @@ class Finding:
 
 
 def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
-    """Apply all rules to a log, the most important findings first; `target_s`: the lap time wanted, None: the best."""
-    found: list[Finding | None] = []
+    """Apply all rules to a log, the most important findings first; `target_s`: the lap time wanted, if there is one."""
+    found, overfits = list[Finding | None](), None
     if view.trained:
-        found += [_converged(view), _submit(view)]
-    found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view), _overfits(view)]
+        overfits = _overfits(view)
+        found += [_converged(view, overfits), _submit(view)]
+    found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view), overfits]
     return [one for one in found if one is not None]
 
 
-def _converged(view: LogView) -> Finding:
+def _converged(view: LogView, overfits: Finding | None) -> Finding:
     decision = view.recording.decision
     if decision is not None:
         return _decided(decision)
-    found = convergence(view.iterations, view.action_count, view.recording.stopping)
+    found = convergence(view.judged, view.action_count, view.recording.stopping)
     rule = convergence_rule(view.recording.stopping)
     if found is None:
-        driven = int((view.iterations["episodes"] > 0).sum())
+        driven = int((view.judged["episodes"] > 0).sum())
         sentence = (
-            f"Too short to say whether the training has converged: {count(driven, 'iteration')}, and at least "
+            f"Too short to say whether the training has converged: {_of(driven, view)}, and at least "
             f"{rule.patience + 1} are needed."
         )
         return Finding("converged", sentence, {"iterations": driven})
+    keep = "" if overfits is not None and overfits.values["overfits"] else " Keep training."
     values: _Numbers = {
         "completion": found.completion,
         "completion_before": found.completion_before,
@@ -99,16 +101,16 @@ def _converged(view: LogView) -> Finding:
     elif found.completion < found.completion_best - rule.completion_near:
         sentence = (
             f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f}%. "
-            f"A lower learning rate or {_instead(view, 'an earlier checkpoint')} may hold it."
+            f"A lower learning rate or {_instead(view)} may hold it."
         )
     elif found.completion > found.completion_before + rule.completion_gain:
         sentence = (
             f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f}% in "
-            f"the last {count(found.patience, 'iteration')}. Keep training."
+            f"the last {_of(found.patience, view)}.{keep}"
         )
     else:
         what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still changes"
-        sentence = f"Not converged yet: completion is {found.completion:.0f}%, but {what}. Keep training."
+        sentence = f"Not converged yet: completion is {found.completion:.0f}%, but {what}.{keep}"
     thresholds = {
         "completion_gain": rule.completion_gain,
         "reward_gain": rule.return_gain,
@@ -117,6 +119,13 @@ def _converged(view: LogView) -> Finding:
         "entropy_change": rule.entropy_change,
     }
     return Finding("converged", sentence, values, thresholds)
+
+
+def _of(number: int, view: LogView) -> str:
+    """Return so many rows of `view.judged` in words."""
+    if not view.in_blocks:
+        return count(number, "iteration")
+    return f"{count(number, 'block')} of {LEAST_EPISODES} or more episodes"
 
 
 def _decided(decision: Mapping[str, Any]) -> Finding:
@@ -141,51 +150,71 @@ def _race_with(best: RunResult) -> Finding:
 def _submit(view: LogView) -> Finding:
     if view.recording.best is not None:
         return _race_with(view.recording.best)
-    best, evaluated = view.candidates, evaluated_candidates(view.recording)
+    best = view.candidates
     thresholds = {"least_laps": CANDIDATE_LAPS, "dense": DENSE}
-    laps = int(view.iterations["complete"].sum())
-    values: _Numbers
-    if len(best):
-        first = best.iloc[0]
-        low, high = map(float, wilson(first["complete"], first["episodes"]))
+    if not len(best):
+        return _nothing_to_submit(view, thresholds)
+    first = best.iloc[0]
+    complete, episodes = int(first["complete"]), int(first["episodes"])
+    values: _Numbers = {
+        "iteration": int(first["iteration"]),
+        "laps": complete,
+        "lap_share": first["lap_share"],
+    }
+    if first["evaluated"]:
+        completed = f"{complete} of {episodes} laps"
+        if complete == episodes:
+            completed = {1: "its lap", 2: "both laps"}.get(episodes, f"all {episodes} laps")
+        average = "" if complete == 1 else " on average"
         sentence = (
-            f"Submit {_checkpoint(first['checkpoint'], 'drove')} iteration {first['iteration']:.0f}: a quarter of "
-            f"its laps are below {first['lap_time_p25_s']:.2f} s, and "
-            f"{first['complete']:.0f} of its {first['episodes']:.0f} episodes are complete laps ({_share(low)} to "
-            f"{_share(high)} with 95% confidence)."
+            f"Submit {_checkpoint(first['checkpoint'], 'was saved after')} iteration {first['iteration'] - 1}: its "
+            f"evaluation completed {completed}, in {first['lap_time_mean_s']:.2f} s{average}. The evaluations of the "
+            "log decide: they race without exploring."
         )
-        others = [
-            f"{row.checkpoint or row.iteration} ({row.lap_time_p25_s:.2f} s, {row.lap_share:.0%})"
-            for row in best.iloc[1:].itertuples()
-        ]
-        if others:
-            sentence += f" After it: {' and '.join(others)}."
-        values = {"iteration": int(first["iteration"]), "p25_s": float(first["lap_time_p25_s"])}
-        values |= {"lap_share": float(first["lap_share"]), "laps": int(first["complete"])}
-    elif len(evaluated):
-        first = evaluated.iloc[0]
-        driven = int(first["laps"])
-        did = {1: "completed its lap", 2: "completed both laps"}.get(driven, f"completed all {driven} laps")
-        saved = view.recording.checkpoints.get(int(evaluated.index[0]) + 1, "")
-        sentence = (
-            f"Submit {_checkpoint(saved, 'was saved after')} iteration {evaluated.index[0]}: its evaluation {did}, in "
-            f"{first['lap_time_s']:.2f} s{'' if driven == 1 else ' on average'}. The training itself has too few "
-            f"complete laps to judge by ({laps})."
-        )
-        values = {
-            "iteration": int(evaluated.index[0]),
-            "lap_time_s": float(first["lap_time_s"]),
-            "laps": laps,
-        }
+        values |= {"lap_time_s": float(first["lap_time_mean_s"])}
+        time_of = "lap_time_mean_s"
     else:
-        farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
+        low, high = map(float, wilson(complete, episodes))
         sentence = (
-            f"Nothing to submit yet: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
-            f"all); the farthest episode drove {math.floor(farthest['progress'])}% of the lap in iteration "
-            f"{farthest['iteration']}."
+            f"Submit {_checkpoint(first['checkpoint'], 'drove')} {_iterations(view, first['iteration'])}: a quarter "
+            f"of its laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of its {episodes} episodes are "
+            f"complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
         )
-        values = {"laps": laps, "progress": float(farthest["progress"])}
+        values |= {"p25_s": float(first["lap_time_p25_s"])}
+        time_of = "lap_time_p25_s"
+    others = [
+        f"{row['checkpoint'] or row['iteration']} ({row[time_of]:.2f} s, {row['lap_share']:.0%})"
+        for row in best.iloc[1:].to_dict("records")
+    ]
+    if others:
+        sentence += f" After it: {' and '.join(others)}."
     return Finding("submit", sentence, values, thresholds)
+
+
+def _nothing_to_submit(view: LogView, thresholds: Mapping[str, float]) -> Finding:
+    laps, at_first = int(view.iterations["complete"].sum()), view.iterations["iteration"] == 0
+    before = int(view.iterations["complete"][at_first].sum())
+    farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
+    sentence = (
+        f"Nothing to submit yet: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
+        f"all); the farthest episode drove {math.floor(farthest['progress'])}% of the lap in iteration "
+        f"{farthest['iteration']}."
+    )
+    if before >= CANDIDATE_LAPS:
+        sentence = (
+            f"Nothing to submit yet: {before} of {count(laps, 'complete lap')} are those of iteration 0, driven by the "
+            f"policy that the training began with; no later one has {CANDIDATE_LAPS}."
+        )
+    return Finding("submit", sentence, {"laps": laps, "progress": float(farthest["progress"])}, thresholds)
+
+
+def _iterations(view: LogView, last: int) -> str:
+    """Return what a row of `view.judged` stands for."""
+    if not view.in_blocks:
+        return f"iteration {last}"
+    before = view.judged["iteration"][view.judged["iteration"] < last].max()
+    first = 0 if math.isnan(before) else int(before) + 1
+    return f"iteration {last}" if first == last else f"iterations {first} to {last}"
 
 
 def _checkpoint(name: str, did: str) -> str:
@@ -198,7 +227,7 @@ def _checkpoint(name: str, did: str) -> str:
 
 
 def _chance(view: LogView, target_s: float | None) -> Finding | None:
-    """Say how likely a lap within a target is: measured, and by a normal distribution of the same laps."""
+    """Say how fast the laps are; with a target, how likely one within it is, measured and by a normal distribution."""
     episodes, when = view.now(LEAST_LAPS)
     laps_s = episodes["lap_time_s"].dropna().to_numpy(np.float64)
     laps = len(laps_s)
@@ -212,22 +241,28 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
             "say how likely the next one is."
         )
         return Finding("chance", sentence, {"laps": laps, "best_s": best_s}, {"least_laps": LEAST_LAPS})
-    target = best_s if target_s is None else target_s
-    faster = int((laps_s <= target).sum())
-    low, high = map(float, wilson(faster, laps))
     complete, sd_s = laps / len(episodes), float(laps_s.std(ddof=1))
+    share = f"{complete:.0%} of the episodes were complete laps."
+    values: _Numbers = {"laps": laps, "best_s": best_s, "mean_s": mean_s, "complete": complete, "sd_s": sd_s}
+    if target_s is None:
+        p25_s, median_s = (float(one) for one in np.quantile(laps_s, [0.25, 0.5]))
+        sentence = (
+            f"Half of the {count(laps, 'complete lap')} {when} took at most {median_s:.2f} s, a quarter at most "
+            f"{p25_s:.2f} s; the fastest took {best_s:.2f} s. {share}"
+        )
+        return Finding("chance", sentence, values | {"p25_s": p25_s, "median_s": median_s})
+    faster = int((laps_s <= target_s).sum())
+    low, high = map(float, wilson(faster, laps))
     sentence = (
-        f"{faster:,} of {count(laps, 'complete lap')} {when} took at most {target:.2f} s"
-        f"{', the fastest of them' if target_s is None else ''}: the chance of such a lap is {_share(low)} to "
-        f"{_share(high)}"
+        f"{faster:,} of {count(laps, 'complete lap')} {when} took at most {target_s:.2f} s: the chance of such a lap "
+        f"is {_share(low)} to {_share(high)}"
     )
-    values: _Numbers = {"target_s": target, "laps": laps, "faster": faster, "low": low, "high": high}
-    values |= {"mean_s": mean_s, "complete": complete}
+    values |= {"target_s": target_s, "faster": faster, "low": low, "high": high}
     if sd_s > 0:
-        normal = float(norm.cdf(target, mean_s, sd_s))
+        normal = float(norm.cdf(target_s, mean_s, sd_s))
         sentence += f"; a normal fit (mean {mean_s:.2f} s, deviation {sd_s:.2f} s) says {_share(normal)}"
-        values |= {"sd_s": sd_s, "normal": normal}
-    return Finding("chance", f"{sentence}. {complete:.0%} of the episodes were complete laps.", values)
+        values["normal"] = normal
+    return Finding("chance", f"{sentence}. {share}", values)
 
 
 def _time_lost(view: LogView) -> Finding | None:
@@ -337,10 +372,11 @@ def _in(sectors: Sequence[Sector], place: OffTrackPlace) -> str:
 
 def _overfits(view: LogView) -> Finding | None:
     decision = view.recording.decision
-    found = overfitting(view.iterations, view.recording.stopping)
+    found = overfitting(view.judged, view.recording.stopping)
     if found is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
     values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
+    values["overfits"] = int(found.decision is not None)
     sentence = (
         f"No sign of overfitting: the mean completion of the last three {found.evaluated}s is {found.now:.0f}% "
         f"(best three in a row: {found.best:.0f}%)."
@@ -349,21 +385,24 @@ def _overfits(view: LogView) -> Finding | None:
         sentence = (
             f"It overfits: the mean completion of three {found.evaluated}s in a row fell from {found.best:.0f}% "
             f"around iteration {found.best_iteration} to {found.now:.0f}% while the reward of the training holds. Take "
-            f"{_instead(view, f'a checkpoint from about iteration {found.best_iteration}')}."
+            f"{_instead(view)}."
         )
         values |= found.decision.values
     thresholds = {"held_out_drop": found.rule.held_out_drop, "return_drop": found.rule.return_drop}
     return Finding("overfits", sentence, values, thresholds | {"patience": found.rule.patience})
 
 
-def _instead(view: LogView, of_the_service: str) -> str:
-    """Return which checkpoint to take instead of the last; a run of ours keeps few, the best among them."""
+def _instead(view: LogView) -> str:
+    """Return which checkpoint to take instead of the last: the one that `_submit` names."""
     best = view.recording.best
-    if best is None:
-        return of_the_service
-    if best.iteration is None:
-        return "one of the kept checkpoints"
-    return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"
+    if best is not None:
+        if best.iteration is None:
+            return "one of the kept checkpoints"
+        return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"
+    if not len(view.candidates):
+        return "an earlier checkpoint"
+    first = view.candidates.iloc[0]
+    return f"the checkpoint {first['checkpoint']}" if first["checkpoint"] else "the checkpoint to submit"
 
 
 def _share(share: float) -> str:

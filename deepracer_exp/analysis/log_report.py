@@ -150,6 +150,7 @@ def html(page: LogPage) -> str:
         problem_count=count(len(view.problems), "problem") if view.problems else "",
         replay=page.replay,
         candidates=candidate_rows(view),
+        evaluated=bool(view.candidates["evaluated"].any()),
         laps=best_laps(view),
         strip=page.strip,
         sections=[(title, [plots[name] for name in names]) for title, names in shown.items() if names],

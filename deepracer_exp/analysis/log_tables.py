@@ -34,7 +34,8 @@ _ITERATION_COLUMNS = {
 }
 """Columns with their heads and formats."""
 _CANDIDATE_COLUMNS = {
-    "iteration": ("Iteration", "d"),
+    "checkpoint": ("Checkpoint", ""),
+    "iteration": ("Drove iteration", "d"),
     "lap_time_p25_s": ("25th percentile, s", ".2f"),
     "lap_time_best_s": ("Best lap, s", ".2f"),
     "lap_time_mean_s": ("Mean lap, s", ".2f"),
@@ -89,16 +90,19 @@ def iteration_rows(view: LogView) -> Table:
 
 
 def candidate_rows(view: LogView) -> Table:
-    """Return the iterations whose policy is worth submitting, the best first."""
-    return table_of(view.candidates, _CANDIDATE_COLUMNS)
+    """Return the checkpoints worth submitting, the best first: `LogView.candidates`."""
+    known = view.candidates.replace({"checkpoint": ""}, None).notna().any()
+    return table_of(view.candidates, {name: one for name, one in _CANDIDATE_COLUMNS.items() if known[name]})
 
 
 def best_laps(view: LogView) -> Table:
-    """Return the fastest complete laps of the training, or of races without one, the fastest first."""
-    laps = view.episodes.dropna(subset="lap_time_s").sort_values("lap_time_s", kind="stable")
-    columns = _LAP_COLUMNS
+    """Return the fastest laps of the training, or of races without one, the fastest first; those with resets last."""
+    columns, episodes = _LAP_COLUMNS, view.episodes
     if not view.trained:
         columns = {"stream": ("Race", "")} | {k: v for k, v in columns.items() if k != "iteration"}
+        columns |= {"resets": ("Resets", "d")} if episodes["reset_lap_time_s"].notna().any() else {}
+        episodes = episodes.assign(lap_time_s=episodes["lap_time_s"].fillna(episodes["reset_lap_time_s"]))
+    laps = episodes.dropna(subset="lap_time_s").sort_values(["resets", "lap_time_s"], kind="stable")
     return table_of(laps.head(MOST_LAPS), columns, max(0, len(laps) - MOST_LAPS))
 
 
@@ -150,7 +154,9 @@ def headline(view: LogView) -> str:
         count(int(view.episodes["ended"].sum()), "finished episode"),
         count(len(view.steps), "control step"),
     )
-    laps, best_s = int(view.episodes["complete"].sum()), view.episodes["lap_time_s"].min()
+    complete, put_back = view.episodes["complete"], view.episodes["resets"] > 0
+    laps, best_s = int((complete & ~put_back).sum()), view.episodes["lap_time_s"].min()
+    more = count(int((complete & put_back).sum()), "more lap")
     if view.trained:
         sentence = f"{steps} of training in {finished} and {count(len(view.iterations), 'iteration')}"
         if view.untraced:
@@ -160,7 +166,8 @@ def headline(view: LogView) -> str:
     else:
         races = count(view.episodes["stream"].nunique(), "race")
         sentence = f"No training; {steps} in {finished} of {races}"
+    with_resets = f"; {more} with resets" if (complete & put_back).any() else ""
     if not laps:
-        return f"{sentence}; no complete lap."
+        return f"{sentence}; no complete lap{with_resets}."
     best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
-    return f"{sentence}; {count(laps, 'complete lap')}{best}."
+    return f"{sentence}; {count(laps, 'complete lap')}{best}{with_resets}."

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -35,6 +36,8 @@ PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
 LEAST_LAPS = 5
 """Complete laps in the last third of the iterations below which those of the whole log show how the car drives."""
+LEAST_EPISODES = 5
+"""Episodes without which an iteration says little: SAC updates its policy after each one."""
 STARTING_STEPS = 10
 """First control steps of an episode, in which the car pulls away from standing."""
 
@@ -59,6 +62,8 @@ class LogView:
     """Their episodes, `tables.EPISODE_COLUMNS`."""
     iterations: pd.DataFrame
     """Their iterations, `tables.ITERATION_COLUMNS`."""
+    judged: pd.DataFrame
+    """What a training is judged by: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`."""
     evaluation_episodes: pd.DataFrame
     """Episodes on the course of all other streams, with `stream`."""
     laps_timed: int
@@ -88,9 +93,19 @@ class LogView:
         return " with a trace" if self.untraced else ""
 
     @property
+    def in_blocks(self) -> bool:
+        """Whether several iterations are judged together."""
+        return len(self.judged) < len(self.iterations)
+
+    @cached_property
     def candidates(self) -> pd.DataFrame:
-        """Iterations worth submitting; none of our own runs, which keep few checkpoints and have evaluated them."""
-        return candidates(self.iterations if self.recording.best is None else self.iterations.iloc[:0])
+        """Checkpoints worth submitting, the best first, `tables.CANDIDATE_COLUMNS`.
+
+        Findings, tables and figures quote this choice. There are none of our own runs, which keep few checkpoints and
+        have evaluated them.
+        """
+        own = self.recording.best is not None
+        return candidates(self.recording, self.judged).iloc[: 0 if own else None]
 
     @property
     def waypoint_count(self) -> int:
@@ -200,6 +215,7 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     driven, raced, races_timed = _episodes(recording, here & ~training, course, discount)
     raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
     iterations = iteration_table(recording, trained, episodes)
+    judged = _judged(recording, trained, episodes, iterations)
     if not (here & training).any():
         trained = driven.assign(episode=np.cumsum(first_rows(driven)) - 1)
         episodes = raced.assign(episode=np.arange(len(raced)))
@@ -212,11 +228,22 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         steps=trained,
         episodes=episodes,
         iterations=iterations,
+        judged=judged,
         evaluation_episodes=raced,
         laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,
     )
+
+
+def _judged(
+    recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame, iterations: pd.DataFrame
+) -> pd.DataFrame:
+    """Return the iterations, put together to blocks of `LEAST_EPISODES` where most have fewer."""
+    usual = iterations["episodes"][iterations["episodes"] > 0].median()
+    if recording.best is not None or not usual < LEAST_EPISODES:
+        return iterations
+    return iteration_table(recording, steps, episodes, LEAST_EPISODES)
 
 
 def _episodes(

@@ -13,7 +13,7 @@ from deepracer_exp.tracks.track import Track
 from .log_course import waypoint_positions
 from .log_view import LEAST_LAPS, LogView
 from .statistics import Values
-from .tables import first_rows, whole_from_start
+from .tables import first_rows, laps_driven
 
 BEND_PM = 0.3
 """Curvature from which on the centre line counts as a bend, 1/m: radii below 3.3 m."""
@@ -106,14 +106,12 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
         bounds: lap positions (n + 1,), growing from 0 to 1.
 
     Returns:
-        A row for each complete lap whose beginning is recorded, a column for each interval; the index is that of
-        `LogView.episodes`.
+        A row for each lap (`tables.laps_driven`), a column for each interval; the index is that of `LogView.episodes`.
     """
     begin = np.flatnonzero(first_rows(steps))
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
     columns = {name: steps[name].to_numpy(np.float64) for name in ("progress", "lap_position", "lap_clock_s")}
-    complete = np.maximum.reduceat(columns["progress"], begin) >= 100.0 if len(begin) else np.zeros(0, bool)
-    laps = np.flatnonzero(complete & whole_from_start(steps))
+    laps = np.flatnonzero(laps_driven(steps))
     begin, end = begin[laps], end[laps]
     rows = end - begin + 1
     lap = np.repeat(np.arange(len(laps)), rows)

@@ -53,7 +53,9 @@ EPISODE_COLUMNS: Mapping[str, str] = {
     "reward_if_complete": "reward * 100 / progress; NaN without progress",
     "ended": "whether its last row is the end of the episode, not just of the recording",
     "complete": "whether progress reached 100 per cent",
-    "lap_time_s": "s, lap_clock_s at the end of a complete lap whose beginning is recorded; NaN of other episodes",
+    "resets": "how often the car was put back on the way",
+    "lap_time_s": "s, lap_clock_s at the end of a lap: complete, without a reset, its beginning recorded; else NaN",
+    "reset_lap_time_s": "s, the same of a complete lap with resets, their penalties included; else NaN",
     "status": "episode_status of its last row; lap_complete of a lap in a race; where the format has none, "
     "lap_complete, off_track or empty",
     "last_waypoint": "waypoint of its last row",
@@ -61,6 +63,8 @@ EPISODE_COLUMNS: Mapping[str, str] = {
     "quintile": "1 to 5, likewise",
 }
 """Names of the columns, with meaning and unit; the first ones equal deepracer-utils' `simulation_agg`."""
+STOPPED = ("off_track", "crashed", "immobilized", "reversed")
+"""Status of the rows after which a car is put back, or the episode ends."""
 FIRST_STEPS = 2
 """Highest step number of an episode's first row: formats without prepare rows may begin with 2."""
 ITERATION_COLUMNS: Mapping[str, str] = {
@@ -92,6 +96,14 @@ CANDIDATE_LAPS = 3
 DENSE = 0.5
 """Share of complete laps a candidate must have, over the highest share of an iteration with `CANDIDATE_LAPS`."""
 MOST_CANDIDATES = 3
+CANDIDATE_COLUMNS: Mapping[str, str] = {
+    "iteration": "that the checkpoint drove",
+    "checkpoint": "the service's name of it; empty where the log does not name it",
+    "evaluated": "whether its evaluation is judged; else the training's own laps",
+    **{name: ITERATION_COLUMNS[name] for name in ("lap_time_p25_s", "lap_time_best_s", "lap_time_mean_s")},
+    **{name: ITERATION_COLUMNS[name] for name in ("lap_share", "complete", "episodes")},
+}
+"""Names of the columns, with meaning and unit; laps, shares and times are those of what is judged."""
 _REPORTED = ("entropy", "kl", "policy_loss", "value_loss", "lr")
 
 
@@ -259,6 +271,31 @@ def whole_from_start(steps: pd.DataFrame) -> NDArray[np.bool_]:
     return (steps["steps"].to_numpy()[begin] <= FIRST_STEPS) | flying_rows(steps)[begin]
 
 
+def resets(steps: pd.DataFrame) -> NDArray[np.int64]:
+    """Return for each episode how often the car was put back on its way."""
+    first = first_rows(steps)
+    stopped = steps["episode_status"].isin(STOPPED).to_numpy()
+    begins = stopped.copy()
+    begins[1:] &= first[1:] | ~stopped[:-1]
+    begin = np.flatnonzero(first)
+    end = np.append(begin[1:], len(steps))[: len(begin)] - 1
+    return (
+        np.add.reduceat(begins, begin, dtype=np.int64) - stopped[end] if len(begin) else np.zeros(0, np.int64)
+    )
+
+
+def laps_driven(steps: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return for each episode whether it is a complete lap without a reset whose beginning is recorded.
+
+    Only these show the driving line and what a lap takes: a car that is put back stands, and drives a part of the lap
+    again.
+    """
+    begin = np.flatnonzero(first_rows(steps))
+    progress = steps["progress"].to_numpy(np.float64)
+    complete = np.maximum.reduceat(progress, begin) >= 100.0 if len(begin) else np.zeros(0, bool)
+    return complete & whole_from_start(steps) & (resets(steps) == 0)
+
+
 def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
     """Summarise each episode in one row, `EPISODE_COLUMNS`, in the order of the steps.
 
@@ -276,7 +313,8 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
 
     progress, time_s, reward = combined("progress", np.maximum), combined("delta_time_s"), combined("reward")
     number, clock_s = steps["steps"].to_numpy(), steps["lap_clock_s"].to_numpy()[end]
-    complete = progress >= 100.0
+    complete, put_back = progress >= 100.0, resets(steps)
+    timed = complete & whole_from_start(steps) & (time_s > 0)
     per_lap = np.divide(100.0, progress, out=np.full(len(begin), np.nan), where=progress > 0)
     first_row, last_row = (steps.iloc[at].reset_index(drop=True) for at in (begin, end))
     status = last_row["episode_status"].astype(str)
@@ -300,7 +338,9 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
             "reward_if_complete": reward * per_lap,
             "ended": complete | ended,
             "complete": complete,
-            "lap_time_s": np.where(complete & whole_from_start(steps) & (time_s > 0), clock_s, np.nan),
+            "resets": put_back,
+            "lap_time_s": np.where(timed & (put_back == 0), clock_s, np.nan),
+            "reset_lap_time_s": np.where(timed & (put_back > 0), clock_s, np.nan),
             "status": status.mask(lap, "lap_complete").mask(off & ~complete, "off_track"),
             "last_waypoint": last_row["closest_waypoint"],
             "quarter": 1 + 4 * order // len(order),
@@ -309,12 +349,30 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame) -> pd.DataFrame:
+def iteration_table(
+    recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame, least_episodes: int = 0
+) -> pd.DataFrame:
     """Summarise each iteration in one row, `ITERATION_COLUMNS`, also those without an episode.
 
     Episodes whose end is not recorded are left out: those still driving when a run ended would count as bad ones.
+
+    Args:
+        recording: of the training.
+        steps: of the training on the course.
+        episodes: theirs.
+        least_episodes: consecutive iterations are put together until each row has as many; it has the number of the
+            last of them.
     """
     ended = pd.concat([episodes[episodes["ended"]], _from_metrics_only(recording, episodes)])
+    driven = steps.groupby("iteration").size()
+    updates = recording.updates.groupby("iteration")[list(_REPORTED)].mean()
+    evaluated = _evaluated(recording)
+    if least_episodes:
+        known = driven.index.union(ended["iteration"].unique()).union(updates.index).union(evaluated.index)
+        row_of = _put_together(known, ended["iteration"], least_episodes)
+        ended = ended.assign(iteration=ended["iteration"].map(row_of))
+        driven = driven.groupby(row_of).sum()
+        updates, evaluated = updates.groupby(row_of).mean(), evaluated.groupby(row_of).mean()
     groups = ended.groupby("iteration")
     laps = groups["lap_time_s"]
     table = pd.DataFrame(
@@ -330,14 +388,24 @@ def iteration_table(recording: Recording, steps: pd.DataFrame, episodes: pd.Data
             "speed_mps": groups["speed_mps"].mean(),
         }
     )
-    driven = steps.groupby("iteration").size()
-    updates = recording.updates.groupby("iteration")[list(_REPORTED)].mean()
     known = driven.index.union(table.index).union(updates.index)
-    table = table.reindex(known).join(updates).join(_evaluated(recording)).assign(steps=driven)
+    table = table.reindex(known).join(updates).join(evaluated).assign(steps=driven)
     table = table.fillna({"episodes": 0, "complete": 0, "steps": 0})
     table["checkpoint"] = [recording.checkpoints.get(k, "") for k in known]
     whole = dict.fromkeys(("iteration", "episodes", "steps", "complete"), np.int64)
     return table.rename_axis("iteration").reset_index()[list(ITERATION_COLUMNS)].astype(whole)
+
+
+def _put_together(iterations: pd.Index, ended: pd.Series, least_episodes: int) -> "pd.Series[int]":
+    """Return for each iteration the last of those that make up its row; the newest row may have fewer episodes."""
+    counts = ended.value_counts().reindex(iterations, fill_value=0)
+    rows, gathered = [], 0
+    for count in counts:
+        rows.append(gathered >= least_episodes)
+        gathered = count + (0 if rows[-1] else gathered)
+    number = pd.Series(np.cumsum(rows), iterations)
+    last = pd.Series(iterations, iterations).groupby(number).max()
+    return number.map(last)
 
 
 def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
@@ -365,24 +433,48 @@ def _evaluated(recording: Recording) -> pd.DataFrame:
     return means.assign(held_out_completion=np.nan)
 
 
-def candidates(iterations: pd.DataFrame) -> pd.DataFrame:
-    """Return the iterations whose policy is worth submitting, the best first, at most `MOST_CANDIDATES`.
+def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
+    """Return the checkpoints of the service worth submitting, the best first, at most `MOST_CANDIDATES`.
 
-    Fast and dense (after TheRayG/deepracer-log-analysis): at least `CANDIDATE_LAPS` complete laps, and `DENSE` of the
-    highest share of complete laps among these; of them the ones with the lowest 25th percentile of the lap time.
-    """
-    enough = iterations["lap_time_p25_s"].notna() & (iterations["complete"] >= CANDIDATE_LAPS)
-    dense = iterations["lap_share"] >= DENSE * iterations.loc[enough, "lap_share"].max()
-    return iterations[enough & dense].sort_values("lap_time_p25_s", kind="stable").head(MOST_CANDIDATES)
+    Evaluations decide where they completed a lap: they race the policy that is submitted, while a training draws its
+    actions. The largest share of complete laps is first, then the lowest mean lap time. Otherwise the training's own
+    laps decide, fast and dense (after TheRayG/deepracer-log-analysis): at least `CANDIDATE_LAPS` complete laps, and
+    `DENSE` of the highest share of complete laps among these; of them the ones with the lowest 25th percentile of the
+    lap time.
 
+    A policy that no update of this training has changed is none of its results: what drove iteration 0 is a network
+    that has learned nothing, or the model that was cloned.
 
-def evaluated_candidates(recording: Recording) -> pd.DataFrame:
-    """Return the iterations after which the service's evaluation completed every lap it tried, the fastest first.
+    Args:
+        recording: of the service.
+        iterations: `ITERATION_COLUMNS`, those to be judged.
 
     Returns:
-        By iteration: `laps` and `lap_time_s`, their mean.
+        `CANDIDATE_COLUMNS`.
     """
     rows = recording.metrics
-    groups = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")].groupby("iteration")
-    found = pd.DataFrame({"laps": groups.size(), "lap_time_s": groups["time_s"].mean()})
-    return found[groups["completion"].min() >= 100.0].sort_values("lap_time_s", kind="stable")
+    rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
+    lap = (rows["completion"] >= 100.0) & ~(rows["resets"] > 0)
+    groups = rows.assign(lap=lap, time_s=rows["time_s"].where(lap)).groupby("iteration")
+    raced = pd.DataFrame(
+        {
+            "episodes": groups.size(),
+            "complete": groups["lap"].sum(),
+            "lap_share": groups["lap"].mean(),
+            "lap_time_mean_s": groups["time_s"].mean(),
+            "lap_time_best_s": groups["time_s"].min(),
+        }
+    )
+    raced = raced[raced["complete"] > 0]
+    if len(raced):
+        # What is evaluated after an iteration drives the next one.
+        raced = raced.reset_index().assign(lap_time_p25_s=np.nan, evaluated=True)
+        raced["iteration"] += 1
+        ranked = raced.sort_values(["lap_share", "lap_time_mean_s"], ascending=[False, True], kind="stable")
+    else:
+        trained = iterations[iterations["iteration"] > 0].assign(evaluated=False)
+        enough = trained["lap_time_p25_s"].notna() & (trained["complete"] >= CANDIDATE_LAPS)
+        dense = trained["lap_share"] >= DENSE * trained.loc[enough, "lap_share"].max()
+        ranked = trained[enough & dense].sort_values("lap_time_p25_s", kind="stable")
+    named = ranked.assign(checkpoint=[recording.checkpoints.get(k, "") for k in ranked["iteration"]])
+    return named.head(MOST_CANDIDATES).reset_index(drop=True)[list(CANDIDATE_COLUMNS)]

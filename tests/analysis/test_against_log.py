@@ -77,7 +77,7 @@ def test_a_training_without_a_lap_and_without_an_evaluation_has_nothing_to_compa
 @pytest.mark.parametrize("evaluations", [{}, {"evaluation-1": [Drive(), Drive()]}])
 @pytest.mark.parametrize("column", ["episode_status", "obstacle_crash_counter"])
 def test_laps_driven_among_bots_say_that_the_simulated_car_is_alone(evaluations, column):
-    recording = made_up_recording([Drive()], evaluations=evaluations)
+    recording = made_up_recording([Drive(), Drive()], evaluations=evaluations)
     course, alone = made_up_course(), "the simulated car drives alone"
     assert alone not in logged_laps(prepare_races(recording), course).words
     steps = recording.steps

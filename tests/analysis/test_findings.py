@@ -12,13 +12,14 @@ from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.findings import Finding, findings
 from deepracer_exp.analysis.log_report import LogPage, draw_sections, html
 from deepracer_exp.analysis.log_tables import NONE, best_laps, headline, iteration_rows
-from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.convergence import LOG_RULE
 from deepracer_exp.runs.result import RunResult
 
+from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording
 
 COURSE = made_up_course()
@@ -30,13 +31,14 @@ def of(view: LogView, rule: str, target_s: float | None = None) -> Finding:
     return found
 
 
-def training(completions: list[float], **more: list[float]) -> LogView:
-    """Prepare a training with one short episode an iteration; 1.0 completes the lap."""
+def training(completions: list[float], episodes: int = LEAST_EPISODES, **more: list[float]) -> LogView:
+    """Prepare a training with a few equal episodes an iteration; 1.0 completes the lap."""
     drives = [
         Drive(speed_mps=3.0, iteration=k, until=c)
         if c >= 1
         else Drive(speed_mps=3.0, iteration=k, off_at=int(118 * c))
         for k, c in enumerate(completions)
+        for _ in range(episodes)
     ]
     return prepare(made_up_recording(drives, **more))
 
@@ -117,6 +119,100 @@ def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_su
         "Submit the checkpoint 5_Step-47, which was saved after iteration 4: its evaluation completed both "
         "laps, in 9.60 s on average."
     )
+
+
+def evaluated(view: LogView, *laps: tuple[int, float, float, float]) -> LogView:
+    """Prepare a log again with evaluations: iteration, completion, time and resets of each lap."""
+    rows = pd.DataFrame(laps, columns=["iteration", "completion", "time_s", "resets"])
+    rows = rows.assign(stream="training", phase="evaluation")
+    metrics = rows.reindex(columns=view.recording.metrics.columns)
+    return prepare(replace(view.recording, metrics=metrics))
+
+
+def test_evaluations_decide_whatever_the_exploring_laps_were() -> None:
+    laps = laps_of((0, 5, 2.0), (10, 0, 3.0), (6, 4, 2.0))
+    assert laps.candidates["iteration"].tolist() == [1, 2]
+    view = evaluated(laps, (0, 60.0, 9.0, 0), (1, 100.0, 9.4, 0), (1, 100.0, 9.6, 0), (2, 100.0, 8.0, 2))
+    # After iteration 1 both laps are complete; the faster one after iteration 2 was put back twice.
+    found = of(view, "submit")
+    assert "that was saved after iteration 1: its evaluation completed both laps" in found.sentence
+    assert (found.values["iteration"], found.values["lap_time_s"]) == (2, pytest.approx(9.5))
+    assert view.candidates["iteration"].tolist() == [2]
+    stars = [
+        one for one in layers(chart_of(view, "lap_time_percentile"), "points") if one.marker.symbol == "star"
+    ]
+    assert [list(one.x) for one in stars] == [[2]]
+    # Without a complete lap they cannot decide.
+    assert evaluated(laps, (1, 90.0, 9.4, 0)).candidates["iteration"].tolist() == [1, 2]
+
+
+def test_the_policy_that_a_training_began_with_is_none_of_its_results() -> None:
+    view = laps_of((10, 0, 3.0), (6, 4, 2.0), (4, 6, 2.0))
+    assert view.candidates["iteration"].tolist() == [1, 2]
+    sentence = of(laps_of((10, 0, 3.0), (2, 4, 2.0)), "submit").sentence
+    assert sentence.startswith(
+        "Nothing to submit yet: 10 of 12 complete laps are those of iteration 0, driven by the"
+    )
+
+
+def test_findings_name_one_checkpoint_and_never_ask_for_more_training_beside_overfitting() -> None:
+    view = training([*RISING, *[1.0] * 4], evaluated=[10.0 * k for k in range(10)] + [90.0] * 3 + [40.0] * 6)
+    named = replace(view.recording, checkpoints={k: f"{k}_Step-{100 * k}" for k in range(25)})
+    view = prepare(named)
+    words = {one.rule: one.sentence for one in findings(view)}
+    first = view.candidates.iloc[0]
+    assert words["overfits"].startswith("It overfits")
+    assert f"Take the checkpoint {first['checkpoint']}." in words["overfits"]
+    assert f"Submit the checkpoint {first['checkpoint']}," in words["submit"]
+    assert "Keep training" not in words["converged"]
+    assert "Keep training" in of(training([*RISING, 1.0]), "converged").sentence
+
+
+def test_iterations_of_one_episode_are_judged_together() -> None:
+    one = training([c for c in LEARNED for _ in range(LEAST_EPISODES)], episodes=1)
+    many = training(LEARNED)
+    assert one.judged["episodes"].tolist() == [LEAST_EPISODES] * len(LEARNED)
+    assert one.judged["completion_mean"].tolist() == pytest.approx(many.judged["completion_mean"].tolist())
+    assert one.judged["iteration"].tolist() == [LEAST_EPISODES * k + 4 for k in range(len(LEARNED))]
+    assert of(one, "converged").values["completion"] == of(many, "converged").values["completion"]
+    assert "drove iterations 75 to 79: a quarter" in of(one, "submit").sentence
+    assert many.judged is many.iterations
+    # A block of steps that have no episode yet ends with the last iteration.
+    assert one.judged["steps"].sum() == one.iterations["steps"].sum()
+
+
+def with_resets(view: LogView, *episodes: int) -> LogView:
+    """Prepare a log again in which the car was put back once in the middle of episodes."""
+    steps = view.recording.steps.copy()
+    status = steps["episode_status"].astype(str)
+    for episode in episodes:
+        rows = np.flatnonzero(steps["episode"] == episode)
+        status.iloc[rows[len(rows) // 2]] = "off_track"
+        status.iloc[rows[len(rows) // 2 + 1]] = "pause"
+    return prepare(replace(view.recording, steps=steps.assign(episode_status=status.astype("category"))))
+
+
+def test_laps_with_resets_are_no_laps_of_the_driving_line() -> None:
+    drives = {"race": [Drive(speed_mps=v) for v in (1.5, 1.8, 1.8, 1.8, 1.8, 2.0)]}
+    view = with_resets(prepare(made_up_recording([], evaluations=drives)), 5)
+    assert view.episodes["resets"].tolist() == [0, 0, 0, 0, 0, 1]
+    assert view.episodes["lap_time_s"].notna().tolist() == [True] * 5 + [False]
+    assert view.episodes["reset_lap_time_s"].notna().tolist() == [False] * 5 + [True]
+    assert "5 complete laps, the best in 9.9" in headline(view)
+    assert headline(view).endswith("; 1 more lap with resets.")
+    found = of(view, "chance")
+    assert (found.values["laps"], found.values["complete"]) == (5, pytest.approx(5 / 6))
+    assert "the best sectors of 5 laps" in of(view, "time_lost").sentence.lower()
+    assert [row[-1] for row in best_laps(view).rows] == ["0"] * 5 + ["1"]
+    assert "(5)" in chart_of(view, "lap_time_histogram").rows[0][0].title
+
+
+def test_no_normal_curve_goes_through_a_few_laps() -> None:
+    for laps, drawn in ((3, False), (5, True)):
+        speeds = (1.5, 2.0, 1.8, 1.7, 1.6)[:laps]
+        view = prepare(made_up_recording([], evaluations={"race": [Drive(speed_mps=v) for v in speeds]}))
+        (panel,) = chart_of(view, "lap_time_histogram").rows[0]
+        assert any("normal" in str(one.name) for one in layers(panel, "line")) == drawn
 
 
 def test_an_episode_just_short_of_the_lap_has_not_driven_all_of_it() -> None:
@@ -298,6 +394,11 @@ def test_a_run_of_ours_is_advised_to_take_a_checkpoint_that_it_has() -> None:
         assert "enough laps" not in "".join(one.caption for one in charts_of(own))
 
 
+def chart_of(view: LogView, name: str) -> Chart:
+    (chart,) = (one for one in charts_of(view) if one.name == name)
+    return chart
+
+
 def charts_of(view: LogView) -> list[Chart]:
     return [chart for some in draw_sections(LogPage(view, [])).values() for chart in some]
 
@@ -324,7 +425,7 @@ def test_a_race_without_training_is_judged_by_its_laps() -> None:
     drawn = {chart.name for chart in charts_of(view)}
     assert "of the training" not in html(LogPage(view, findings(view)))
     assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn
-    assert [row[:2] for row in best_laps(view).rows] == [("race", s) for s in ("8.92", "9.90", "11.87")]
+    assert [row[:2] for row in best_laps(view).rows] == [("race", s) for s in ("8.92", "9.91", "11.87")]
 
 
 def test_without_a_course_only_what_needs_its_shape_is_left_out() -> None:

@@ -165,7 +165,7 @@ def test_six_figures_are_open_and_the_others_are_drawn_to_size_when_unfolded(pat
     tab.open(path)
     assert tab.evaluate(f"{VISIBLE}.length") == 6
     assert tab.evaluate("document.documentElement.scrollHeight") < 8_000
-    tab.draw_all()  # printing draws what is folded as wide as a sheet
+    tab.prepare_print()  # draws what is folded as wide as a sheet
     box = "document.querySelector('[data-plot=waypoint_map]')"
     assert tab.evaluate(f"!{box}.checkVisibility()")
     tab.prefer("dark")

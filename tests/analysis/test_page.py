@@ -76,8 +76,9 @@ CONTRAST = """
   };
   const found = {};
   for (const one of document.querySelectorAll("h1, h2, p, dt, dd, a, td, th, summary, button, code, svg text")) {
-    // Values in a heat map stand on its cells.
+    // Values in a heat map stand on its cells; the ranges of a parallel axis are transparent.
     if (!one.textContent.trim() || !one.checkVisibility() || one.closest(".heatmap-label")) continue;
+    if (one instanceof SVGElement && getComputedStyle(one).fillOpacity === "0") continue;
     const color = one instanceof SVGElement ? getComputedStyle(one).fill : getComputedStyle(one).color;
     const paper = one.closest("[data-plot]")?.querySelector("svg.main-svg")?.style.background || behind(one);
     const [light, dim] = [shine(color), shine(paper)].sort((a, b) => b - a);

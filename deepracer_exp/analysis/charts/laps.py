@@ -8,7 +8,7 @@ import pandas as pd
 from numpy.polynomial import Polynomial
 from scipy.stats import norm
 
-from deepracer_exp.analysis.log_view import LogView, thirds
+from deepracer_exp.analysis.log_view import LEAST_LAPS, LogView, thirds
 from deepracer_exp.analysis.sectors import Sector, sectors_of, time_lost
 from deepracer_exp.analysis.statistics import Values, histogram, subsample
 from deepracer_exp.errors import count
@@ -81,7 +81,7 @@ def _histogram_panel(title: str, times_s: Values) -> Panel:
 
 
 def _deviation(times_s: Values) -> float:
-    return float(times_s.std(ddof=1)) if len(times_s) > 2 else 0.0
+    return float(times_s.std(ddof=1)) if len(times_s) >= LEAST_LAPS else 0.0
 
 
 def _chances_in_words(times_s: Values, late: bool) -> str:
@@ -110,7 +110,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     laps = view.episodes[view.episodes["lap_time_s"].notna()]
     shown = laps.iloc[subsample(len(laps), 2500)]
     x, y, share = table["iteration"], table["lap_time_p25_s"], 100 * table["lap_share"]
-    best = view.candidates
+    best = table[table["iteration"].isin(view.candidates["iteration"])]
     hover = [
         f"iteration {row.iteration}: 25th percentile {row.lap_time_p25_s:.2f} s, best {row.lap_time_best_s:.2f} s, "
         f"{row.complete} of {row.episodes} episodes are complete laps"
@@ -125,8 +125,10 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     which = "No iteration has enough laps to be judged by them."
     if view.recording.best is not None:
         which = "A run of ours races with its best kept checkpoint."
-    elif len(best):
-        which = f"Candidates, the best first: {', '.join(map(str, best['iteration']))}."
+    elif len(view.candidates):
+        judged = " by their evaluations" if view.candidates["evaluated"].any() else ""
+        names = ", ".join(map(str, view.candidates["iteration"]))
+        which = f"Candidates, the best{judged} first: {names}."
     # The laps of an iteration may be in metrics files only.
     times_s = np.concatenate([shown["lap_time_s"], y])
     low, high = float(times_s.min()), max(float(np.percentile(times_s, 99)), float(y.max()))

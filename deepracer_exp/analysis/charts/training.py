@@ -141,20 +141,28 @@ def evaluations(view: LogView) -> Chart | None:
     # Side by side, so that equal results do not cover each other.
     order, size = number.groupby(number).cumcount(), number.groupby(number).transform("size")
     x = number + 0.7 * ((order + 0.5) / size - 0.5)
-    complete = episodes["complete"]
-    parts = ((complete, "complete", BLUE, "circle"), (~complete, "not complete", VERMILION, "x"))
+    complete, put_back = episodes["complete"], episodes["resets"] > 0
+    parts = (
+        (complete & ~put_back, "complete", BLUE, "circle"),
+        (complete & put_back, "complete with resets", ORANGE, "diamond"),
+        (~complete, "not complete", VERMILION, "x"),
+    )
     progress = [
         points(x[some], episodes["progress"][some], color, name, symbol=symbol, size=8)
         for some, name, color, symbol in parts
         if some.any()
     ]
     panels = [("Progress", "per cent of the lap", progress, (0.0, 104.0))]
-    if episodes["lap_time_s"].notna().any():
-        laps: list[Layer] = [points(x, episodes["lap_time_s"], BLUE, size=8)]
+    times_s = [*episodes["lap_time_s"], *episodes["reset_lap_time_s"]]
+    if np.isfinite(times_s).any():
+        laps: list[Layer] = [
+            points(x, episodes["lap_time_s"], BLUE, size=8),
+            points(x, episodes["reset_lap_time_s"], ORANGE, size=8, symbol="diamond"),
+        ]
         best_s = float(view.episodes["lap_time_s"].min()) if view.trained else np.nan
         if np.isfinite(best_s):
             laps.append(mark(best_s, "best of the training", GREEN, horizontal=True))
-        times_s = [*episodes["lap_time_s"], best_s]
+        times_s.append(best_s)
         low, high = np.nanmin(times_s), np.nanmax(times_s)
         rim = max(0.1 * (high - low), 0.1)
         panels.append(("Lap time", "lap time, s", laps, (low - rim, high + rim)))
