@@ -44,6 +44,11 @@ class RewardFailed(RunFailed):
         """Index of the car in its batch; None: not known."""
 
 
+def run_module(code: CodeType, namespace: dict[str, Any]) -> None:
+    """Run the compiled module of a reward function in a namespace; only here a text is executed as a program."""
+    exec(code, namespace)
+
+
 class RewardFunction:
     """One reward module, run for `n_cars` cars.
 
@@ -149,7 +154,7 @@ class RewardFunction:
             "__file__": self.source.path,
             "print": printer,
         }
-        exec(code, namespace)
+        run_module(code, namespace)
         function = namespace.get(name)
         if not callable(function):
             raise Unusable(f"{name} is {_short(function)}; accepted: a function")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from deepracer_exp.rewards.guard import CtrlC, DeadlinePassed, Guard
-from deepracer_exp.rewards.reward import MAX_REWARD, Unusable, what_happened
+from deepracer_exp.rewards.reward import MAX_REWARD, Unusable, run_module, what_happened
 from deepracer_exp.rewards.source import RewardSource, source_with_constants
 from deepracer_exp.tracks.track import Track
 
@@ -65,7 +65,7 @@ class _Module:
         """Run the module's text in its namespace."""
         try:
             with Guard(_LIMIT_S):
-                exec(self._code, self._namespace)
+                run_module(self._code, self._namespace)
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - of the module's code

@@ -117,7 +117,7 @@ def test_a_recording_left_out_is_predicted_by_a_car_that_has_not_seen_it(
     figures = json.loads(file.read_text())["versions"]["4"]
     first, second = read_recorded([traces])
     some = second.windows["one_second"]
-    begin = fit(car_named("deepracer_v5"), some, (), 12)
+    begin = fit(car_named("deepracer_v6"), some, (), 12)
     alone = fit(begin.car, some, PARAMETERS[-2:], 3, begin.observer)
     found = figures["recordings"][first.name]
     assert found["car"] == {p.key: getattr(alone.car, p.key) for p in PARAMETERS[-2:]}

@@ -61,8 +61,9 @@ def test_a_policy_beside_its_own_log_differs_in_nothing(experiment, driver, tmp_
     assert np.abs(numbers["difference"]).max() < 1e-6
     assert numbers.loc["complete laps, %", "logged"] == 100.0
     # The second of the first race is a flying lap, the third starts a quarter of the lap further.
-    assert logged.episodes["lap_time_s"].round(2).nunique() == 2
-    assert logged.episodes["lap_time_s"].idxmin() == 1
+    standing_s, flying_s, later_s = logged.episodes["lap_time_s"]
+    assert flying_s < min(standing_s, later_s) - 0.2
+    assert standing_s == pytest.approx(later_s, abs=1.5 / 15)
     assert both.sentences[1].startswith("Line and speed are the same all along the track")
 
 
