@@ -71,7 +71,7 @@ def driven_speed_mps(track_speed_mps: "pd.Series[float]") -> "pd.Series[float]":
     return track_speed_mps.rolling(_SMOOTHED, center=True, min_periods=1).mean().bfill().ffill()
 
 
-def racing_line(track: "Track") -> "pd.DataFrame":
+def racing_line_table(track: "Track") -> "pd.DataFrame":
     """Return the racing line of a track from waypoint 0, without a speed, which depends on the car.
 
     On a closed track its last point is the first one again, as among the waypoints.

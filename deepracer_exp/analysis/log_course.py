@@ -101,7 +101,7 @@ def catalogue_track(name: str, reversed: bool = False) -> Track:
 
 class _Recognised(NamedTuple):
     name: str
-    """Of the world."""
+    """Name of the world."""
     misjudged: float
     """Share of the rows whose wheels are on the other side of its borders than logged."""
 

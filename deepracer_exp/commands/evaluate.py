@@ -240,15 +240,15 @@ def _replay_laps(args: argparse.Namespace) -> int:
             rival = check_policy(runs[1], config.runs_dir, config.tracking.uri, None)
 
     from deepracer_exp.analysis.lap_replay import fastest_lap_of_log
-    from deepracer_exp.evaluation.driven_laps import drive_laps
+    from deepracer_exp.evaluation.driven_laps import laps_to_replay
 
     protocol = run.experiment.evaluation if own_trials else config.evaluation
     with warnings_on_stderr():
-        laps = drive_laps(run, config.checkpoint, protocol, ordinary=not runs[1:])
+        laps = laps_to_replay(run, config.checkpoint, protocol, ordinary=not runs[1:])
         if view is not None:
             laps.append(fastest_lap_of_log(view, laps[0]))
         elif rival is not None:
-            laps += drive_laps(rival, None, protocol, beside=laps[0])
+            laps += laps_to_replay(rival, None, protocol, beside=laps[0])
     write_laps(args.replay, laps)
     print(f"  laps  {args.replay}")
     return 0

@@ -308,7 +308,7 @@ def _list_tracks() -> None:
 
 def _show_track(name: str, output: str | None, line: str | None) -> None:
     """Draw a track, or a route file (.npy, .yaml), in the terminal; write a picture and its racing line where asked."""
-    from deepracer_exp.analysis.line_file import check_line_file, racing_line, write_line
+    from deepracer_exp.analysis.line_file import check_line_file, racing_line_table, write_line
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
 
@@ -320,7 +320,7 @@ def _show_track(name: str, output: str | None, line: str | None) -> None:
             draw_picture(track, output)
     if line is not None:
         with writing(f"--line {line}"):
-            write_line(Path(line), racing_line(track))
+            write_line(Path(line), racing_line_table(track))
     wide, high = shutil.get_terminal_size((COLUMNS, ROWS))
     print(
         f"{track.title} ({track.name}): {track.length_m:.2f} m, {track.width_m:.2f} m wide, "

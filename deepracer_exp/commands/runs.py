@@ -215,11 +215,11 @@ def _compare(args: argparse.Namespace) -> int:
         console.print(f"\n{args.output}: these tables, learning curves and lap times", soft_wrap=True)
     if args.replay is not None:
         stored = [check_policy(str(folder), str(stores.runs_dir), stores.uri, None) for folder in folders]
-        from deepracer_exp.evaluation.driven_laps import drive_laps
+        from deepracer_exp.evaluation.driven_laps import laps_to_replay
 
         protocol = stored[0].experiment.evaluation
-        (first,) = drive_laps(stored[0], None, protocol)
-        write_laps(args.replay, [first, *drive_laps(stored[1], None, protocol, beside=first)])
+        (first,) = laps_to_replay(stored[0], None, protocol)
+        write_laps(args.replay, [first, *laps_to_replay(stored[1], None, protocol, beside=first)])
         console.print(f"\n{args.replay}: the fastest laps of their best checkpoints", soft_wrap=True)
     return 0
 

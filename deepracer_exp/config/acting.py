@@ -39,7 +39,7 @@ class Acting:
 
     @property
     def mark(self) -> str:
-        """Its name in the record of this account: a hash of the text, of code that of the contents."""
+        """Name in the record of this account: a hash of the text; for code, of the contents."""
         digest = hashlib.sha256(f"{self.key}\0{'' if self.key == REWARD else self.text}\0".encode())
         for file in self.contents:
             try:
@@ -121,7 +121,7 @@ def remember() -> None:
             (record / mark).touch(mode=0o600)
 
 
-def take_over(config: dict[str, Any], where: str) -> list[str]:
+def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
     """Leave out of a stored configuration what acts and is not the user's own; return a line for each such value.
 
     Code stays as text: `refuse_reward` and `load_class` decide about it before it is run.

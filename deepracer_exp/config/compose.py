@@ -169,7 +169,7 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
     # Option files of the user may contain addresses, too.
     mapping, left_out = without_passwords(mapping), list[str]()
     if stored:
-        left_out = acting.take_over(mapping, "the study")
+        left_out = acting.leave_out_foreign(mapping, "the study")
     else:
         allow(mapping)
     return Composition(

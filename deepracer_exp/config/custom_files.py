@@ -373,8 +373,8 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
             notes.append(f"hyperparameters.json: {key}={value}: not used, because of {winner}")
     if taken:
         notes.append(f"hyperparameters.json: used as {', '.join(taken)}")
-    job, told = job_overrides(files.workers, own)
-    notes += [*told, *_left(files, own)]
+    job, applied = job_overrides(files.workers, own)
+    notes += [*applied, *_left(files, own)]
     return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
 
 

@@ -21,7 +21,7 @@ ABSENT = "\N{EN DASH}"
 def with_overrides(
     config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str], *, stored: bool = False
 ) -> Composition:
-    """Change a stored configuration; values that act and are not the user's own are left out (`acting.take_over`).
+    """Change a stored configuration, without values that act and are foreign (`acting.leave_out_foreign`).
 
     Args:
         config: all values, as in config.yaml.
@@ -41,7 +41,7 @@ def with_overrides(
         allow_given(parts)
     parsed = [parse_single(override) for override in overrides if override not in parts]
     values = copy.deepcopy(dict(config))
-    left_out = acting.take_over(values, "the stored run")
+    left_out = acting.leave_out_foreign(values, "the stored run")
     chosen = [one for one in parsed if one.key_or_group in groups() and not one.is_delete()]
     for one in parsed:
         if one.key_or_group in _WHOLE:
@@ -62,7 +62,7 @@ def with_overrides(
             _set(values, one.key_or_group, one.value())
     keys = [one.key_or_group for one in parsed]
     if stored:
-        left_out += acting.take_over(values, "the study")
+        left_out += acting.leave_out_foreign(values, "the study")
     else:
         for one in parsed:
             allow({one.key_or_group.rpartition(".")[2]: one.value()})

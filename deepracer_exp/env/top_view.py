@@ -10,7 +10,7 @@ from deepracer_exp.tracks.track import Track
 from .race import Race
 
 _LONG_PX = 640
-"""Of the picture's longer side."""
+"""Length of the longer side of the picture."""
 _CAR_COLOR, _NOSE_COLOR, _MARK_COLOR = "#d62728", "#ffffff", "#ffbf00"
 _CAR_M = ((0.2, 0.1), (0.2, -0.1), (-0.2, -0.1), (-0.2, 0.1))
 _NOSE_M = ((0.2, 0.1), (0.2, -0.1), (0.08, -0.1), (0.08, 0.1))

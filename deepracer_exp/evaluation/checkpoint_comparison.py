@@ -53,7 +53,7 @@ class LapStatistics:
     median_s: float
     best_s: float
     laps_s: tuple[float, ...]
-    """Of all complete laps on the usual conditions, in the order of the trials."""
+    """Times of all complete laps on the usual conditions, in the order of the trials."""
     held_out_complete: float
     held_out_completion: float
     held_out_lap_time_s: float

@@ -18,7 +18,7 @@ from .race_protocol import Attempt
 from .result import USUAL
 
 
-def drive_laps(
+def laps_to_replay(
     run: StoredRun,
     checkpoint: str | None,
     protocol: EvaluationConfig,

@@ -9,7 +9,7 @@ from deepracer_exp.errors import BadInput
 
 HOST = "127.0.0.1"
 _NAMES = (HOST, "localhost", "[::1]")
-"""Of this machine. Through a tunnel the port is another one."""
+"""Names of this machine; the port is not compared, since through a tunnel it is another one."""
 
 
 class LiveServer(ThreadingHTTPServer):

@@ -38,7 +38,7 @@ AGENT, TRAINING = "agent", "training"
 """Components: the networks with what improves them, and what a resumed training needs besides."""
 _STATE = {"state.json", "state.tdz"}
 _MOST_BYTES = 2**32
-"""Of a checkpoint; the largest known have tens of megabytes."""
+"""Limit for a checkpoint; the largest known have tens of megabytes."""
 _MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
 
 

@@ -15,7 +15,7 @@ from deepracer_exp.config.experiment import Experiment, safe_name
 from deepracer_exp.config.stored import config_differences
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.tracking.registry import Registered, fetch, is_alias, look_up, place_of
+from deepracer_exp.tracking.registry import Registered, download_folder, fetch, is_alias, look_up
 from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
 from .checkpoint_files import LINKS, checkpoint_sha256, restore_links, verify
@@ -38,7 +38,7 @@ class StoredRun:
 
     @cached_property
     def experiment(self) -> Experiment:
-        """Its configuration, without values that act and are not the user's own (`config.acting`).
+        """Configuration of the run, without values that act and are not the user's own (`config.acting`).
 
         Raises:
             BadInput: it cannot be read, or was written by another version.
@@ -46,7 +46,7 @@ class StoredRun:
         from deepracer_exp.config.parse import parse_experiment
 
         mapping = read_config(self.path)
-        acting.take_over(mapping, self.path.name)
+        acting.leave_out_foreign(mapping, self.path.name)
         try:
             return parse_experiment(mapping)
         except BadInput as error:
@@ -249,7 +249,7 @@ def _short(value: Any) -> str:
 
 def _of_registered(run: str, found: Registered, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     """Return the run of a registered checkpoint, which must be as it was; it is downloaded where it is not."""
-    places = found.run_dir, place_of(found.run_dir, runs_dir)
+    places = found.run_dir, download_folder(found.run_dir, runs_dir)
     path = next((one for one in places if (one / CHECKPOINTS / found.checkpoint).is_dir()), None)
     if path is None:
         path = fetch(found, tracking_uri, runs_dir)

@@ -38,9 +38,9 @@ class Download:
     """What is downloaded, from where."""
 
     uri: str
-    """Of the store, with its password if it is a database: on standard input, where `ps` does not show it."""
+    """Address of the store, with the password of a database: it comes on standard input, which `ps` does not show."""
     model_id: str
-    """Of the logged model that has the checkpoint."""
+    """MLflow's id of the logged model that has the checkpoint."""
     run_id: str
     checkpoint: str
     """Name of the checkpoint's folder."""
@@ -49,7 +49,7 @@ class Download:
     with_run: bool
     """Whether the run's files are wanted as well."""
     most_bytes: int = 512 * 2**20
-    """Of all files together; the largest checkpoint of the project, one that sees pictures, has 30 MB."""
+    """Limit for all files together; the largest checkpoint of the project, one that sees pictures, has 30 MB."""
 
 
 def download(what: str, wanted: Download, store: Store, target: Path) -> None:

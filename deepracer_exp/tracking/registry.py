@@ -45,7 +45,7 @@ class Registered:
     sha256: str
     """Hash of the checkpoint."""
     model_id: str
-    """Of the logged model that has the checkpoint's files."""
+    """MLflow's id of the logged model that has the files of the checkpoint."""
     run_id: str
 
     def __str__(self) -> str:
@@ -287,7 +287,7 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
     )
 
 
-def place_of(run_dir: Path, runs_dir: Path) -> Path:
+def download_folder(run_dir: Path, runs_dir: Path) -> Path:
     """Return where in `runs_dir` a run belongs whose folder was elsewhere.
 
     Raises:
@@ -309,7 +309,7 @@ def fetch(registered: Registered, uri: str | None, runs_dir: Path) -> Path:
     """
     store = existing_store(uri, runs_dir)
     client_of(store)  # leaves user and password in the environment, which the download inherits
-    target = place_of(registered.run_dir, runs_dir)
+    target = download_folder(registered.run_dir, runs_dir)
     wanted = Download(
         uri=store.uri,
         model_id=registered.model_id,

@@ -76,7 +76,7 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
     }
     url = f"http://{_HOST}:{port}"
     # Its state is in a database, which loses nothing when the server is killed. uvicorn imports from the working folder
-    # first, whatever Python is told.
+    # first, whatever PYTHONSAFEPATH says.
     options_of = {"env": environment, "cwd": "/", "stdin": subprocess.DEVNULL}
     with (
         tempfile.TemporaryFile() as output,

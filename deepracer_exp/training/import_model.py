@@ -92,7 +92,7 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
     load_reward_source(experiment.reward)
     own = {key_of(line): line for line in changes}
     options = import_files(files, name, composition.mapping, [*network, *seen], path, own)
-    told = [note for note in composition.notes if note.startswith(_SETTINGS)]
+    applied = [note for note in composition.notes if note.startswith(_SETTINGS)]
     try:
         experiment, composition = compose_experiment([f"experiment={name}", *changes])
         result = store_run(experiment, composition, networks, f"imported from {model.source}")
@@ -100,7 +100,7 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
         remove_options(options)
         raise
     notes = [f"{model.source}: {', '.join([*seen, *network])}", *model.notes]
-    notes = list(dict.fromkeys([*notes, *_remarks(files, model, absent), *told]))
+    notes = list(dict.fromkeys([*notes, *_remarks(files, model, absent), *applied]))
     return Imported(result.folder, options, notes, model.has_logs)
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import shapely
 
-from deepracer_exp.analysis.line_file import SUFFIXES, racing_line, recorded_line, write_line
+from deepracer_exp.analysis.line_file import SUFFIXES, racing_line_table, recorded_line, write_line
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.tracks.track import world_track
 from tests.conftest import refused
@@ -78,7 +78,7 @@ NOT_BESIDE = ("AWS_track", "China_track", "Tokyo_Training_track")
 @pytest.mark.parametrize("name", [*NOT_BESIDE, "Straight_track", "reinvent_base"])
 def test_the_racing_line_stays_on_the_road_from_waypoint_0_to_the_end(name):
     track = world_track(name)
-    line = racing_line(track)
+    line = racing_line_table(track)
     points = line[["x_m", "y_m"]].to_numpy()
     assert shapely.dwithin(track.road, shapely.points(points), 1e-6).all()
     assert line["progress"].iloc[[0, -1]].tolist() == [0.0, 100.0]

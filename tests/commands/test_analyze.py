@@ -113,12 +113,12 @@ def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
 def test_the_lap_whose_line_is_written_is_named_and_can_be_asked_for(run_dir, call, tmp_path):
     ended = call("analyze", str(run_dir), "--line", "line.py")
     assert ended.code == 0, ended.stderr
-    told = re.fullmatch(
+    match = re.fullmatch(
         r"  line  line\.py \(the fastest lap, iteration \d+, episode (\d+), \d\.\d{3} s\)",
         ended.stdout.splitlines()[-1],
     )
-    assert told
-    assert call("analyze", str(run_dir), "--line", "same.py", "--lap", told[1]).code == 0
+    assert match
+    assert call("analyze", str(run_dir), "--line", "same.py", "--lap", match[1]).code == 0
     assert (tmp_path / "same.py").read_text() == (tmp_path / "line.py").read_text()
 
 

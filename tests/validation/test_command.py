@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from deepracer_exp.analysis.line_file import racing_line, write_line
+from deepracer_exp.analysis.line_file import racing_line_table, write_line
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.rewards.source import zoo_names
@@ -47,7 +47,7 @@ def test_waypoint_numbers_that_no_world_has_are_noted(call, tmp_path, track, own
 
 @pytest.mark.parametrize("speed", [(), (1.5,)])
 def test_a_line_pasted_into_a_reward_function_is_accepted(call, tmp_path, speed):
-    line = racing_line(world_track("reinvent_base"))
+    line = racing_line_table(world_track("reinvent_base"))
     write_line(tmp_path / "mine.py", line.assign(speed_mps=speed[0]) if speed else line)
     uses = "1 / (0.1 + min(abs(params['x'] - point[0]) + abs(params['y'] - point[1]) for point in LINE))"
     with (tmp_path / "mine.py").open("a") as file:
