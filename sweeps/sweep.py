@@ -84,7 +84,7 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     build_sampler(config, space)
     build_pruner(config)
     experiment, composition = compose(space.example())
-    for note in composition.notes if request.stored else ():
+    for note in (*request.composition.notes, *composition.notes) if request.stored else ():
         _log.warning(note)
     if parent and protocol.real_car is not None:
         require_car(experiment)

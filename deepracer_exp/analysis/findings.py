@@ -101,7 +101,7 @@ def _converged(view: LogView, overfits: Finding | None) -> Finding:
     elif found.completion < found.completion_best - rule.completion_near:
         sentence = (
             f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f}%. "
-            f"A lower learning rate or {_instead(view)} may hold it."
+            f"Lower the learning rate, or take {_instead(view)}."
         )
     elif found.completion > found.completion_before + rule.completion_gain:
         sentence = (
@@ -175,20 +175,28 @@ def _submit(view: LogView) -> Finding:
         time_of = "lap_time_mean_s"
     else:
         low, high = map(float, wilson(complete, episodes))
+        whose = "their" if view.in_blocks else "its"
         sentence = (
             f"Submit {_checkpoint(first['checkpoint'], 'drove')} {_iterations(view, first['iteration'])}: a quarter "
-            f"of its laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of its {episodes} episodes are "
-            f"complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
+            f"of {whose} laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} {episodes} episodes "
+            f"are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
         )
         values |= {"p25_s": float(first["lap_time_p25_s"])}
         time_of = "lap_time_p25_s"
     others = [
-        f"{row['checkpoint'] or row['iteration']} ({row[time_of]:.2f} s, {row['lap_share']:.0%})"
+        f"{row['checkpoint'] or _unnamed(row)} ({row[time_of]:.2f} s, {row['lap_share']:.0%})"
         for row in best.iloc[1:].to_dict("records")
     ]
     if others:
         sentence += f" After it: {' and '.join(others)}."
     return Finding("submit", sentence, values, thresholds)
+
+
+def _unnamed(candidate: Mapping[str, Any]) -> str:
+    """Return what to call a checkpoint whose name is not known."""
+    if candidate["evaluated"]:
+        return f"that after iteration {candidate['iteration'] - 1}"
+    return f"that of iteration {candidate['iteration']}"
 
 
 def _nothing_to_submit(view: LogView, thresholds: Mapping[str, float]) -> Finding:
@@ -214,7 +222,7 @@ def _iterations(view: LogView, last: int) -> str:
         return f"iteration {last}"
     before = view.judged["iteration"][view.judged["iteration"] < last].max()
     first = 0 if math.isnan(before) else int(before) + 1
-    return f"iteration {last}" if first == last else f"iterations {first} to {last}"
+    return f"iteration {last}" if first == last else f"the last of iterations {first} to {last}"
 
 
 def _checkpoint(name: str, did: str) -> str:

@@ -156,7 +156,7 @@ def headline(view: LogView) -> str:
     )
     complete, put_back = view.episodes["complete"], view.episodes["resets"] > 0
     laps, best_s = int((complete & ~put_back).sum()), view.episodes["lap_time_s"].min()
-    more = count(int((complete & put_back).sum()), "more lap")
+    with_resets = int((complete & put_back).sum())
     if view.trained:
         sentence = f"{steps} of training in {finished} and {count(len(view.iterations), 'iteration')}"
         if view.untraced:
@@ -166,8 +166,14 @@ def headline(view: LogView) -> str:
     else:
         races = count(view.episodes["stream"].nunique(), "race")
         sentence = f"No training; {steps} in {finished} of {races}"
-    with_resets = f"; {more} with resets" if (complete & put_back).any() else ""
     if not laps:
-        return f"{sentence}; no complete lap{with_resets}."
+        return f"{sentence}; {_without_a_lap(with_resets)}."
+    more = f"; {count(with_resets, 'more lap')} with resets" if with_resets else ""
     best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
-    return f"{sentence}; {count(laps, 'complete lap')}{best}{with_resets}."
+    return f"{sentence}; {count(laps, 'complete lap')}{best}{more}."
+
+
+def _without_a_lap(with_resets: int) -> str:
+    if not with_resets:
+        return "no complete lap"
+    return f"no lap without a reset, {count(with_resets, 'complete lap')} with resets"

@@ -173,7 +173,7 @@ def timed_by_service(steps: pd.DataFrame, metrics: pd.DataFrame) -> tuple[pd.Dat
         metrics: `recording.METRICS_COLUMNS`.
 
     Returns:
-        The steps, and of how many laps the files give the time.
+        The steps, and of how many laps without resets the files give the time.
     """
     in_training = metrics["stream"].astype(str) == TRAINING
     laps = metrics[(metrics["completion"] >= 100.0) & (in_training == (metrics["phase"] == "training"))]
@@ -190,7 +190,7 @@ def timed_by_service(steps: pd.DataFrame, metrics: pd.DataFrame) -> tuple[pd.Dat
     )
     late_s = np.where(whole, known_s - steps["lap_clock_s"].to_numpy()[end], np.nan)
     moved = steps["lap_clock_s"].to_numpy() + np.repeat(np.nan_to_num(late_s), counts)
-    return steps.assign(lap_clock_s=moved), int(np.isfinite(late_s).sum())
+    return steps.assign(lap_clock_s=moved), int((np.isfinite(late_s) & (resets(steps) == 0)).sum())
 
 
 def _places(

@@ -165,14 +165,15 @@ def _analyze(args: argparse.Namespace) -> int:
         compared = prepare(read_log(other))
         rival = rival or compared
         others.append(_light(compared))
+    laps = None if args.replay is None else laps_of_log(view, rival)
     replay = None if reward is None else replay_reward(view, reward, car)
     default = place / REPORT if is_own_run(place) else _page("analysis", recording.name)
     out = Path(args.output or default)
     found = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
         write_page(out, LogPage(view, found, others, replay, terms, strip))
-    if args.replay is not None:
-        write_laps(args.replay, laps_of_log(view, rival))
+    if laps is not None:
+        write_laps(args.replay, laps)
     if line is not None:
         with writing(f"--line {args.line}"):
             write_line(Path(args.line), line[0])

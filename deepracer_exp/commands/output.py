@@ -13,8 +13,6 @@ from deepracer_exp.errors import count
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, REPORT
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import Console
 
     from deepracer_exp.config.running import TrackingConfig

@@ -79,19 +79,27 @@ def _send(args: argparse.Namespace) -> int:
     for folder in named:
         recorded = read_tracked_run(folder / TRACKING).store
         # What a run names as its store may be a stranger's, who would be given this user's password.
-        if stores.uri is None and recorded != store.shown:
+        if stores.uri is None and not store.is_named(recorded):
             raise BadInput(f"{folder}: was recorded in {recorded}; give tracking.uri={recorded}")
-    everything = undelivered(run_folders(stores.runs_dir)).items()
-    folders = named or [folder for folder, recorded in everything if recorded == store.shown]
+    folders = named
+    if not named:
+        everything = undelivered(run_folders(stores.runs_dir)).items()
+        folders = [folder for folder, recorded in everything if store.is_named(recorded)]
+    code = 0
     for folder in dict.fromkeys(folders):
         if is_delivered(folder, stores.uri, stores.runs_dir):
             print(f"{folder.name}: MLflow has everything")
             continue
-        points = deliver(folder, stores.uri, stores.runs_dir)
+        try:
+            points = deliver(folder, stores.uri, stores.runs_dir)
+        except BadInput as error:  # of this run, such as one that was deleted in MLflow
+            print(f"deepracer-exp: {error}", file=sys.stderr)
+            code = 2
+            continue
         print(f"{folder.name}: sent, with {count(points, 'metric point')} that MLflow lacked")
     if not folders:
         print(f"MLflow ({store.shown}) has everything of the ended runs in {stores.runs_dir}")
-    return 0
+    return code
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,7 @@ class _Target:
         store = resolve_store(self.stores.uri, self.stores.runs_dir)
         if self.run_id is None or not has_store(self.stores.uri, self.stores.runs_dir):
             return
-        if self.folder is not None and read_tracked_run(self.folder / TRACKING).store != store.shown:
+        if self.folder is not None and not store.is_named(read_tracked_run(self.folder / TRACKING).store):
             return  # a store that was not asked for
         try:
             deliver_labels(self.run_id, labels, self.stores.uri, self.stores.runs_dir)
@@ -160,9 +168,9 @@ def _rename(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise BadInput(f"{name}: {error}") from None
     others = [folder for folder in run_folders(target.stores.runs_dir) if folder != target.folder]
-    from deepracer_exp.runs.labels import read_labels
+    from deepracer_exp.runs.labels import named_folders
 
-    if any(name in (folder.name, read_labels(folder).name) for folder in others):
+    if any(folder.name == name for folder in others) or named_folders(others, name):
         raise BadInput(f"{name}: another run in {target.stores.runs_dir} has this name")
     target.write(replace(target.labels(), name=name))
     return 0

@@ -212,6 +212,7 @@ cannot be changed. `deepracer-exp runs lineage RUN` draws the family tree.
 def _clone(args: argparse.Namespace) -> int:
     from deepracer_exp.config.acting import refuse_reward
     from deepracer_exp.config.parse import import_own_classes
+    from deepracer_exp.runs.files import REWARD
     from deepracer_exp.runs.lineage import refuse_other_networks
 
     run, given = run_and_overrides(args)
@@ -221,7 +222,7 @@ def _clone(args: argparse.Namespace) -> int:
     parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None)
     experiment = check_changes(parent.path, changes)
     import_own_classes(experiment)
-    refuse_reward(experiment.reward.file, parent.path.name)
+    refuse_reward(experiment.reward.file, parent.path.name, parent.path / REWARD)
     print_notes(check_files(experiment))
     refuse_other_networks(parent.experiment, experiment)
     print_start()

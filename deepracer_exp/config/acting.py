@@ -146,16 +146,22 @@ def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
     return left_out
 
 
-def refuse_reward(file: str | None, where: str) -> None:
-    """Refuse to run a file as reward function that only a stored configuration names; None: there is no file.
+def refuse_reward(file: str | None, where: str, copy: Path | None = None) -> None:
+    """Refuse to run a file as reward function that only a stored configuration names.
+
+    Args:
+        file: None: there is no file.
+        where: what stores the configuration, for the message.
+        copy: of the file, to be named where that is not on this machine.
 
     Raises:
         BadInput: the message says how the user names it.
     """
     if file is not None and not reward_file(file).is_own:
+        readable = file if copy is None or Path(file).exists() else copy
         raise BadInput(
             f"{REWARD}={file}: named by {where}, and not a reward function that you have trained with, or changed "
-            f"since; read it, and if you trust it, give {REWARD}={file}"
+            f"since; read it, and if you trust it, give {REWARD}={readable}"
         )
 
 

@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput, nearest
 
 from . import acting, custom_files
@@ -35,6 +36,7 @@ def with_overrides(
     Raises:
         BadInput: an override cannot be parsed, names something unknown or would replace the whole experiment.
     """
+    overrides = without_passwords(list(overrides))
     # The parts of an observation are a list: naming one again changes no value.
     parts = [override for override in overrides if override.startswith("observation.target=")]
     if not stored:

@@ -96,14 +96,14 @@ def read_run_env(path: str, workers: Mapping[int, str]) -> tuple[JobSettings, ..
     return tuple(found)
 
 
-def read_training_params(path: str, raw: bytes | None = None) -> tuple[JobSettings, ...]:
+def read_training_params(path: str) -> tuple[JobSettings, ...]:
     """Read the training_params.yaml of a model, in which a key has one value, or one for each worker.
 
     Raises:
         BadInput: as for `read_run_env`.
     """
     accepted = "parameters of a training, KEY: VALUE"
-    data = read_yaml(path, accepted, raw=raw)
+    data = read_yaml(path, accepted)
     if not isinstance(data, dict):
         raise BadInput(f"{path}: holds no keys; accepted: {accepted}")
     lists = {str(key): value if isinstance(value, list) else [value] for key, value in data.items()}

@@ -67,7 +67,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def _counted_checkpoints(steps: pd.DataFrame) -> dict[int, str]:
-    """Return the names of the checkpoints that drove iterations, as far as every step before them is recorded.
+    """Return the names of the checkpoints before each iteration and after the last, if every step before is recorded.
 
     The service names a checkpoint by its number and the control steps before it.
     """
@@ -76,9 +76,9 @@ def _counted_checkpoints(steps: pd.DataFrame) -> dict[int, str]:
     )
     episodes["whole"] = (episodes["rows"] == episodes["last"]) & (episodes.index == np.arange(len(episodes)))
     iterations = episodes.groupby("iteration").agg({"rows": "sum", "whole": "all"})
-    before = iterations["rows"].cumsum() - iterations["rows"]
-    known = iterations["whole"].shift(fill_value=True) & (iterations.index == np.arange(len(iterations)))
-    return {number: f"{number}_Step-{count}" for number, count in before[known.cummin()].items()}
+    whole = (iterations["whole"] & (iterations.index == np.arange(len(iterations)))).cummin()
+    before = [0, *iterations["rows"].cumsum()[whole]] if 0 in iterations.index else []
+    return {number: f"{number}_Step-{count}" for number, count in enumerate(before)}
 
 
 class _Assembly:

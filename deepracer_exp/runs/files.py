@@ -55,8 +55,8 @@ def is_run(folder: Path) -> bool:
 
 
 def run_folders(runs_dir: Path) -> list[Path]:
-    """Return the folders of the runs of all experiments."""
-    return sorted(file.parent for file in runs_dir.glob(f"*/*/{CONFIG}"))
+    """Return the folders of the runs of all experiments; a hidden one is being downloaded, or was cut off."""
+    return sorted(file.parent for file in runs_dir.glob(f"*/[!.]*/{CONFIG}"))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 import json
 import re
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -64,3 +66,13 @@ def check_tag(word: str) -> tuple[str, str]:
     if not equals or not _KEY.fullmatch(key):
         raise BadInput(f"{word}: accepted: KEY=VALUE, where KEY has letters, digits, '_', '.' and '-'")
     return key, check_label(word[:60], value)
+
+
+def named_folders(folders: Iterable[Path], name: str) -> list[Path]:
+    """Return the runs that `runs rename` has given a name; one whose labels cannot be read has none."""
+    matches = []
+    for folder in folders:
+        with suppress(BadInput):
+            if read_labels(folder).name == name:
+                matches.append(folder)
+    return matches

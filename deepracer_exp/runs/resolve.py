@@ -20,7 +20,7 @@ from deepracer_exp.tracking.store import folder_of, has_store, is_run_id
 
 from .checkpoint_files import LINKS, checkpoint_sha256, restore_links, verify
 from .files import BEST, BEST_OF_SWEEP, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
-from .labels import read_labels
+from .labels import named_folders
 from .result import RunResult, read_result
 
 logger = logging.getLogger("deepracer_exp")
@@ -66,7 +66,7 @@ class StoredRun:
         """
         name = given or self.checkpoint
         best, last = (self.checkpoints / link for link in LINKS)
-        if name is None and not best.is_symlink() and last.exists():
+        if name is None and not (best.is_symlink() or best.exists()) and last.exists():
             logger.warning(
                 "%s: ended before its policy was evaluated, so checkpoint=last is used", self.path.name
             )
@@ -99,7 +99,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     folders = run_folders(runs_dir)
     matches = [folder for folder in folders if folder.name == run]
     matches = matches or [folder for folder in folders if folder.name.startswith(run)]
-    matches = matches or [folder for folder in folders if read_labels(folder).name == run]
+    matches = matches or named_folders(folders, run)
     if len(matches) == 1:
         return StoredRun(matches[0])
     if matches:

@@ -90,7 +90,7 @@ def deliver_evaluation(
         return
     store, recorded = resolve_store(uri, runs_dir), read_object(run_dir / TRACKING).get("store")
     try:
-        if recorded not in (None, store.shown):
+        if recorded is not None and not store.is_named(recorded):
             raise StoreRefusedError(f"its run is in {recorded}; give tracking.uri={recorded}")
         with _connected(store) as run:
             run.run_id = run_id
@@ -112,7 +112,7 @@ def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
         BadInput: tracking.json is invalid, or `uri` can never work.
     """
     run, store = read_tracked_run(run_dir / TRACKING), resolve_store(uri, runs_dir)
-    return run.complete and run.store == store.shown and has_store(uri, runs_dir)
+    return run.complete and store.is_named(run.store) and has_store(uri, runs_dir)
 
 
 def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
@@ -162,7 +162,7 @@ def mark_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) ->
         BadInput: the run was recorded in another store, or this one does not answer.
     """
     recorded = read_tracked_run(run_dir / TRACKING).store
-    if recorded != resolve_store(uri, runs_dir).shown:
+    if not resolve_store(uri, runs_dir).is_named(recorded):
         raise BadInput(
             f"{run_dir}: was recorded in {recorded}; give tracking.uri={recorded} to delete it there"
         )

@@ -78,6 +78,20 @@ class Store:
             return None
         return Path(self.uri.removeprefix(_SQLITE_PREFIX))
 
+    def is_named(self, recorded: str | None) -> bool:
+        """Return whether this is the store that a run folder names.
+
+        A file may be reached by a link, or may have been moved with its folder.
+        """
+        if recorded is None or recorded == self.shown or self.sqlite_file is None:
+            return recorded == self.shown
+        if not recorded.startswith(_SQLITE_PREFIX):
+            return False
+        file = Path(recorded.removeprefix(_SQLITE_PREFIX))
+        return file.resolve() == self.sqlite_file.resolve() or (
+            file.name == self.sqlite_file.name and not file.exists()
+        )
+
     @contextmanager
     def creation_lock(self) -> Iterator[None]:
         """Let one process at a time create the tables of an SQLite store.

@@ -342,7 +342,11 @@ def _check_crossings(center: np.ndarray) -> None:
     pieces = shapely.get_parts(shapely.line_merge(shapely.unary_union(line, grid_size=_GRID_M)))
     longest = pieces[shapely.length(pieces).argmax()]
     if line.length - longest.length > _FOLD_M:
-        x, y = longest.coords[0]
+        # Of an open line one end of a piece may be an end of the line.
+        x, y = max(
+            (longest.coords[0], longest.coords[-1]),
+            key=lambda place: np.linalg.norm(center[[0, -1]] - place, axis=1).min(),
+        )
         raise BadInput(
             f"the centre line crosses itself at ({x:.2f}, {y:.2f}); accepted is one that passes each place once"
         )

@@ -9,11 +9,20 @@ from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
 from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.files import CHECKPOINTS, PROVENANCE, SUMMARY, read_config, read_object, read_run_id
+from deepracer_exp.runs.files import (
+    CHECKPOINTS,
+    PROVENANCE,
+    REWARD,
+    SUMMARY,
+    read_config,
+    read_object,
+    read_run_id,
+)
 from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
 from deepracer_exp.runs.resolve import StoredRun, resolve
 
@@ -63,7 +72,7 @@ def prepare_clone(
     checkpoint = read_checkpoint(parent.experiment, parent.checkpoints, name)
     composition = _changed(parent, changes, stored)
     experiment = parse_experiment(composition.mapping)
-    acting.refuse_reward(experiment.reward.file, parent.path.name)
+    acting.refuse_reward(experiment.reward.file, parent.path.name, parent.path / REWARD)
     refuse_other_networks(parent.experiment, experiment)
     above = read_lineage(parent.path)
     lineage = Lineage(
@@ -86,9 +95,10 @@ def prepare_clone(
 
 def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composition:
     names = read_object(parent.path / PROVENANCE).get("names", {})
-    usual = _AS_USUAL if "trial" in read_object(parent.path / SUMMARY) else ()
+    keys = {key_of(change) for change in changes}
+    is_trial = "trial" in read_object(parent.path / SUMMARY)
+    usual = [line for line in _AS_USUAL if is_trial and group_of(line) not in keys]
     composition = with_overrides(read_config(parent.path), names, [*usual, *changes], stored=stored)
-    keys = {change.lstrip("+").split("=", 1)[0] for change in changes}
     if not keys & {"algorithm", "algorithm.lr"}:
         composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER
     if "runs_dir" not in keys:

@@ -38,6 +38,7 @@ from deepracer_exp.runs.files import (
     LINEAGE,
     METRICS,
     PROVENANCE,
+    REWARD,
     SUMMARY,
     TRACKING,
     read_config,
@@ -318,7 +319,7 @@ def _reopen(
     checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
     state = read_training(checkpoint)
     refuse_changes(run_dir, state, composition.mapping, setup)
-    acting.refuse_reward(experiment.reward.file, run_dir.name)
+    acting.refuse_reward(experiment.reward.file, run_dir.name, run_dir / REWARD)
     _try(experiment, setup)
     _forget_damaged_best(run_dir, state)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))

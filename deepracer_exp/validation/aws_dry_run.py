@@ -41,8 +41,8 @@ def dry_run_findings(source: RewardSource, track: Track) -> list[AwsFinding]:
     """
     module = _Module(source)
     module.run()
+    module.check_signature()
     if module.error is None:
-        module.check_signature()
         module.find_imports(validator_params(track)["at the start"])
         for name, params in validator_params(track).items():
             module.call(name, params)
@@ -72,8 +72,14 @@ class _Module:
             self.error = f"cannot be imported: {self._what_happened(error)}"
 
     def check_signature(self) -> None:
-        """Find a function that has not exactly one parameter."""
-        signature = inspect.signature(self._namespace["reward_function"])
+        """Find what is no function, or one that has not exactly one parameter."""
+        if self.error is not None:
+            return
+        function = self._namespace.get("reward_function")
+        if not inspect.isfunction(function):
+            self.error = f"reward_function is {reprlib.repr(function)}, no function"
+            return
+        signature = inspect.signature(function)
         if len(signature.parameters) != 1:
             text = f"reward_function{signature}: exactly one parameter is accepted, reward_function(params)"
             self._found.append(AwsFinding(0, text))
@@ -87,8 +93,8 @@ class _Module:
                 _noting_imports(self._namespace["reward_function"], self._path, late)(params)
         except CtrlC:
             raise
-        except BaseException as error:  # noqa: BLE001 - of the module's code
-            self._hangs = isinstance(error, DeadlinePassed)
+        except BaseException:  # noqa: BLE001 - of the module's code, which `call` reports
+            pass
         for name, line in late.items():
             why = _ARRAY_METHODS if name == _METHODS else "imports belong at the top of the file"
             text = f"{name} is imported while the function is called; {why}"

@@ -316,7 +316,7 @@ def _print_aws(out: Console, findings: list[AwsFinding]) -> None:
     if style:
         _line(out, "  style (flake8; the AWS console trained functions with such findings):")
         _print_first(out, [f"  {line}" for line in style])
-    console = "forbids what is named first above" if documented else "forbids nothing of this"
+    console = "forbids what is named first above" if documented else "forbids nothing in it"
     _line(out, f"AWS console: its documentation {console}", "yellow" * bool(documented))
 
 

@@ -83,7 +83,7 @@ def test_laps_course_and_evaluations_are_those_that_the_service_reports(console:
 def test_a_checkpoint_that_no_log_names_is_named_by_the_steps_before_it(console: LogView) -> None:
     traces = read_recording(CONSOLE / "sim-trace" / "training")
     logged = console.recording.checkpoints
-    assert traces.checkpoints == {number: logged[number] for number in range(28)}
+    assert traces.checkpoints == {number: logged[number] for number in range(29)}
 
 
 def test_findings_name_the_iteration_and_the_places_that_the_tables_show(console: LogView) -> None:

@@ -132,6 +132,8 @@ def evaluated(view: LogView, *laps: tuple[int, float, float, float]) -> LogView:
 def test_evaluations_decide_whatever_the_exploring_laps_were() -> None:
     laps = laps_of((0, 5, 2.0), (10, 0, 3.0), (6, 4, 2.0))
     assert laps.candidates["iteration"].tolist() == [1, 2]
+    first_two = evaluated(laps, (0, 100.0, 9.9, 0), (1, 100.0, 9.4, 0))
+    assert "After it: that after iteration 0 (9.90 s, 100%)." in of(first_two, "submit").sentence
     view = evaluated(laps, (0, 60.0, 9.0, 0), (1, 100.0, 9.4, 0), (1, 100.0, 9.6, 0), (2, 100.0, 8.0, 2))
     # After iteration 1 both laps are complete; the faster one after iteration 2 was put back twice.
     found = of(view, "submit")
@@ -175,7 +177,7 @@ def test_iterations_of_one_episode_are_judged_together() -> None:
     assert one.judged["completion_mean"].tolist() == pytest.approx(many.judged["completion_mean"].tolist())
     assert one.judged["iteration"].tolist() == [LEAST_EPISODES * k + 4 for k in range(len(LEARNED))]
     assert of(one, "converged").values["completion"] == of(many, "converged").values["completion"]
-    assert "drove iterations 75 to 79: a quarter" in of(one, "submit").sentence
+    assert "drove the last of iterations 75 to 79: a quarter of their laps" in of(one, "submit").sentence
     assert many.judged is many.iterations
     # A block of steps that have no episode yet ends with the last iteration.
     assert one.judged["steps"].sum() == one.iterations["steps"].sum()

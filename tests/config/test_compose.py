@@ -11,6 +11,7 @@ from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 
@@ -328,3 +329,10 @@ def test_a_run_of_the_car_of_before_is_refused_with_what_to_do():
     values["car"] |= {"contact_time_s": 0.04, "chassis_mass_kg": 5.9811}
     with pytest.raises(BadInput, match=r"^car: .* train again$"):
         parse_experiment(values)
+
+
+def test_a_password_in_a_change_of_a_stored_run_is_not_kept():
+    stored = compose_experiment([])[1].mapping
+    changed = with_overrides(stored, {}, ["tracking.uri=http://me:s3cret@127.0.0.1:5000"])
+    assert "s3cret" not in changed.yaml()
+    assert "s3cret" not in " ".join(changed.overrides)

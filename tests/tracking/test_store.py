@@ -55,3 +55,17 @@ def test_neither_a_uri_that_is_checked_nor_tracking_off_imports_mlflow(tmp_path)
 def test_a_relative_sqlite_file_means_the_same_after_a_change_of_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert resolve_store("sqlite:///a/b.db", tmp_path).sqlite_file == tmp_path / "a" / "b.db"
+
+
+def test_a_store_is_the_one_that_a_run_names_by_whichever_path_and_after_a_move(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "runs").symlink_to(tmp_path / "data")
+    store = resolve_store(None, tmp_path / "data")
+    assert store.is_named(resolve_store(None, tmp_path / "runs").shown)
+    assert store.is_named(f"sqlite:///{tmp_path}/before/mlflow.db")
+    assert not store.is_named("sqlite:///:memory:")
+    assert not store.is_named("http://127.0.0.1:5000")
+    assert not store.is_named(None)
+    (tmp_path / "before").mkdir()
+    (tmp_path / "before" / "mlflow.db").touch()
+    assert not store.is_named(f"sqlite:///{tmp_path}/before/mlflow.db")

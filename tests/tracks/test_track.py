@@ -207,6 +207,13 @@ def test_a_course_that_crosses_itself_is_refused_with_the_place(turn, closed):
             Track.from_route(rows if closed else rows[:-1], "eight")
 
 
+def test_an_open_course_that_crosses_itself_late_is_refused_with_the_place():
+    x, y = np.array([-5, -4, -3, -2, -1, 0, 1, 2, 2, 1, 0.5, 0.5]), np.array([0] * 7 + [0, 1, 1, 0.5, -1.0])
+    rows = np.column_stack([x, y, x, y + 0.3, x, y - 0.3])
+    with pytest.raises(BadInput, match=r"crosses itself at \(0\.50, -?0\.00\)"):
+        Track.from_route(rows, "late")
+
+
 def test_a_course_that_returns_along_itself_is_refused(ring):
     half = ring[:31]
     with pytest.raises(BadInput, match="the centre line crosses itself"):

@@ -61,8 +61,8 @@ def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_it
 
 
 def test_a_clone_of_a_sweeps_trial_runs_as_a_training_does(parent):
-    def clone():
-        return prepare_clone([f"run={parent}"], parent.parents[1], None).experiment
+    def clone(*changes):
+        return prepare_clone([f"run={parent}", *changes], parent.parents[1], None).experiment
 
     stored = read_config(parent)
     assert (stored["report"], stored["collector"]["mode"]) == (False, "in_process")
@@ -72,6 +72,7 @@ def test_a_clone_of_a_sweeps_trial_runs_as_a_training_does(parent):
     assert clone().report
     assert (clone().collector.mode, clone().collector.processes) == ("sync", None)
     assert clone().collector.cars == stored["collector"]["cars"]
+    assert clone("collector=in_process").collector.mode == "in_process"
 
 
 def test_a_clone_knows_where_it_comes_from_and_the_parent_keeps_the_checkpoint(parent, call):

@@ -80,11 +80,18 @@ def test_functions_of_numpy_are_accepted(findings, name):
     assert findings(function(f"float(np.{name}(a))", "a = np.ones(3)\n    ")) == []
 
 
-def test_a_function_that_hangs_is_called_once(findings, monkeypatch):
+@pytest.mark.parametrize("value", ["5", "None", "max"])
+def test_what_is_no_function_is_refused_in_one_line(findings, value):
+    (found,) = findings(f"reward_function = {value}\n")
+    assert found.startswith(f"reward_function is {'<built-in function max>' if value == 'max' else value}")
+
+
+def test_a_function_that_hangs_is_refused(findings, monkeypatch):
     monkeypatch.setattr("deepracer_exp.validation.aws_dry_run._LIMIT_S", 0.2)
     text = function("1.0", "while params['progress'] == 0:\n        pass\n    ")
-    assert findings(text) == []
-    assert "took longer" in findings(text.replace("progress'] == 0", "progress'] == 50"))[0]
+    for hangs in (text, text.replace("progress'] == 0", "progress'] == 50")):
+        (found,) = findings(hangs)
+        assert "took longer" in found
 
 
 def test_what_only_the_function_assigns_is_kept_and_what_the_module_assigns_is_not(findings):

@@ -26,7 +26,7 @@ def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
     ended = call("validate", "reward=progress_gain")
     assert ended.code == 0
     assert "deepracer-on-aws: would accept it" in ended.stdout
-    assert "AWS console: its documentation forbids nothing of this" in ended.stdout
+    assert "AWS console: its documentation forbids nothing in it" in ended.stdout
     assert ended.stdout.splitlines()[-1].startswith("Verdict: can be trained here")
     picture = tmp_path / "runs/validate/progress_gain-reinvent_base.png"
     assert picture.name in ended.stdout
@@ -73,7 +73,7 @@ def test_what_aws_would_reject_is_reported_and_fails_with_strict(call, tmp_path)
 def test_style_is_counted_apart_and_blamed_on_nobody_else(call, tmp_path):
     (tmp_path / "mine.py").write_text("import math\n" + REWARD.format(pay="math.sqrt(params['speed'])"))
     ended = call("validate", "reward.file=mine.py")
-    assert "AWS console: its documentation forbids nothing of this" in ended.stdout
+    assert "AWS console: its documentation forbids nothing in it" in ended.stdout
     assert "style (flake8" in ended.stdout
     assert "line 2: E302 expected 2 blank lines, found 0" in ended.stdout
     assert ended.stdout.splitlines()[-1].endswith("deepracer-on-aws would refuse it: 1 finding, 1 of style")

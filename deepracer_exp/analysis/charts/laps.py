@@ -104,7 +104,7 @@ def _chances_in_words(times_s: Values, late: bool) -> str:
 
 def lap_time_percentile(view: LogView) -> Chart | None:
     """Draw the 25th percentile of the lap times of each iteration, with the candidates for submission."""
-    table = view.iterations[view.iterations["lap_time_p25_s"].notna()]
+    table = view.judged[view.judged["lap_time_p25_s"].notna()]
     if not len(table):
         return None
     laps = view.episodes[view.episodes["lap_time_s"].notna()]
@@ -129,6 +129,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
         judged = " by their evaluations" if view.candidates["evaluated"].any() else ""
         names = ", ".join(map(str, view.candidates["iteration"]))
         which = f"Candidates, the best{judged} first: {names}."
+    unit = "a block of iterations" if view.in_blocks else "an iteration"
     # The laps of an iteration may be in metrics files only.
     times_s = np.concatenate([shown["lap_time_s"], y])
     low, high = float(times_s.min()), max(float(np.percentile(times_s, 99)), float(y.max()))
@@ -137,8 +138,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     return Chart(
         name="lap_time_percentile",
         title="25th percentile of the lap time",
-        caption="Each coloured point is an iteration: low ones are fast, bright ones often complete the lap. "
-        + which,
+        caption=f"Each coloured point is {unit}: low ones are fast, bright ones often complete the lap. {which}",
         rows=[[Panel(x_label=ITERATION, y_label="lap time, s", layers=layers, y_range=y_range)]],
     )
 

@@ -263,8 +263,8 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     return Chart(
         name="learning_curves_compared",
         title="Learning curves and lap times" if has_laps else "Learning curves",
-        caption="Lines are moving averages of three iterations, those of evaluations join them. In training the policy "
-        "explores and is slower.",
+        caption="Lines are moving averages of three iterations; the line of the evaluations connects them without "
+        "averaging. In training the policy explores and is slower.",
         rows=in_rows(panels),
     )
 
