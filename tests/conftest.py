@@ -41,8 +41,8 @@ settings.load_profile("same")
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# What the tests train with is no part of the account that runs them.
-os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="deepracer_exp-account-")
+# What the tests train with is no part of the account that runs them. Commands clear unlocked folders `deepracer_exp-*`.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="account-of-tests-")
 atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 REFERENCE = Path(__file__).parents[2] / "shared" / "reference"
