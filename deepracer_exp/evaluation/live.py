@@ -35,7 +35,7 @@ from .sight import glimpses
 _EVERY_S = 1.0
 """Seconds between two looks into the run's folder."""
 _CURVES_EVERY_S = 10.0
-"""Seconds between two drawings of the curves of a run that goes on: each loads the page again."""
+"""Seconds between two drawings of the curves of a run in progress: each loads the page again."""
 _LAST = "last"
 _NICENESS = 19
 

@@ -51,7 +51,7 @@ class _Answer(BaseHTTPRequestHandler):
     server: LiveServer
 
     def do_GET(self) -> None:
-        # A page of somebody else whose name leads here (DNS rebinding) could read the answer.
+        # A foreign page whose host name leads here (DNS rebinding) could read the answer.
         if re.sub(r":\d+$", "", self.headers.get("Host", "")) not in _NAMES:
             self.send_error(421, "accepted: " + " or ".join(_NAMES))
             return

@@ -105,7 +105,7 @@ class RunFolder:
                 "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
             },
             "reward": {"name": reward.name, "path": str(reward.path), "sha256": reward.sha256},
-            # Of a script, too, whose arguments nobody has looked at.
+            # A script's arguments have not been checked for passwords yet.
             "command": [redact(without_passwords(word)) for word in sys.argv[1:]],
         }
         self.write(PROVENANCE, json.dumps(provenance, indent=2) + "\n")

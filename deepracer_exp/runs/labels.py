@@ -32,7 +32,7 @@ _LABELS = TypeAdapter(Labels)
 
 
 def read_labels(run_dir: Path) -> Labels:
-    """Return the labels of a run; none where nobody gave it any.
+    """Return the labels of a run; none if it was given none.
 
     Raises:
         BadInput: the file cannot be read or holds something else.

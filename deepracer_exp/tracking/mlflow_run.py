@@ -202,7 +202,7 @@ class MLflowRun:
             copy(self.run_id, str(path), folder)
 
     def _refuse_far_files(self) -> None:
-        """Refuse a file store elsewhere: a database file that somebody else has filled may name any, for any user."""
+        """Refuse a file store elsewhere: a database file of another person may name any, for any user."""
         place = self._client.get_run(self.run_id).info.artifact_uri
         if urlsplit(place).scheme not in ("", "file"):
             raise StoreRefusedError(

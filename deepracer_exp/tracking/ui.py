@@ -67,7 +67,7 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
     if store.artifact_location:
         command += ["--default-artifact-root", store.artifact_location]
     environment = {
-        # It is the server: a page of a store that somebody else has filled gets no password of the user's own.
+        # It is the server: a page of another person's store gets no password of the user's own.
         **{name: value for name, value in os.environ.items() if not name.startswith("MLFLOW_TRACKING_")},
         "PYTHONSAFEPATH": "1",
         "MLFLOW_BACKEND_STORE_URI": store.uri,  # not on the command line, where `ps` shows the password
