@@ -19,7 +19,8 @@ from deepracer_exp.commands.arguments import runs_and_overrides
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment, compose_export, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.validation.pitfalls import action_space_laps, pays_for_slowness
+from deepracer_exp.validation.laps import action_space_laps
+from deepracer_exp.validation.pitfalls import lap_returns, slow_laps_return_as_much
 from deepracer_exp.validation.validate import read
 from tests.test_own_classes import write_examples
 
@@ -171,9 +172,9 @@ def test_the_tutorial_quotes_what_validate_says_of_its_reward_function(tmp_path)
         read(compose_experiment([f"reward.file={file}", *more])[0]).setup for more in ((), (mended,))
     )
     laps = action_space_laps(setup)
-    (warning,) = pays_for_slowness(setup, laps)
-    assert warning.partition(": ")[2] in page
-    assert not list(pays_for_slowness(better, laps))
+    (warning,) = slow_laps_return_as_much(lap_returns(setup, laps, 0.99), 0.99)
+    assert warning.partition(": ")[2].partition(";")[0] in page
+    assert not list(slow_laps_return_as_much(lap_returns(better, laps, 0.99), 0.99))
 
 
 def _imports():

@@ -1,135 +1,17 @@
 """Warn of common mistakes in reward functions that run without an error; some are measured on driven laps."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepracer_exp.deepracer.trace import STATUS_CODE
-from deepracer_exp.env.rules import RaceRules, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.env.state import Measures
-from deepracer_exp.rewards.params import COLUMNS
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.sim.batch import CarBatch
 
+from .laps import DrivenLap
 from .probe import Probe
 from .reward_map import RewardGrid
 from .situations import Situations
-
-Floats = NDArray[np.float64]
-
-_SPEEDS = 5
-_LATERAL_MPS2 = (2.0, 1.0)
-"""Lateral acceleration in bends; the second is used where the first leaves the track."""
-# Gains of the driver, chosen so that both the car of version 4, whose wheels lag commands by half a second, and the
-# ideal car complete every track of the catalogue at 1 to 3 m/s.
-_FORESIGHT_S = 0.25
-_AHEAD_M, _AHEAD_S = 0.45, 0.2
-_UNDERSTEER = 1.5
-_BRAKING_MPS2 = 0.7
-_LOOK_M = np.linspace(0.0, 2.4, 9)
-
-
-@dataclass(frozen=True, eq=False)
-class DrivenLap:
-    """A complete lap with all wheels on the track."""
-
-    speed_mps: float
-    """Commanded on straights; less in bends."""
-    time_s: float
-    paid: Situations
-    """Its rewarded steps."""
-
-
-def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
-    """Drive laps at speeds from the lowest to the highest of the action space; return the complete ones, slowest first.
-
-    The driver may steer any angle and slow down to the lowest speed, whatever the action space allows.
-    """
-    low, high = float(setup.actions.low[1]), float(setup.actions.high[1])
-    speeds = np.linspace(low, high, _SPEEDS) if high > low else np.array([low])
-    laps: dict[float, DrivenLap] = {}
-    for lap in drive_laps(setup, np.repeat(speeds, len(_LATERAL_MPS2)), np.tile(_LATERAL_MPS2, len(speeds))):
-        laps.setdefault(lap.speed_mps, lap)
-    return list(laps.values())
-
-
-def drive_laps(setup: RaceSetup, speed_mps: Floats, lateral_mps2: Floats) -> list[DrivenLap]:
-    """Drive n laps side by side by pursuit of the centre line and return those completed with all wheels on the track.
-
-    Args:
-        setup: the track, the car and the lowest speed, which also holds in bends.
-        speed_mps: target speed of each car, (n,).
-        lateral_mps2: lateral acceleration in bends, (n,).
-    """
-    n = len(speed_mps)
-    car = setup.car
-    batch = CarBatch(car, n, 1, setup.track.floor.friction)
-    rules = RaceRules(setup, n)
-    pose = rules.reset(start_ndist=np.zeros(n))
-    batch.place(np.arange(n), pose.x, pose.y, pose.yaw_rad)
-    driving, complete = np.ones(n, bool), np.zeros(n, bool)
-    steps: list[dict[str, np.ndarray]] = []
-    ends = np.zeros(n, np.int64)
-    lowest_mps = float(speed_mps.min())
-    # Twice the duration of a lap, plus the standing start.
-    most = 30 + int(2 * setup.track.length_m / lowest_mps * car.control_hz)
-    while driving.any() and len(steps) < most:
-        now = rules.measure(batch.read())
-        result = rules.apply()
-        steering_deg = _steer(setup, now)
-        wanted_mps = np.clip(_bend_speed(setup, now, lateral_mps2), lowest_mps, speed_mps)
-        steps.append(rules.params(result, steering_deg, wanted_mps))
-        done = driving & (result.status == STATUS_CODE["lap_complete"])
-        ends[done] = len(steps)
-        complete |= done
-        # On an open track the rear wheels start behind the road.
-        driving &= ~done & (result.all_wheels_on_track | (result.progress < 5))
-        batch.drive(wanted_mps, np.radians(steering_deg), moving=result.running & driving)
-    columns = {key: np.stack([step[key] for step in steps]) for key in COLUMNS}
-    return [
-        DrivenLap(
-            speed_mps=float(speed_mps[i]),
-            time_s=float(lap_clock_s(ends[i], car.control_period_s)),
-            paid=Situations(
-                {key: column[1 : ends[i], i] for key, column in columns.items()}, rules.track_params[0]
-            ),
-        )
-        for i in np.flatnonzero(complete)
-    ]
-
-
-def _bend_speed(setup: RaceSetup, now: Measures, lateral_mps2: Floats) -> Floats:
-    """Return the highest speed from which a car can still brake for every bend ahead, (n,)."""
-    track = setup.track
-    at = now.ndist[:, None] + _LOOK_M / track.length_m
-    around_m = 0.25
-    behind, ahead = (track.start_pose(at + side * around_m / track.length_m).yaw_rad for side in (-1, 1))
-    turn_rad = np.abs(np.mod(ahead - behind + np.pi, 2 * np.pi) - np.pi)
-    curvature = np.maximum(turn_rad / (2 * around_m), 1e-3)
-    braking_m = np.maximum(_LOOK_M - 0.3, 0.0)
-    fastest: Floats = np.sqrt(lateral_mps2[:, None] / curvature + 2 * _BRAKING_MPS2 * braking_m).min(axis=1)
-    return fastest
-
-
-def _steer(setup: RaceSetup, now: Measures) -> Floats:
-    """Return pure-pursuit steering angles in degrees, from the predicted pose to a point ahead, (n,)."""
-    car, track = setup.car, setup.track
-    speed_mps = np.maximum(now.speed_mps, 0.3)
-    turn_rad = now.yaw_rate_radps * _FORESIGHT_S
-    direction_rad, yaw_rad = now.yaw_rad + turn_rad / 2, now.yaw_rad + turn_rad
-    x_m = now.x_m + speed_mps * _FORESIGHT_S * np.cos(direction_rad)
-    y_m = now.y_m + speed_mps * _FORESIGHT_S * np.sin(direction_rad)
-    ndist = track.project(np.column_stack([x_m, y_m])).ndist
-    target = track.points_at(ndist + (_AHEAD_M + _AHEAD_S * speed_mps) / track.length_m)
-    dx, dy = target[:, 0] - x_m, target[:, 1] - y_m
-    along, aside = dx * np.cos(yaw_rad) + dy * np.sin(yaw_rad), dy * np.cos(yaw_rad) - dx * np.sin(yaw_rad)
-    curvature = 2.0 * aside / (along**2 + aside**2)
-    angle_deg = np.degrees(np.arctan(_UNDERSTEER * car.wheelbase_m * curvature))
-    return np.clip(angle_deg, -car.max_steering_deg, car.max_steering_deg)
-
 
 _HELD = 15
 """Steps without moving after which the service ends the episode."""
@@ -137,6 +19,10 @@ _FASTER = 1.1
 """Two laps are compared only if one is faster than the other by this factor."""
 _MARGIN = 0.01
 """Rewards closer than this, relative, count as equal."""
+_LAP_MARGIN = 0.02
+"""The same for returns of laps, whose lines are not quite the same."""
+_ASKS = 0.2
+"""Growth of the return, relative, per relative saving of time below which speed counts little; a race score has 1."""
 
 
 def constant_reward(rewards: np.ndarray) -> Iterator[str]:
@@ -201,16 +87,66 @@ def _held(lap: Situations, at: int, step_s: float) -> Situations:
     )
 
 
-def pays_for_slowness(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
-    """Warn if a slow lap earns more reward in total than a fast one."""
-    if not laps or laps[0].time_s < _FASTER * laps[-1].time_s:
+@dataclass(frozen=True)
+class LapReturn:
+    """What a reward function returns for a driven lap."""
+
+    time_s: float
+    total: float
+    """Sum of the rewards."""
+    discounted: float
+    """The same, each reward discounted from the start of the lap."""
+
+
+def lap_returns(setup: RaceSetup, laps: Sequence[DrivenLap], discount: float) -> list[LapReturn]:
+    """Return the sums of the rewards of each lap; `discount` is the experiment's, per control step."""
+    found = []
+    for lap in laps:
+        rewards = Probe(setup).rewards(lap.paid)
+        discounted = float(rewards @ discount ** np.arange(len(rewards)))
+        found.append(LapReturn(lap.time_s, float(rewards.sum()), discounted))
+    return found
+
+
+def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iterator[str]:
+    """Warn if a slower lap returns more than the fastest, or the fastest hardly more.
+
+    Speed counts little where the return grows by less than `_ASKS` of the share of the time that is saved; a race
+    score grows by all of it, so such a policy gives up speed for safety that no race rewards. Of several slower laps
+    the one that returns most is compared, or the slowest if none returns more than the fastest.
+    """
+    fast = min(laps, key=lambda lap: lap.time_s, default=None)
+    slower = [lap for lap in laps if fast is not None and lap.time_s >= _FASTER * fast.time_s]
+    if fast is None or not slower:
         return
-    slow, fast = (float(Probe(setup).rewards(lap.paid).sum()) for lap in (laps[0], laps[-1]))
-    if slow > fast + _MARGIN * max(abs(slow), abs(fast)):
+
+    def gain(slow: LapReturn) -> float:
+        """Return how much the return grows, relative, per relative saving of time."""
+        scale = max(abs(slow.total), abs(fast.total), 1e-9)
+        return (fast.total - slow.total) / scale / (1 - fast.time_s / slow.time_s)
+
+    def grows(before: float, after: float) -> bool:
+        return after > before + _LAP_MARGIN * max(abs(before), abs(after))
+
+    slow = max(slower, key=lambda lap: lap.total)
+    if not grows(fast.total, slow.total):
+        slow = max(slower, key=lambda lap: lap.time_s)
+    if gain(slow) >= _ASKS:
+        return
+    by_discount = f"({discount:g} a step: {slow.discounted:.4g} against {fast.discounted:.4g})"
+    helps = discount < 1 and grows(slow.discounted, fast.discounted)
+    if grows(fast.total, slow.total):
+        discounted = "only the discount asks for speed" if helps else "the discount does not make up for it"
         yield (
-            f"pays more for a slow lap than for a fast one: {slow:.4g} in {laps[0].time_s:.1f} s, "
-            f"{fast:.4g} in {laps[-1].time_s:.1f} s"
+            f"returns more for a slow lap than for a fast one: {slow.total:.4g} in {slow.time_s:.1f} s, "
+            f"{fast.total:.4g} in {fast.time_s:.1f} s; {discounted} {by_discount}"
         )
+        return
+    asks = "little asks" if grows(slow.total, fast.total) else "nothing asks"
+    yield (
+        f"a lap in {slow.time_s:.1f} s returns {slow.total:.4g}, one in {fast.time_s:.1f} s {fast.total:.4g}: "
+        f"{asks} for speed{' except the discount' if helps else ', and the discount does not either'} {by_discount}"
+    )
 
 
 def batch_differs(setup: RaceSetup, sampled: Situations, rewards: np.ndarray) -> Iterator[str]:

@@ -28,7 +28,8 @@ from deepracer_exp.tracks.track import Track
 from . import pitfalls
 from .aws_dry_run import dry_run_findings
 from .aws_rules import AwsFinding, text_findings
-from .pitfalls import action_space_laps
+from .laps import action_space_laps
+from .pitfalls import LapReturn
 from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
 from .situations import NamedSituation, Situations, named_situations, sample, seam, situations, start
@@ -81,6 +82,7 @@ def validate_reward(
     if not check.failures:
         look_closer(check)
     if not check.failures:
+        _print_laps(out, check)
         _draw(out, check, _default_picture(experiment, check) if output is None else Path(output))
     _print_lines(out, "Warnings", "yellow", check.warnings)
     _print_lines(out, "Failures", "red", check.failures)
@@ -96,6 +98,8 @@ class Check:
     setup: RaceSetup
     against: Track
     """The same track, driven the other way."""
+    discount: float
+    """Of the experiment, per control step."""
     aws: list[AwsFinding]
     """Reasons why deepracer-on-aws would refuse the function."""
     tried: dict[str, Answer] = field(default_factory=dict)
@@ -108,6 +112,8 @@ class Check:
     lowest: float = float("nan")
     highest: float = float("nan")
     state: State = "none"
+    laps: list[LapReturn] = field(default_factory=list)
+    """Returns of driven laps, slowest first; none where the function is too slow or constant."""
     grid: RewardGrid | None = None
     """None: not sampled, because a call takes too long."""
 
@@ -130,6 +136,7 @@ def read(experiment: Experiment) -> Check:
     return Check(
         setup=setup.on(setup.track),
         against=Track.from_config(track, reversed=track.direction != "reversed"),
+        discount=experiment.algorithm.discount,
         aws=[*text_findings(setup.reward.text), *dry_run_findings(setup.reward, setup.track)],
     )
 
@@ -209,7 +216,8 @@ def look_closer(check: Check) -> None:
     laps = action_space_laps(setup)
     check.warnings += pitfalls.pays_off_the_road(check.grid)
     check.warnings += pitfalls.pays_for_standing(setup, laps)
-    check.warnings += pitfalls.pays_for_slowness(setup, laps)
+    check.laps = pitfalls.lap_returns(setup, laps, check.discount)
+    check.warnings += pitfalls.slow_laps_return_as_much(check.laps, check.discount)
 
 
 def _execute_scenes(probe: Probe, check: Check) -> tuple[Coverage, int]:
@@ -332,6 +340,19 @@ def _print_situations(out: Console, check: Check) -> None:
         how = "[dim]-[/dim]" if answer.failure == NOT_CALLED else "[red]failed[/red]"
         table.add_row(name, f"{answer.reward:.4g}" if answer.failure is None else how)
     out.print()
+    out.print(table, highlight=False)
+    out.print()
+
+
+def _print_laps(out: Console, check: Check) -> None:
+    """Print what laps of one line at several speeds return."""
+    if not check.laps:
+        return
+    table = Table("lap of the same line", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
+    for name in ("return", f"discounted by {check.discount:g} a step"):
+        table.add_column(name, justify="right")
+    for lap in check.laps:
+        table.add_row(f"{lap.time_s:.2f} s", f"{lap.total:.4g}", f"{lap.discounted:.4g}")
     out.print(table, highlight=False)
     out.print()
 

@@ -12,7 +12,7 @@ from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.tracks.track import Track
 from deepracer_exp.validation import reward_map
 from deepracer_exp.validation import validate as checking
-from deepracer_exp.validation.pitfalls import DrivenLap, action_space_laps
+from deepracer_exp.validation.laps import DrivenLap, action_space_laps
 from deepracer_exp.validation.validate import Check, look_closer, read, try_named_situations
 
 
@@ -68,7 +68,7 @@ def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None
     """Check a reward function given as text, completely."""
 
     def build(text: str, time_limit_s: float = 60.0) -> Check:
-        check = Check(setup=race_with(text, time_limit_s), against=against, aws=[])
+        check = Check(setup=race_with(text, time_limit_s), against=against, discount=0.99, aws=[])
         try_named_situations(check)
         if not check.failures:
             look_closer(check)

@@ -19,7 +19,9 @@ def reward_function(params):
     last["progress"], last["steps"] = params["progress"], params["steps"]
     return gained
 """
-GOOD = function('return params["speed"] - 5.0 * params["is_offtrack"] + params["progress"] / params["steps"]')
+GOOD = function(
+    'return params["speed"] ** 2 - 5.0 * params["is_offtrack"] + params["progress"] / params["steps"]'
+)
 
 
 def test_a_good_function_gets_no_warning(check_of):
@@ -28,6 +30,7 @@ def test_a_good_function_gets_no_warning(check_of):
     assert check.warnings == []
     assert check.tried["off the track"].reward < 0 < check.tried["mid-lap"].reward
     assert check.lowest < 0 < check.highest
+    assert [lap.total for lap in check.laps] == sorted(lap.total for lap in check.laps)
 
 
 @pytest.mark.parametrize(

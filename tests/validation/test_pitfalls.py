@@ -60,25 +60,73 @@ def test_reward_for_standing_is_reported(race_with, laps, text, warned):
     assert [line.startswith("pays for standing still: ") for line in found] == [True] * warned
 
 
+MORE, AS_MUCH = (
+    "returns more for a slow lap than for a fast one: ",
+    ": nothing asks for speed except the discount (",
+)
+
+
 @pytest.mark.parametrize(
-    ("text", "warned"),
+    ("text", "words"),
     [
-        (CENTER, True),
-        (paying("1 / params['speed']"), True),
-        (paying('100.0 if params["progress"] == 100 else -1.0'), False),
-        (DELTA, False),
-        (paying("params['speed'] ** 2"), False),
+        (CENTER, [MORE, "; the discount does not make up for it (0.99 a step: "]),
+        (paying("1 / params['speed']"), [MORE]),
+        (SPEED, [AS_MUCH]),
+        (DELTA, [AS_MUCH]),
+        (DELTA.replace("0.01", "0.05"), [": little asks for speed except the discount (0.99 a step: "]),
+        (DELTA.replace("0.01", "0.3"), None),
+        (paying('100.0 if params["progress"] == 100 else -1.0'), None),
+        (paying("params['speed'] ** 2"), None),
     ],
 )
-def test_more_reward_for_a_slow_lap_is_reported_with_both_times(race_with, laps, text, warned):
-    race = race_with(text)
-    found = list(pitfalls.pays_for_slowness(race, laps))
-    assert len(found) == warned
+def test_a_slow_lap_that_returns_as_much_is_reported_with_both_times_and_returns(
+    race_with, laps, text, words
+):
+    returns = pitfalls.lap_returns(race_with(text), laps, 0.99)
+    found = list(pitfalls.slow_laps_return_as_much(returns, 0.99))
+    assert len(found) == (words is not None)
     for line in found:
-        assert "pays more for a slow lap than for a fast one: " in line
-        assert f"in {laps[0].time_s:.1f} s" in line
+        assert all(word in line for word in words)
         assert f"in {laps[-1].time_s:.1f} s" in line
-    assert not list(pitfalls.pays_for_slowness(race, laps[:1]))
+        assert f"{returns[-1].total:.4g}" in line
+    assert not list(pitfalls.slow_laps_return_as_much(returns[:1], 0.99))
+
+
+def test_the_speeds_of_a_lap_add_up_to_its_length_however_long_it_takes(race, race_with, laps):
+    returns = pitfalls.lap_returns(race_with(SPEED), laps, 0.99)
+    metres = [lap.total * race.car.control_period_s for lap in returns]
+    assert metres == pytest.approx([race.track.length_m] * 3, rel=0.05)
+    assert [lap.time_s for lap in returns] == [lap.time_s for lap in laps]
+    assert returns[0].discounted < 0.8 * returns[-1].discounted
+
+
+@pytest.mark.parametrize(
+    ("slow", "fast", "discount", "words"),
+    [
+        ((100.0, 50.0), (100.0, 60.0), 0.99, AS_MUCH),
+        ((100.0, 50.0), (100.0, 50.0), 0.99, ": nothing asks for speed, and the discount does not either ("),
+        ((100.0, 100.0), (100.0, 100.0), 1.0, ": nothing asks for speed, and the discount does not either ("),
+        ((100.0, 60.0), (104.0, 80.0), 0.99, ": little asks for speed except the discount ("),
+        ((100.0, 60.0), (80.0, 70.0), 0.99, "; only the discount asks for speed ("),
+        (
+            (-100.0, -60.0),
+            (-101.0, -70.0),
+            0.99,
+            ": nothing asks for speed, and the discount does not either (",
+        ),
+        ((-100.0, -60.0), (-50.0, -40.0), 0.99, None),
+        ((100.0, 60.0), (140.0, 40.0), 0.99, None),
+    ],
+)
+def test_the_discount_is_said_to_ask_for_speed_only_where_it_does(slow, fast, discount, words):
+    laps = [pitfalls.LapReturn(10.0, *slow), pitfalls.LapReturn(7.0, *fast)]
+    found = list(pitfalls.slow_laps_return_as_much(laps, discount))
+    assert [words in line for line in found] == [True] * (words is not None)
+
+
+def test_laps_of_almost_the_same_time_are_not_compared():
+    laps = [pitfalls.LapReturn(10.0, 100.0, 50.0), pitfalls.LapReturn(9.5, 50.0, 20.0)]
+    assert not list(pitfalls.slow_laps_return_as_much(laps, 0.99))
 
 
 def test_only_a_constant_reward_is_reported_as_constant():

@@ -1,7 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from deepracer_exp.validation.pitfalls import drive_laps
+from deepracer_exp.config.driving import DiscreteAction, DiscreteActionSpace
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.validation.laps import SHARES, action_space_laps, drive_laps
 from deepracer_exp.validation.situations import named_situations, poses, sample, seam, situations, start
 
 
@@ -74,9 +78,23 @@ def test_laps_are_complete_stay_on_the_road_and_are_the_faster_the_higher_the_sp
     assert times == sorted(times, reverse=True)
 
 
-def test_the_whole_range_of_the_action_space_gets_round_on_the_default_track(race, laps):
-    assert (laps[0].speed_mps, laps[-1].speed_mps) == (race.actions.low[1], race.actions.high[1])
+def test_one_line_is_driven_at_several_shares_of_its_speeds(race, laps):
+    highest = race.actions.high[1]
+    assert [lap.speed_mps for lap in laps] == pytest.approx([share * highest for share in SHARES])
+    assert laps[0].time_s > 1.2 * laps[1].time_s > 1.3 * laps[2].time_s
+    assert all(lap.paid.columns["speed"].min() >= race.actions.low[1] for lap in laps)
+    # No lap cuts what another drives around: they are as long, and a slow one nears no border more than the fast one.
+    reach_m = [lap.paid.columns["distance_from_center"].max() for lap in laps]
+    assert reach_m == sorted(reach_m)
+    assert reach_m[-1] < race.track.width_m / 2
+
+
+def test_a_single_action_gives_one_lap(race):
+    action = DiscreteAction(steering_angle=0.0, speed=1.0)
+    only = DiscreteActionSpace(kind="discrete", actions=(action,), file=None)
+    (lap,) = action_space_laps(replace(race, actions=build_action_space(only)))
+    assert lap.speed_mps == 1.0
 
 
 def test_a_bend_taken_too_fast_gives_no_lap(race):
-    assert drive_laps(race, np.array([4.0]), np.array([50.0])) == []
+    assert drive_laps(race, np.array([50.0]), np.array([1.0])) == [None]
