@@ -5,6 +5,7 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -117,6 +118,9 @@ def folder(tmp_path_factory):
     np.save(folder / "my_route.npy", np.array([[np.cos(t), np.sin(t)] * 3 for t in np.linspace(0, 6, 50)]))
     options = folder / "conf" / "experiment"
     (options / "my_model.yaml").write_text("# @package _global_\nname: my_model\n", encoding="utf-8")
+    actions = folder / "conf" / "action_space"
+    actions.mkdir(exist_ok=True)
+    shutil.copy(conf_dir() / "action_space" / "grid.yaml", actions / "season.yaml")
     return folder
 
 

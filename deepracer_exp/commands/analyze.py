@@ -205,8 +205,8 @@ def _compare(args: argparse.Namespace) -> int:
     name, logs = given
     _check_output(args.output)
     chosen = stores.values.get("checkpoint")
-    place = _logs(logs)
-    if place is None and not is_run(Path(name)) and _logs(name) is not None:
+    place = existing_logs(logs)
+    if place is None and not is_run(Path(name)) and existing_logs(name) is not None:
         raise BadInput(f"{name}: is no run; write {shlex.join(['deepracer-exp', 'compare', logs, name])}")
     if place is None or is_run(place):
         why = "no such file or folder" if place is None else "is a run"
@@ -260,7 +260,7 @@ def _end(page: Path, is_opened: bool) -> None:
         webbrowser.open(page.resolve().as_uri())
 
 
-def _logs(what: str) -> Path | None:
+def existing_logs(what: str) -> Path | None:
     """Return an existing file or folder, None if there is none.
 
     Raises:
@@ -283,7 +283,7 @@ def _place(what: str, stores: Stores) -> Path:
     Raises:
         BadInput: there is none, or the name of a run is ambiguous.
     """
-    path = _logs(what)
+    path = existing_logs(what)
     if path is not None:
         return path
     from deepracer_exp.runs.resolve import resolve

@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from deepracer_exp.deepracer.model_metadata import Action
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 
@@ -85,14 +86,53 @@ def import_files(
     texts[Path("conf/experiment", f"{name}.yaml")] = b"# @package _global_\n" + _option(
         source or files.folder, experiment
     )
+    _check_free(texts, name)
+    _write_all(texts)
+    return list(texts)
+
+
+def check_action_space_name(name: str) -> None:
+    """Check the name of a new option of the group `action_space`.
+
+    Raises:
+        BadInput: it cannot be used or is taken.
+    """
+    _check_name(name)
+    _check_free([_action_space_file(name)], name)
+
+
+def write_action_space(name: str, actions: Iterable[Action], comment: str) -> Path:
+    """Write a list of actions as `./conf/action_space/NAME.yaml`.
+
+    Args:
+        name: name of the new option.
+        actions: in their order.
+        comment: one line that says where they come from.
+
+    Raises:
+        BadInput: as for `check_action_space_name`, or the file cannot be written.
+    """
+    check_action_space_name(name)
+    path = _action_space_file(name)
+    lines = [
+        f"  - {{steering_angle: {action.steering_deg}, speed: {action.speed_mps}}}\n" for action in actions
+    ]
+    text = f"{_comment(comment)}kind: discrete\nactions:\n{''.join(lines)}file: null\n"
+    _write_all({path: text.encode()})
+    return path
+
+
+def _action_space_file(name: str) -> Path:
+    return Path("conf", "action_space", f"{name}.yaml")
+
+
+def _check_free(paths: Iterable[Path], name: str) -> None:
     searched = conf_dirs()
-    for path in texts:
+    for path in paths:
         for folder in (Path("conf"), *searched):
             taken = folder / path.relative_to("conf")
             if os.path.lexists(taken):
                 raise BadInput(f"--name {name}: {taken} exists already; accepted: a new name")
-    _write_all(texts)
-    return list(texts)
 
 
 def _check_name(name: str) -> None:
@@ -109,9 +149,13 @@ def _check_name(name: str) -> None:
 
 def _option(source: str, values: Mapping[str, Any]) -> bytes:
     """Return the text of an option file that says where its values come from."""
-    # On one line even if the path has line breaks.
-    comment = f"# Imported from {re.sub(r'[^ -~]+', ' ', str(Path(source).resolve()))}.\n"
+    comment = _comment(f"Imported from {Path(source).resolve()}.")
     return (comment + yaml.safe_dump(values, sort_keys=False, allow_unicode=True)).encode()
+
+
+def _comment(text: str) -> str:
+    """Return a comment on one line even if the text has line breaks."""
+    return f"# {re.sub(r'[^ -~]+', ' ', text)}\n"
 
 
 def _write_all(texts: Mapping[Path, bytes]) -> None:

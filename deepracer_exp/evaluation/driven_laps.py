@@ -1,21 +1,24 @@
-"""Laps for a replay, driven by the policies of runs."""
+"""Laps driven by the policies of runs: for a replay, and for the commands of the fast ones."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from deepracer_exp.analysis.lap_replay import ReplayedLap, is_same_start
+from deepracer_exp.analysis.proposed_actions import Commands, fast_laps, in_words
 from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.resolve import StoredRun
 
 from .evaluator import Evaluator
 from .film import LapRecorder, best_attempt
 from .race_protocol import Attempt
-from .result import USUAL
+from .result import USUAL, Evaluation
 
 
 def laps_to_replay(
@@ -38,11 +41,7 @@ def laps_to_replay(
         BadInput: the checkpoint, a track or a condition cannot be used, or there is no other complete lap.
         RunFailed: a car's state became NaN.
     """
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(checkpoint))
-    torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, replace(protocol, held_out=None))
-    recorder = LapRecorder(evaluator)
-    evaluation = evaluator(stored.networks.policy, recorder)
+    stored, evaluator, recorder, evaluation = _raced(run, checkpoint, protocol)
     starts = np.array([trial.start_ndist for trial in evaluator.trials])
     same = np.ones(len(starts), bool) if beside is None else is_same_start(starts, beside)
     best = best_attempt(evaluation, {*np.flatnonzero(same if same.any() else ~same).tolist()})
@@ -60,6 +59,55 @@ def laps_to_replay(
     return [
         _replayed(recorder, one, run, f"{words} of checkpoint {stored.path.name}") for one, words in chosen
     ]
+
+
+def commands_of_run(run: StoredRun, checkpoint: str | None) -> Commands:
+    """Race a run's checkpoint as its training evaluates it, on the usual conditions; return its fast laps' commands.
+
+    On several tracks the fast laps are those of each track.
+
+    Args:
+        run: trained.
+        checkpoint: its name; None: the best.
+
+    Raises:
+        BadInput: the checkpoint cannot be used, or completes no lap without a reset.
+        RunFailed: a car's state became NaN.
+    """
+    stored, _, recorder, evaluation = _raced(run, checkpoint, run.experiment.evaluation)
+    words: list[str] = []
+    steps: list[NDArray[np.float64]] = []
+    for group in evaluation.groups:
+        laps = [one for one in group.attempts if one.complete and not one.resets]
+        if not laps:
+            continue
+        times_s = np.array([one.time_s for one in laps])
+        fast = fast_laps(times_s)
+        words.append(in_words(int(fast.sum()), len(laps), float(times_s.min()), f"on {group.track}"))
+        steps += [recorder.rows(laps[number])[1] for number in np.flatnonzero(fast)]
+    name = f"{run.path.name}, checkpoint {stored.path.name}"
+    if not steps:
+        tried = count(len(evaluation.on(USUAL).attempts), "lap")
+        raise BadInput(f"{name}: completes none of {tried} without a reset; accepted: a run that does")
+    rows = np.concatenate(steps)
+    # In the prepare step nothing is commanded yet.
+    rows = rows[rows[:, PACKED["episode_status"]] != STATUS_CODE["prepare"]]
+    return Commands(
+        laps="; ".join(words),
+        steering_deg=rows[:, PACKED["steer"]],
+        speed_mps=rows[:, PACKED["throttle"]],
+    )
+
+
+def _raced(
+    run: StoredRun, checkpoint: str | None, protocol: EvaluationConfig
+) -> tuple[StoredPolicy, Evaluator, LapRecorder, Evaluation]:
+    """Race a checkpoint on the usual conditions and record every step."""
+    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(checkpoint))
+    torch.set_num_threads(1)
+    evaluator = Evaluator(run.experiment, replace(protocol, held_out=None))
+    recorder = LapRecorder(evaluator)
+    return stored, evaluator, recorder, evaluator(stored.networks.policy, recorder)
 
 
 def _median(attempts: Sequence[Attempt]) -> Attempt:

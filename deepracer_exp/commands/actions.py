@@ -1,0 +1,200 @@
+"""`deepracer-exp actions`: an action space from driven laps."""
+
+import argparse
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from deepracer_exp.errors import BadInput, writing
+
+from .analyze import existing_logs
+from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
+from .output import table_console, warnings_on_stderr
+from .startup import check_policy
+
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.proposed_actions import ActionProposal, Commands
+    from deepracer_exp.config.car import CarConfig
+    from deepracer_exp.deepracer.model_metadata import ModelMetadata
+
+_EPILOG = """\
+  deepracer-exp actions RUN                                 from the fast laps of its best checkpoint, driven now
+  deepracer-exp actions ~/Downloads/training.tar.gz --count 20 --name season
+                                                            from the fast laps of a log
+  deepracer-exp train action_space=season                   train with them
+
+Laps that count are complete, without a reset, and at most 5 % slower than the fastest of their track. Actions are the
+centres of clusters of what these commanded, where 10 degrees of steering count as much as 1 m/s. To recover with, where
+nothing like it is among them, there are also: full lock to either side and straight ahead at the lowest speed of the
+laps (at most 1.3 m/s), and 10 degrees to either side at their median speed.
+"""
+METADATA, PICTURE = "model_metadata.json", "actions.png"
+
+
+class _Source(NamedTuple):
+    """Where the commands come from."""
+
+    name: str
+    commands: "Commands"
+    car: "CarConfig"
+    metadata: "ModelMetadata"
+    """With the sensors, network and version that the written file has."""
+
+
+def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command."""
+    parser = add_command(
+        commands,
+        "actions",
+        _actions,
+        help="propose an action space from driven laps",
+        description="Propose a list of actions from the commands of fast laps: of a log, or of a run's best policy. "
+        "Write it as an option of your own, as model_metadata.json and as a picture.",
+        epilog=_EPILOG,
+        entry="evaluate",
+    )
+    what = parser.add_argument("what", nargs="?", metavar="RUN | LOGS", help="a run, or logs of the service")
+    what.completer = complete_runs  # type: ignore[attr-defined]
+    add_overrides(parser, "checkpoint=NAME | runs_dir=DIR | tracking.uri=URI")
+    parser.add_argument("--count", type=_whole, default=12, metavar="N", help="actions in all (default: 12)")
+    parser.add_argument(
+        "--name", help="name of the option, ./conf/action_space/NAME.yaml (default: actions-SOURCE)"
+    )
+    parser.add_argument(
+        "--track",
+        metavar="NAME",
+        help="one of several tracks of a log; or a name for one that it does not name",
+    )
+    parser.add_argument(
+        *("-o", "--output"),
+        metavar="DIR",
+        help=f"folder for {METADATA} and {PICTURE} (default: NAME)",
+    )
+
+
+def _whole(given: str) -> int:
+    if not given.isdecimal():
+        raise argparse.ArgumentTypeError(f"{given}: accepted: a whole number")
+    return int(given)
+
+
+def _actions(args: argparse.Namespace) -> int:
+    from deepracer_exp.analysis.proposed_actions import check_count, propose_actions
+    from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
+    from deepracer_exp.deepracer.model_metadata import model_metadata_text
+    from deepracer_exp.files import atomic_write
+
+    words = [word for word in (args.what, *args.overrides) if word is not None]
+    stores = read_stores((word for word in words if is_override(word)), ["checkpoint"])
+    given = [word for word in words if not is_override(word)]
+    if len(given) != 1:
+        raise BadInput(f"{' '.join(given) or 'RUN'}: {len(given)} given; accepted: one run, or logs")
+    check_count(args.count)
+    if args.name is not None:
+        check_action_space_name(args.name)
+        _check_folder(args.output or args.name)
+
+    source = _source(given[0], stores, args.track)
+    name = args.name or _default_name(source.name)
+    folder = _check_folder(args.output or name)
+    check_action_space_name(name)
+    proposal = propose_actions(source.commands.within(source.car), args.count, source.car)
+
+    from deepracer_exp.analysis.charts.proposed_actions import proposed_actions_picture
+
+    metadata = replace(
+        source.metadata, actions=proposal.actions, low=None, high=None, training_algorithm="clipped_ppo"
+    )
+    title = f"{len(proposal.actions)} actions from {source.name}"
+    picture = proposed_actions_picture(title, proposal)
+    with writing(f"--output {folder}", "a folder"):
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(folder / METADATA, model_metadata_text(metadata))
+        atomic_write(folder / PICTURE, picture)
+    option = write_action_space(name, proposal.actions, f"{title}: {source.commands.laps}.")
+
+    _print(source, proposal, args.count)
+    print(f"\n  option    {option}\n  metadata  {folder / METADATA}\n  picture   {folder / PICTURE}")
+    print(f"\n  train with it  deepracer-exp train action_space={name}")
+    return 0
+
+
+def _check_folder(output: str) -> Path:
+    """Return the folder to write to.
+
+    Raises:
+        BadInput: it has one of the files already.
+    """
+    folder = Path(output).expanduser()
+    for name in (METADATA, PICTURE):
+        if os.path.lexists(folder / name):
+            raise BadInput(f"--output {output}: {folder / name} exists already; accepted: another folder")
+    return folder
+
+
+def _default_name(source: str) -> str:
+    return f"actions-{re.sub(r'[^A-Za-z0-9_]+', '-', source).strip('-')[:60] or 'log'}"
+
+
+def _source(what: str, stores: Stores, track: str | None) -> _Source:
+    from deepracer_exp.runs.files import is_run
+
+    place = existing_logs(what)
+    if place is None or is_run(place):
+        return _of_run(what, stores, track)
+    if stores.values:
+        raise BadInput(f"checkpoint={stores.values['checkpoint']}: {what} is a log; accepted for a run")
+
+    from deepracer_exp.analysis.proposed_actions import commands_of_log
+    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.deepracer.model_metadata import ModelMetadata
+    from deepracer_exp.deepracer.recording_reader import read_recording
+
+    recording = read_recording(place)
+    commands = commands_of_log(recording, track)
+    # All cars have the service's limits.
+    car = compose_experiment([])[0].car
+    return _Source(recording.name, commands, car, recording.metadata or ModelMetadata())
+
+
+def _of_run(what: str, stores: Stores, track: str | None) -> _Source:
+    if track is not None:
+        raise BadInput(f"--track {track}: {what} is no log; accepted for a log of several tracks")
+    chosen = stores.values.get("checkpoint")
+    run = check_policy(what, str(stores.runs_dir), stores.uri, chosen)
+
+    from deepracer_exp.evaluation.driven_laps import commands_of_run
+    from deepracer_exp.export.aws_files import services_metadata
+
+    with warnings_on_stderr():
+        commands = commands_of_run(run, chosen)
+    experiment = run.experiment
+    return _Source(experiment.name, commands, experiment.car, services_metadata(experiment))
+
+
+def _print(source: _Source, proposal: "ActionProposal", count: int) -> None:
+    from rich.table import Table
+
+    console = table_console()
+    console.print(f"{source.name}: {source.commands.laps}\n", soft_wrap=True)
+    table = Table(box=None, pad_edge=False)
+    for head in ("action", "steering, degrees", "speed, m/s", "nearest to, % of steps"):
+        table.add_column(head, justify="right", no_wrap=True)
+    table.add_column("")
+    for number, (action, rescue, share) in enumerate(
+        zip(proposal.actions, proposal.to_recover, proposal.shares, strict=True)
+    ):
+        cells = f"{action.steering_deg:g}", f"{action.speed_mps:.2f}", f"{100 * share:.1f}"
+        table.add_row(str(number), *cells, "to recover with" * rescue)
+    console.print(table)
+    degrees, mps = proposal.mean_deviation
+    console.print(
+        f"\nthe laps' commands are {degrees:.1f} degrees and {mps:.2f} m/s from the nearest action, on average",
+        soft_wrap=True,
+    )
+    if len(proposal.actions) < count:
+        console.print(
+            f"{len(proposal.actions)} of {count}: the laps have no more different commands", soft_wrap=True
+        )

@@ -1,0 +1,94 @@
+"""`deepracer-exp actions`: from a run and from its logs to an action space that trainings take."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.action_space import build_action_space, describe_actions
+
+LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
+
+
+@pytest.fixture
+def run_dir(copied) -> Path:
+    """A copy of a trained run that completes laps."""
+    return copied(*LAPS)
+
+
+@pytest.fixture
+def logs(run_dir, call, tmp_path) -> Path:
+    """Its logs, as the console writes them."""
+    ended = call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws"))
+    assert ended.code == 0, ended.stderr
+    return tmp_path / "from aws"
+
+
+def described(*overrides: str) -> str:
+    return describe_actions(build_action_space(compose_experiment(list(overrides))[0].action_space))
+
+
+def test_the_option_and_the_file_of_a_run_are_the_same_actions(run_dir, call, tmp_path, monkeypatch):
+    ended = call("actions", str(run_dir), "--count", "8", "--name", "mine")
+    assert ended.code == 0, ended.stderr
+    monkeypatch.chdir(tmp_path)
+    assert described("action_space=mine") == described("custom_files=mine")
+    assert described("action_space=mine").startswith("5 actions -30°/0.6 -10°/0.6 0°/0.6 ")
+    assert (tmp_path / "mine" / "actions.png").read_bytes().startswith(b"\x89PNG")
+    assert "train action_space=mine" in ended.stdout
+    assert re.search(r"\d of \d complete laps? without a reset on Straight_track", ended.stdout)
+    # The run has a list of five actions, all at 0.6 m/s.
+    assert "5 of 8: the laps have no more different commands" in ended.stdout
+
+
+def test_the_table_has_the_actions_of_the_file(logs, call, tmp_path):
+    ended = call("actions", str(logs), "--count", "7")
+    assert ended.code == 0, ended.stderr
+    rows = re.findall(r"^ +\d+ +(-?[\d.]+) +([\d.]+) +[\d.]+", ended.stdout, re.MULTILINE)
+    metadata = json.loads((tmp_path / "actions-from-aws" / "model_metadata.json").read_text())
+    listed = [(action["steering_angle"], action["speed"]) for action in metadata["action_space"]]
+    assert [(float(steering), float(speed)) for steering, speed in rows] == listed
+    assert listed == sorted(listed)
+    assert (tmp_path / "conf" / "action_space" / "actions-from-aws.yaml").is_file()
+
+
+def test_a_training_takes_them(run_dir, call, train_here):
+    assert call("actions", str(run_dir), "--name", "mine").code == 0
+    ended = train_here("action_space=mine", "budget.iterations=1", "name=next")
+    assert ended.code == 0, ended.stderr
+
+
+def test_nothing_that_is_there_is_overwritten(run_dir, call, tmp_path):
+    assert call("actions", str(run_dir), "--name", "mine").code == 0
+    call("actions", str(run_dir), "--name", "mine").assert_refused("--name mine", "exists already")
+    shutil.rmtree(tmp_path / "conf")
+    metadata = tmp_path / "mine" / "model_metadata.json"
+    metadata.write_text("precious")
+    call("actions", str(run_dir), "--name", "mine").assert_refused("--output mine", "model_metadata.json")
+    assert metadata.read_text() == "precious"
+    assert not (tmp_path / "conf").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["accepted: one run, or logs"]),
+        (["RUN", "nowhere"], ["2 given"]),
+        (["nowhere"], ["nowhere"]),
+        (["empty"], ["empty"]),
+        (["RUN", "--count", "5"], ["--count 5", "accepted: 6 to 100"]),
+        (["RUN", "--count", "a dozen"], ["a dozen", "whole number"]),
+        (["RUN", "--name", "../mine"], ["--name"]),
+        (["RUN", "--name", "discrete"], ["--name discrete", "exists already"]),
+        (["RUN", "--track", "Oval_track"], ["--track Oval_track", "is no log"]),
+        (["empty", "checkpoint=last"], ["checkpoint=last", "is a log"]),
+        (["RUN", "seed=3"], ["seed=3", "no such key"]),
+    ],
+)
+def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
+    (tmp_path / "empty").mkdir()
+    call("actions", *(str(run_dir) if word == "RUN" else word for word in arguments)).assert_refused(*words)
+    assert not (tmp_path / "conf").exists()
