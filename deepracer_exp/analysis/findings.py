@@ -17,6 +17,7 @@ from . import off_track
 from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .sectors import Sector, sector_at, sectors_now, sectors_of
+from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
 from .tables import CANDIDATE_LAPS, DENSE
 
@@ -34,6 +35,7 @@ FIGURES = {
     "runs_off": "off_track_risk",
     "steering": "slide_map",
     "overfits": "training_progress",
+    "laps_slower": "training_progress",
 }
 """The chart that shows what a rule found."""
 _Numbers = dict[str, float | int | str]
@@ -61,7 +63,7 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
     found, overfits = list[Finding | None](), None
     if view.trained:
         overfits = _overfits(view)
-        found += [_converged(view, overfits), _submit(view)]
+        found += [_converged(view, overfits), _submit(view), _laps_slower(view)]
     found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view), overfits]
     return [one for one in found if one is not None]
 
@@ -398,6 +400,17 @@ def _overfits(view: LogView) -> Finding | None:
         values |= found.decision.values
     thresholds = {"held_out_drop": found.rule.held_out_drop, "return_drop": found.rule.return_drop}
     return Finding("overfits", sentence, values, thresholds | {"patience": found.rule.patience})
+
+
+def _laps_slower(view: LogView) -> Finding | None:
+    decision = view.recording.decision
+    found = slower_laps(view.judged)
+    if found is None or (decision is not None and decision["rule"] == "laps_slower"):  # reported already
+        return None
+    values: _Numbers = {"iteration": found.since, "fastest_s": found.fastest_s, "now_s": found.now_s}
+    values |= {"return_then": found.return_then, "return_now": found.return_now}
+    thresholds = {"slower": SLOWER, "chance": CHANCE, "least_lap_times": LEAST_TIMES}
+    return Finding("laps_slower", f"{found} Take {_instead(view)}.", values, thresholds)
 
 
 def _instead(view: LogView) -> str:

@@ -87,6 +87,7 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "checkpoint": "the service's name of the checkpoint that drove it; empty where the log does not name it",
     "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
+    "eval_lap_time_s": "s, mean of the complete laps of the evaluation on usual conditions; NaN on several tracks",
 }
 """Names of the columns, with meaning and unit."""
 FINISHED = 0.75
@@ -423,14 +424,23 @@ def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataF
 
 
 def _evaluated(recording: Recording) -> pd.DataFrame:
-    """Return the mean completion of each iteration's evaluation: of our own runs, or of the service's metrics."""
+    """Return the means of each iteration's evaluation: of our own runs, or of the service's metrics."""
     if len(recording.evaluations):
-        own = recording.evaluations.groupby("iteration")[["completion", "held_out_completion"]].last()
-        return own.rename(columns={"completion": "eval_completion"})
+        own = recording.evaluations.groupby("iteration").last()
+        if recording.track is None:  # a mean over whichever tracks have a lap
+            own["lap_time_s"] = np.nan
+        return own.rename(columns={"completion": "eval_completion", "lap_time_s": "eval_lap_time_s"})
+    rows = _evaluation_rows(recording)
+    groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
+    means = groups["completion"].mean().to_frame("eval_completion")
+    return means.assign(held_out_completion=np.nan, eval_lap_time_s=groups["time_s"].mean())
+
+
+def _evaluation_rows(recording: Recording) -> pd.DataFrame:
+    """Return the evaluation episodes of a training's metrics files; `lap`: whether it is one without a reset."""
     rows = recording.metrics
     rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
-    means = rows.groupby("iteration")["completion"].mean().to_frame("eval_completion")
-    return means.assign(held_out_completion=np.nan)
+    return rows.assign(lap=(rows["completion"] >= 100.0) & ~(rows["resets"] > 0))
 
 
 def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
@@ -452,10 +462,8 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
     Returns:
         `CANDIDATE_COLUMNS`.
     """
-    rows = recording.metrics
-    rows = rows[(rows["phase"] == "evaluation") & (rows["stream"] == "training")]
-    lap = (rows["completion"] >= 100.0) & ~(rows["resets"] > 0)
-    groups = rows.assign(lap=lap, time_s=rows["time_s"].where(lap)).groupby("iteration")
+    rows = _evaluation_rows(recording)
+    groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
     raced = pd.DataFrame(
         {
             "episodes": groups.size(),

@@ -19,7 +19,7 @@ _HEALTHY_MS, _TOO_LONG_MS = 1000 / 15, 90.0
 
 
 def training_progress(view: LogView) -> Chart | None:
-    """Draw reward, progress, complete laps and entropy of each iteration, and where the training converged."""
+    """Draw reward, progress, complete laps, lap times and entropy by iteration, and where the training converged."""
     table = view.iterations
     if not len(table):
         return None
@@ -39,6 +39,17 @@ def training_progress(view: LogView) -> Chart | None:
         ("Progress", "per cent of the lap", progress),
         ("Complete laps", "per cent of the episodes", curve(shares, "lap_share", BLUE, "share")),
     ]
+    laps = [
+        layer
+        for column, color, name in (
+            ("lap_time_mean_s", BLUE, "exploring laps, mean"),
+            ("eval_lap_time_s", ORANGE, "evaluated laps, mean"),
+        )
+        if table[column].notna().any()
+        for layer in _joined(table, column, color, name)
+    ]
+    if laps:
+        shown.append(("Lap times", "lap time, s", laps))
     if table["entropy"].notna().any():
         shown.append(
             ("Entropy of the policy", "nats", curve(table, "entropy", PURPLE, "mean over the update"))

@@ -1,0 +1,109 @@
+"""Whether the laps of a training became slower, and whether its return rose meanwhile."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.stats import kendalltau
+
+from .statistics import Values
+
+LEAST_TIMES = 8
+"""Lap times without which nothing is said."""
+_MOST_BLOCKS = 12
+"""More lap times are averaged to so many, because those of neighbouring iterations are not independent."""
+_AVERAGED = 3
+SLOWER = 0.02
+"""Share by which the last laps must be slower than the fastest of the training."""
+CHANCE = 0.02
+"""Chance of calling a training slower that only scatters, as the test has it."""
+_RETURN_CHANCE = 0.05
+SERIES = {"eval_lap_time_s": "evaluated laps", "lap_time_mean_s": "exploring laps"}
+"""Columns of lap times, what counts more first, and what they are called."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlowerLaps:
+    """Since when laps became slower."""
+
+    laps: str
+    """A value of SERIES."""
+    since: int
+    """The iteration around which they were fastest."""
+    fastest_s: float
+    """Mean of three lap times in a row around that iteration; likewise the next ones."""
+    now_s: float
+    """At the end."""
+    return_then: float
+    return_now: float
+    return_rose: bool
+
+    def __str__(self) -> str:
+        """Say so in a sentence or two."""
+        what = (
+            f"The {self.laps} became slower from iteration {self.since} on, from {self.fastest_s:.2f} to "
+            f"{self.now_s:.2f} s, while the return"
+        )
+        if not self.return_rose:
+            return f"{what} did not rise ({self.return_then:.4g}, then {self.return_now:.4g})."
+        return (
+            f"{what} rose from {self.return_then:.4g} to {self.return_now:.4g}: the reward function rewards it. "
+            "`deepracer-exp validate` shows what slow and fast laps return."
+        )
+
+
+def slower_laps(iterations: pd.DataFrame) -> SlowerLaps | None:
+    """Test whether laps became slower since they were fastest; None: no, or there are too few to say.
+
+    The lap times since the fastest three in a row are compared with their order (Kendall's tau, one-sided). That
+    start was chosen among all, so the chance of a false alarm is divided by their number (Bonferroni). The return
+    rose if the same test says so of the returns of the same iterations.
+
+    Args:
+        iterations: a row each, with `iteration`, `reward_mean` and the columns SERIES; the first of them with
+            `LEAST_TIMES` lap times counts.
+    """
+    for column, name in SERIES.items():
+        known = iterations[column].notna()
+        if known.sum() >= LEAST_TIMES:
+            # The return of an evaluated policy is that of the iterations since the evaluation before.
+            block = known.cumsum() - known
+            returns = iterations["reward_mean"].groupby(block).mean().to_numpy()[: known.sum()]
+            rows = iterations[known]
+            return _tested(
+                name,
+                rows["iteration"].to_numpy(np.int64),
+                rows[column].to_numpy(np.float64),
+                returns.astype(np.float64),
+            )
+    return None
+
+
+def _tested(name: str, iteration: np.ndarray, laps_s: Values, returns: Values) -> SlowerLaps | None:
+    parts = np.array_split(np.arange(len(laps_s)), min(len(laps_s), _MOST_BLOCKS))
+    times_s, rewards = (
+        np.array([np.nanmean(values[part]) for part in parts]) for values in (laps_s, returns)
+    )
+    averages_s = np.convolve(times_s, np.ones(_AVERAGED) / _AVERAGED, "valid")
+    fastest = int(averages_s.argmin())
+    if averages_s[-1] < (1 + SLOWER) * averages_s[fastest]:
+        return None
+    starts = len(averages_s) - _AVERAGED
+    if not _rises(times_s[fastest:], CHANCE / starts):
+        return None
+    middle = parts[fastest + _AVERAGED // 2]
+    return SlowerLaps(
+        laps=name,
+        since=int(iteration[middle[len(middle) // 2]]),
+        fastest_s=float(averages_s[fastest]),
+        now_s=float(averages_s[-1]),
+        return_then=float(np.mean(rewards[fastest : fastest + _AVERAGED])),
+        return_now=float(np.mean(rewards[-_AVERAGED:])),
+        return_rose=_rises(rewards[fastest:], _RETURN_CHANCE),
+    )
+
+
+def _rises(values: Values, chance: float) -> bool:
+    """Return whether values rise with their order beyond a chance."""
+    found = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit")
+    return bool(found.pvalue < chance)
