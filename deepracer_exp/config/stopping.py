@@ -79,6 +79,18 @@ class OverfittingRule:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LapsSlowerRule:
+    """The evaluated laps of the policy become slower while its return holds."""
+
+    warmup: Natural
+    patience: Count
+    slower: Fraction
+    """How much slower than the fastest laps all later ones are, as a share of the speed."""
+    return_drop: Fraction
+    """How far the return may be below its best and still count as stable, as a share of the range so far."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CollapsedRule:
     """The policy has become almost deterministic and drives badly."""
 
@@ -104,7 +116,7 @@ class NotLearningRule:
 
 @dataclass(frozen=True, kw_only=True)
 class EntropyStopping:
-    """Stop trainings that have converged, overfit, collapsed or do not learn."""
+    """Stop trainings that have converged, overfit, become slower, collapsed or do not learn."""
 
     kind: Literal["entropy"]
     window: Count
@@ -114,6 +126,8 @@ class EntropyStopping:
     overfitting: OverfittingRule | None
     collapsed: CollapsedRule | None
     not_learning: NotLearningRule | None
+    laps_slower: LapsSlowerRule | None = None
+    """Runs of older versions do not have it."""
 
 
 PresetStopping = NoStopping | ReliableStopping | PlateauStopping | EntropyStopping

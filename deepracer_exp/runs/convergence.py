@@ -15,10 +15,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.stopping import (
-    CollapsedRule,
     ConvergedRule,
     EntropyStopping,
-    NotLearningRule,
     OverfittingRule,
     PlateauStopping,
     ReliableStopping,
@@ -26,17 +24,20 @@ from deepracer_exp.config.stopping import (
 )
 from deepracer_exp.errors import count
 
+from . import trends
+from .result import RELIABLE
+from .trends import Average, Found
+
 if TYPE_CHECKING:
     import pandas as pd
 
 Row = Mapping[str, Any]
 """One line of metrics.jsonl."""
-_Found = tuple[str, dict[str, float]]
-"""Why a rule applies, in words, and what it compared."""
 
 EVALUATED = ("eval_completion", "held_out_completion")
 """Columns that only the rows of evaluated iterations have."""
 _ALWAYS = ("completion", "mean_return", "laps_per_1000_steps", "entropy")
+_LAP_SPEED = "evaluated_laps_per_s"
 _STEPS = 1000  # control steps per which laps are counted, because iterations differ in length
 
 
@@ -67,7 +68,8 @@ class Decision:
     """Why a run should end."""
 
     rule: str
-    """`reliable`, `plateau`, `converged`, `overfitting`, `collapsed`, `not_learning`, or the name of another rule."""
+    """`reliable`, `plateau`, a rule of `stopping=entropy` (`converged`, `overfitting`, `laps_slower`, `collapsed`,
+    `not_learning`), or the name of another rule."""
     why: str
     """The rule's reason in words."""
     values: dict[str, float] = field(default_factory=dict)
@@ -145,51 +147,6 @@ class ReliableRule(StoppingRule):
         return _decision("reliable", why, {"lap_share": share}, self._config)
 
 
-class _Average:
-    """A moving average over the last known values of a column; it stays where a row has none."""
-
-    def __init__(self, window: int):
-        self._window = window
-        self._known: list[float] = []
-        self._averages: list[float | None] = []
-        self.first = math.nan
-        self.best, self._worst = -math.inf, math.inf
-
-    def add(self, value: float | None) -> None:
-        if value is not None and math.isfinite(value):
-            self._known = [*self._known, value][-self._window :]
-        average = sum(self._known) / self._window if len(self._known) == self._window else None
-        if average is not None:
-            if math.isinf(self.best):
-                self.first = average
-            self.best, self._worst = max(self.best, average), min(self._worst, average)
-        self._averages.append(average)
-
-    def known(self, patience: int) -> bool:
-        """Return whether there is an average before the last `patience` rows."""
-        return len(self._averages) > patience and self._averages[-patience - 1] is not None
-
-    @property
-    def now(self) -> float:
-        """The newest average, which must be known."""
-        (last,) = self.last(1)
-        return last
-
-    @property
-    def range(self) -> float:
-        """Difference of the highest and the lowest average."""
-        return self.best - self._worst
-
-    def last(self, rows: int) -> list[float]:
-        """Return the averages of the last rows."""
-        return [average for average in self._averages[-rows:] if average is not None]
-
-    def bests(self, patience: int) -> tuple[float, float]:
-        """Return the highest average before the last `patience` rows, and within them."""
-        before = (average for average in self._averages[:-patience] if average is not None)
-        return max(before), max(self.last(patience))
-
-
 class TrendRule(StoppingRule):
     """The rules `plateau` and `entropy`, which look at moving averages."""
 
@@ -202,7 +159,7 @@ class TrendRule(StoppingRule):
         self._action_count = action_count
         self._entropy_at_start: float | None = None
         self._before = (0, 0)
-        self._seen = {name: _Average(config.window) for name in (*_ALWAYS, *EVALUATED)}
+        self._seen = {name: Average(config.window) for name in (*_ALWAYS, *EVALUATED, _LAP_SPEED)}
         self._race_scores_s: list[float] = []  # infinite where none is known
         self._rows = 0
 
@@ -226,6 +183,7 @@ class TrendRule(StoppingRule):
             share = entropy_share(entropy, self._entropy_at_start, self._action_count)
         return {
             "entropy": share,
+            _LAP_SPEED: _lap_speed(row),
             "laps_per_1000_steps": _STEPS * (row["laps"] - laps) / max(row["env_steps"] - steps, 1),
             **{name: row.get(name) for name in ("completion", "mean_return", *EVALUATED)},
         }
@@ -242,10 +200,11 @@ class TrendRule(StoppingRule):
         return _decision("plateau", why, values, config)
 
     def _entropy(self, config: EntropyStopping) -> Decision | None:
-        rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., _Found | None]], ...] = (
-            ("collapsed", config.collapsed, ("entropy", "completion"), _collapsed),
-            ("not_learning", config.not_learning, ("entropy", "completion"), _not_learning),
-            ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), _overfitting),
+        rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., Found | None]], ...] = (
+            ("collapsed", config.collapsed, ("entropy", "completion"), trends.collapsed),
+            ("not_learning", config.not_learning, ("entropy", "completion"), trends.not_learning),
+            ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), trends.overfits),
+            ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), trends.laps_slower),
             ("converged", config.converged, _ALWAYS, self._converged),
         )
         for name, rule, columns, judge in rules:
@@ -257,7 +216,7 @@ class TrendRule(StoppingRule):
                 return _decision(name, *found, rule)
         return None
 
-    def _converged(self, rule: ConvergedRule, *averages: _Average) -> _Found | None:
+    def _converged(self, rule: ConvergedRule, *averages: Average) -> Found | None:
         completion, returns, laps, entropy = averages
         flat = entropy.last(rule.patience)
         values = {
@@ -288,31 +247,10 @@ class TrendRule(StoppingRule):
         return f"{completion.now:.1f}% completion, entropy {entropy.now:.1%}, no growth for {idle}", values
 
 
-def _collapsed(rule: CollapsedRule, entropy: _Average, completion: _Average) -> _Found | None:
-    highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
-    if highest >= rule.entropy_floor or best >= rule.completion_poor:
-        return None
-    why = f"entropy at {highest:.1%} with {best:.0f}% completion"
-    return why, {"entropy": highest, "completion": best}
-
-
-def _not_learning(rule: NotLearningRule, entropy: _Average, completion: _Average) -> _Found | None:
-    lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
-    start = completion.first
-    if lowest <= rule.entropy_near or best - start > rule.completion_gain or best >= rule.completion_poor:
-        return None
-    why = f"entropy still at {lowest:.1%}, completion {start:.1f}% at the start and {best:.1f}% since"
-    return why, {"entropy": lowest, "completion_start": start, "completion": best}
-
-
-def _overfitting(rule: OverfittingRule, held_out: _Average, returns: _Average) -> _Found | None:
-    before, since = held_out.bests(rule.patience)
-    lowest_return = returns.best - rule.return_drop * returns.range
-    if since > before - rule.held_out_drop or returns.now < lowest_return:
-        return None
-    why = f"held-out completion fell from {before:.0f}% to {since:.0f}% while the return holds"
-    completions = {"held_out_completion_before": before, "held_out_completion_since": since}
-    return why, completions | {"return": returns.now, "return_best": returns.best}
+def _lap_speed(row: Row) -> float | None:
+    """Return 1 / mean lap time of an evaluation, None where too few laps are complete to compare it."""
+    share, lap_time_s = row.get("eval_lap_share"), row.get("eval_lap_time_s")
+    return None if share is None or lap_time_s is None or share < RELIABLE else 1 / lap_time_s
 
 
 def build_rule(config: StoppingConfig, action_count: int | None) -> StoppingRule:

@@ -15,6 +15,8 @@ FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "stopped early", "int
 BUDGET_REACHED = "budget reached: "
 """Beginning of `reason` of a run that has used its budget; the limit's key follows."""
 IN_TRAINING = "training"
+RELIABLE = 0.95
+"""Share of complete laps on usual conditions from which on a policy counts as reliable."""
 CRITERIA = {
     "race_score": "race score",
     "lap_time": "mean lap",

@@ -41,6 +41,8 @@ def history(
     lap_share=None,
     held_out=None,
     race_score_s=None,
+    lap_time_s=None,
+    evaluated_lap_share=1.0,
     noise: float = 0.0,
     seed: int = 0,
 ) -> list[dict]:
@@ -63,6 +65,7 @@ def history(
         }
         if iteration % 5 == 0:
             evaluated = {"held_out_completion": held_out, "eval_race_score_s": race_score_s}
+            evaluated |= {"eval_lap_time_s": lap_time_s, "eval_lap_share": evaluated_lap_share}
             row |= {name: at(value, iteration) for name, value in evaluated.items() if value is not None}
         rows.append(row)
     return rows
@@ -84,6 +87,13 @@ def falling(**more) -> list[dict]:
     """Held-out completion rises to 90 and falls to 50, as the return rises on."""
     held_out = {"held_out": lambda i: 90 * i / 50 if i <= 50 else max(50.0, 140 - i)}
     return history(**{"completion": learned(LONG), "mean_return": learned(LONG)} | held_out | more)
+
+
+def slowing(**more) -> list[dict]:
+    """Evaluated laps fall from 8 to 6 s and rise to 7 s, as the return rises on."""
+    lap_time_s = {"lap_time_s": lambda i: 8 - 2 * i / 60 if i <= 60 else min(7.0, 6 + (i - 60) / 100)}
+    grows = {name: learned(LONG) for name in ("completion", "mean_return", "held_out")}
+    return history(**grows | lap_time_s | more)
 
 
 RANDOM = {"completion": 11.0, "entropy": 0.999, "laps_per_iteration": 0.0}
@@ -108,6 +118,7 @@ def assert_reported(decision: Decision) -> None:
         ("not_learning", history(**RANDOM), 42, 3),
         ("collapsed", history(completion=20.0, entropy=lambda i: max(0.01, 1 - 0.1 * i)), 31, 3),
         ("overfitting", falling(), 110, 19),
+        ("laps_slower", slowing(), 165, 15),
     ],
 )
 def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
@@ -117,6 +128,9 @@ def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
     assert number == pytest.approx(at, abs=within)
     if name == "overfitting":
         assert decision.values["held_out_completion_before"] > 85
+    if name == "laps_slower":
+        assert decision.values["lap_time_s_before"] == pytest.approx(6.0, abs=0.2)
+        assert decision.values["lap_time_s_since"] > 1.03 * decision.values["lap_time_s_before"]
     assert_reported(decision)
 
 
@@ -135,6 +149,15 @@ def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
         "held-out completion rises": falling(held_out=learned(LONG)),
         "held-out completion holds": falling(held_out=80.0),
         "held-out completion wobbles": falling(held_out=lambda i: 80.0 + 4 * (-1) ** (i // 5)),
+        "laps hold": slowing(lap_time_s=lambda i: max(6.0, 8 - 2 * i / 60)),
+        "laps become faster": slowing(lap_time_s=lambda i: 8 - 2 * i / LONG),
+        "laps are slower by little": slowing(lap_time_s=lambda i: 6.0 if i <= 60 else 6.1),
+        "laps are slower now and then": slowing(lap_time_s=lambda i: 7.0 if i % 100 > 40 else 6.0),
+        "one lap was fast": slowing(lap_time_s=lambda i: 6.5 if i == 60 else 7.0),
+        "fast laps were not reliable": slowing(
+            lap_time_s=lambda i: 6.0 if i < 80 else 7.0, evaluated_lap_share=lambda i: 0.9 if i < 80 else 1.0
+        ),
+        "the return falls with the laps": slowing(mean_return=lambda i: 100 - 0.2 * i),
         "the return falls, too": falling(mean_return=lambda i: 100 - 0.2 * i),
     }.items(),
     ids=lambda rows: rows[0],

@@ -1,0 +1,98 @@
+"""Trends over the rows of a run: moving averages, and what the parts of `stopping=entropy` read in them."""
+
+import math
+
+from deepracer_exp.config.stopping import CollapsedRule, LapsSlowerRule, NotLearningRule, OverfittingRule
+
+Found = tuple[str, dict[str, float]]
+"""Why a rule applies, in words, and what it compared."""
+
+
+class Average:
+    """A moving average over the last known values of a column; it stays where a row has none."""
+
+    def __init__(self, window: int):
+        self._window = window
+        self._known: list[float] = []
+        self._averages: list[float | None] = []
+        self.first = math.nan
+        self.best, self._worst = -math.inf, math.inf
+
+    def add(self, value: float | None) -> None:
+        """Add the value of the newest row, None or NaN where it has none."""
+        if value is not None and math.isfinite(value):
+            self._known = [*self._known, value][-self._window :]
+        average = sum(self._known) / self._window if len(self._known) == self._window else None
+        if average is not None:
+            if math.isinf(self.best):
+                self.first = average
+            self.best, self._worst = max(self.best, average), min(self._worst, average)
+        self._averages.append(average)
+
+    def known(self, patience: int) -> bool:
+        """Return whether there is an average before the last `patience` rows."""
+        return len(self._averages) > patience and self._averages[-patience - 1] is not None
+
+    @property
+    def now(self) -> float:
+        """The newest average, which must be known."""
+        (last,) = self.last(1)
+        return last
+
+    @property
+    def range(self) -> float:
+        """Difference of the highest and the lowest average."""
+        return self.best - self._worst
+
+    def last(self, rows: int) -> list[float]:
+        """Return the averages of the last rows."""
+        return [average for average in self._averages[-rows:] if average is not None]
+
+    def bests(self, patience: int) -> tuple[float, float]:
+        """Return the highest average before the last `patience` rows, and within them."""
+        before = (average for average in self._averages[:-patience] if average is not None)
+        return max(before), max(self.last(patience))
+
+
+def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Found | None:
+    """Return why a policy that has become almost deterministic and drives badly should end."""
+    highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
+    if highest >= rule.entropy_floor or best >= rule.completion_poor:
+        return None
+    why = f"entropy at {highest:.1%} with {best:.0f}% completion"
+    return why, {"entropy": highest, "completion": best}
+
+
+def not_learning(rule: NotLearningRule, entropy: Average, completion: Average) -> Found | None:
+    """Return why a policy that has hardly changed since the start should end."""
+    lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
+    start = completion.first
+    if lowest <= rule.entropy_near or best - start > rule.completion_gain or best >= rule.completion_poor:
+        return None
+    why = f"entropy still at {lowest:.1%}, completion {start:.1f}% at the start and {best:.1f}% since"
+    return why, {"entropy": lowest, "completion_start": start, "completion": best}
+
+
+def overfits(rule: OverfittingRule, held_out: Average, returns: Average) -> Found | None:
+    """Return why a policy that improves on the training's conditions only should end."""
+    before, since = held_out.bests(rule.patience)
+    lowest_return = returns.best - rule.return_drop * returns.range
+    if since > before - rule.held_out_drop or returns.now < lowest_return:
+        return None
+    why = f"held-out completion fell from {before:.0f}% to {since:.0f}% while the return holds"
+    completions = {"held_out_completion_before": before, "held_out_completion_since": since}
+    return why, completions | {"return": returns.now, "return_best": returns.best}
+
+
+def laps_slower(rule: LapsSlowerRule, speed: Average, returns: Average) -> Found | None:
+    """Return why a policy whose evaluated laps have become slower while its return holds should end.
+
+    `speed` is 1 / lap time, 1/s, of evaluations that completed `RELIABLE` of their laps.
+    """
+    before, since = speed.bests(rule.patience)
+    lowest_return = returns.best - rule.return_drop * returns.range
+    if since * (1 + rule.slower) > before or returns.now < lowest_return:
+        return None
+    laps = f"evaluated laps took {1 / before:.2f} s and have taken {1 / since:.2f} s or more since"
+    lap_times = {"lap_time_s_before": 1 / before, "lap_time_s_since": 1 / since}
+    return f"{laps}, while the return holds", lap_times | {"return": returns.now, "return_best": returns.best}
