@@ -12,6 +12,7 @@ from deepracer_exp.runs.files import BEST, RunRecord, read_config, run_folders, 
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.resolve import best_of
 from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, FIGURES, INTERRUPTED, read_result
+from deepracer_exp.tracks.boards import standings, what_it_sees
 
 COMMAND = "deepracer-exp"
 _RUNS = Path("runs")
@@ -42,9 +43,33 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
             if value is not None
         ]
         found.append(("Best checkpoint", f"{result.iteration:06d}"))
+        place = official_place(run.config, result.lap_time_s)
+        if place is not None:
+            found.append(("Official board", place))
     elif run.summary:
         found.append(("Evaluated", "never"))
     return [*found, ("State", state(run))]
+
+
+def official_place(config: Mapping[str, Any], mean_lap_s: float | None) -> str | None:
+    """Return where the mean of the evaluated laps would stand on the official board of a run's track, in words.
+
+    None: there is no complete lap, the run has several tracks, or its track has no board or is driven the other way.
+    """
+    track, protocol = config.get("track") or {}, config.get("evaluation") or {}
+    alone = track.get("direction") == "forward" and track.get("file") is None and track.get("knots") is None
+    if mean_lap_s is None or not alone or protocol.get("tracks") is not None:
+        return None
+    observation, penalty_s = config.get("observation") or {}, protocol.get("penalty_s") or {}
+    places = standings(
+        str(track.get("name")),
+        mean_lap_s=mean_lap_s,
+        best_lap_s=None,
+        car=str((config.get("car") or {}).get("name")),
+        sees=what_it_sees(observation.get("camera"), observation.get("lidar")),
+        off_track_penalty_s=penalty_s.get("off_track") if protocol.get("resets_per_lap") else None,
+    )
+    return places[0].words if places else None
 
 
 def state(run: RunRecord) -> str:

@@ -23,8 +23,9 @@ from deepracer_exp.runs.files import EVALUATIONS, FILMS
 from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
+from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 
-from .evaluator import Evaluator
+from .evaluator import Evaluator, tracks_of
 from .film import LapRecorder, best_attempt
 from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number
 
@@ -97,8 +98,17 @@ def write_evaluation(
     config: EvaluationConfig,
     stored: StoredPolicy,
     car: Mapping[str, Evaluation] | None = None,
+    places: Mapping[str, Sequence[Standing]] | None = None,
 ) -> Path:
-    """Write `evaluations/<time>.json` into a run's folder and return it; `car`: what `race_car_parts` returns.
+    """Write `evaluations/<time>.json` into a run's folder and return it.
+
+    Args:
+        folder: of the run.
+        evaluation: the results.
+        config: the protocol.
+        stored: the checkpoint.
+        car: what `race_car_parts` returns.
+        places: what `official_places` returns.
 
     Raises:
         RunFailed: the file cannot be written.
@@ -112,6 +122,8 @@ def write_evaluation(
     }
     if car is not None:
         content["real_car"] = car_figures(car)
+    if places:
+        content["boards"] = {track: [one.as_dict() for one in found] for track, found in places.items()}
     target = folder / EVALUATIONS
     with writing(target, failure=RunFailed):
         target.mkdir(exist_ok=True)
@@ -165,7 +177,8 @@ def evaluate_run(
     car = None
     if config.evaluation.real_car is not None:
         car = race_car_parts(run.experiment, config.evaluation, stored.networks.policy, evaluation)
-    file = write_evaluation(run.path, evaluation, config.evaluation, stored, car)
+    places = official_places(run.experiment, config.evaluation, evaluation)
+    file = write_evaluation(run.path, evaluation, config.evaluation, stored, car, places)
     known = trained_on(run.experiment, config.evaluation, evaluation)
     out.print(results_table(evaluation, config.evaluation, known, out))
     if car is not None:
@@ -173,6 +186,10 @@ def evaluate_run(
         out.print(car_table(car))
         for line in explain_controls(run.experiment, config.evaluation):
             out.print(f"  {line}", soft_wrap=True, highlight=False)
+    for track, found in places.items():
+        laps = next(one for one in evaluation.groups if one.track == track and one.condition == USUAL)
+        part = f"; {len(laps.lap_times_s)} of {len(laps.decided)} laps were complete" * (laps.lap_share < 1)
+        out.print(f"\n{found[0].words}{part}", soft_wrap=not out.is_terminal, highlight=False)
     out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
     files = {file: EVALUATIONS}
     if video is not None:
@@ -187,6 +204,36 @@ def evaluate_run(
     runs_dir = run.path.resolve().parent.parent
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
     return evaluation
+
+
+def official_places(
+    experiment: Experiment, config: EvaluationConfig, evaluation: Evaluation
+) -> dict[str, list[Standing]]:
+    """Return where the usual laps would stand on the official boards of each track that has any, the best known first.
+
+    Laps driven as the physical car does have no place: its racers drove in the simulator.
+    """
+    if config.real_car is not None:
+        return {}
+    courses, observation = tracks_of(experiment, config), experiment.observation
+    found = {}
+    for group in evaluation.groups:
+        course, mean_s = courses.get(group.track), group.mean_lap_time_s
+        if group.condition != USUAL or course is None or mean_s is None:
+            continue
+        if course.file is not None or course.knots is not None or course.direction == "reversed":
+            continue
+        places = standings(
+            course.name,
+            mean_lap_s=mean_s,
+            best_lap_s=float(group.lap_times_s.min()),
+            car=experiment.car.name,
+            sees=what_it_sees(observation.camera, observation.lidar),
+            off_track_penalty_s=config.penalty_s.off_track if config.resets_per_lap else None,
+        )
+        if places:
+            found[group.track] = places
+    return found
 
 
 def trained_on(experiment: Experiment, config: EvaluationConfig, evaluation: Evaluation) -> list[str]:

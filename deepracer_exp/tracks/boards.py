@@ -1,0 +1,182 @@
+"""The official leaderboards of the service's time trials, and where a lap would stand on them.
+
+`boards.csv` has the boards since March 2020, when the service's commands were limited to 4 m/s as they are today. Times
+before that do not compare.
+"""
+
+import csv
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from deepracer_exp.config.custom_files import CARS
+
+FILE = Path(__file__).with_name("boards.csv")
+_VERSION_5_SINCE = "2022"
+_ORDER = {"TOTAL_TIME": "total of", "AVG_LAP_TIME": "average of", "BEST_LAP_TIME": "best of"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A final leaderboard; its times are seconds a lap, with the penalties of the laps in them."""
+
+    world: str
+    date: str
+    """When the race began."""
+    board: str
+    """Name of the race."""
+    racers: int
+    timing: Literal["TOTAL_TIME", "AVG_LAP_TIME", "BEST_LAP_TIME"]
+    """What counted of the laps: their total, their average, or the best of them."""
+    laps: int
+    """Laps that counted."""
+    off_track_penalty_s: float | None
+    """Added each time a car left the track; None: not known."""
+    record_s: float
+    """The fastest single lap."""
+    winner_s: float
+    first_1_percent_s: float
+    """Of the last racer among the first 1 %; likewise the next two."""
+    first_10_percent_s: float
+    half_s: float
+
+    @property
+    def car(self) -> str:
+        """Return the option of the car that drove then: simulation version 5 came with 2022."""
+        return CARS[5 if self.date >= _VERSION_5_SINCE else 4]
+
+    @property
+    def terms(self) -> str:
+        """Return what counted, in words."""
+        return "best lap" if self.laps == 1 else f"{_ORDER[self.timing]} {self.laps} laps"
+
+    def place(self, lap_s: float) -> str:
+        """Return where a time would stand, as far as the board's figures say, after ``it would``."""
+        if lap_s <= self.winner_s:
+            return f"have won ({self.winner_s:.2f} s won)"
+        if lap_s <= self.first_1_percent_s:
+            return f"be among the first 1 % ({self.winner_s:.2f} s won)"
+        if lap_s <= self.first_10_percent_s:
+            ends = f"{self.first_1_percent_s:.2f} and {self.first_10_percent_s:.2f} s"
+            return f"be between the first 1 and 10 % ({ends})"
+        if lap_s <= self.half_s:
+            return f"be between the first 10 and 50 % ({self.first_10_percent_s:.2f} and {self.half_s:.2f} s)"
+        return f"be in the slower half ({self.half_s:.2f} s and more)"
+
+
+@cache
+def _boards() -> tuple[Board, ...]:
+    with FILE.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    return tuple(Board(**{name: _value(name, text) for name, text in row.items()}) for row in rows)
+
+
+def _value(name: str, text: str) -> Any:
+    if name in ("racers", "laps"):
+        return int(text)
+    return (float(text) if text else None) if name.endswith("_s") else text
+
+
+def boards_of(world: str) -> tuple[Board, ...]:
+    """Return the boards of a world, the oldest first.
+
+    A world with the ending `_ccw` is that of the race, resampled; one with `_cw` is driven the other way.
+    """
+    return tuple(board for board in _boards() if board.world == world.removesuffix("_ccw"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """Where the laps of a policy would stand on a board, and how they differ from those of its racers."""
+
+    board: Board
+    lap_s: float
+    """Mean of the complete laps, or the best of them where that counted and is known; penalties included."""
+    is_best: bool
+    """Whether it is the best of them."""
+    car: str
+    """The car that drove."""
+    sees: str
+    """What the policy sees, after ``from``."""
+    off_track: str | None
+    """What leaving the track costs, where that is not what it cost there."""
+
+    @property
+    def is_comparable(self) -> bool:
+        """Whether the car is that of the board's time."""
+        return self.car == self.board.car
+
+    @property
+    def words(self) -> str:
+        """Return it as a sentence."""
+        board = self.board
+        lap = f"a best lap of {self.lap_s:.2f} s" if self.is_best else f"{self.lap_s:.2f} s a lap"
+        differs = f"driven with {self.car} from {self.sees}, the board's racers "
+        differs += f"{f'with {board.car} ' * (not self.is_comparable)}from a camera"
+        if self.off_track is not None:
+            differs += f"; {self.off_track}"
+        if not self.is_comparable:
+            differs += f"; to compare, train with car={board.car}"
+        place = f"{lap} would {board.place(self.lap_s)}"
+        return f"{board.board} ({board.racers:,} racers, {board.terms}): {place}; {differs}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON types."""
+        return {
+            **vars(self.board),
+            "board_car": self.board.car,
+            "lap_s": self.lap_s,
+            "car": self.car,
+            "sees": self.sees,
+            "comparable": self.is_comparable,
+            "words": self.words,
+        }
+
+
+def standings(
+    world: str,
+    *,
+    mean_lap_s: float,
+    best_lap_s: float | None,
+    car: str,
+    sees: str,
+    off_track_penalty_s: float | None,
+) -> list[Standing]:
+    """Return where laps would stand on each board of a world, driven in the order of its waypoints.
+
+    Boards of the car's own time come first, and of these the one with most racers.
+
+    Args:
+        world: name of a world of the service.
+        mean_lap_s: mean of the complete laps.
+        best_lap_s: the fastest of them; None: not known, and the mean counts instead.
+        car: name of the car.
+        sees: what the policy sees, such as `a camera` or `features`.
+        off_track_penalty_s: what it cost to leave the track; None: it ended the lap.
+    """
+    found = []
+    for board in boards_of(world):
+        best_s = best_lap_s if board.timing == "BEST_LAP_TIME" else None
+        there = board.off_track_penalty_s
+        off_track = None
+        if there is not None and there != off_track_penalty_s:
+            here = "it ends a lap" if off_track_penalty_s is None else f"{off_track_penalty_s:g} s"
+            off_track = f"leaving the track cost {there:g} s there, here {here}"
+        found.append(
+            Standing(
+                board=board,
+                lap_s=mean_lap_s if best_s is None else best_s,
+                is_best=best_s is not None,
+                car=car,
+                sees=sees,
+                off_track=off_track,
+            )
+        )
+    return sorted(found, key=lambda one: (not one.is_comparable, -one.board.racers))
+
+
+def what_it_sees(camera: object, lidar: object) -> str:
+    """Return what a policy sees in words, by whether its observation has a camera and a LIDAR."""
+    seen = [name for name, one in (("a camera", camera), ("a LIDAR", lidar)) if one is not None]
+    return " and ".join(seen) or "features"
