@@ -1,5 +1,6 @@
 """A model that was trained with the service, as a run of our own."""
 
+import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from deepracer_exp.config.custom_files import (
 )
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.imported_options import import_files, remove_options
+from deepracer_exp.config.job_overrides import job_overrides, several_of
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.config.overrides import key_of, override_line
 from deepracer_exp.deepracer.model_archive import StoredModel, read_model
@@ -92,14 +94,19 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
     load_reward_source(experiment.reward)
     own = {key_of(line): line for line in changes}
     options = import_files(files, name, composition.mapping, [*network, *seen], path, own)
+    # No option file can choose several tracks, so that the experiment has none of them.
+    several = several_of(job_overrides(files.workers, own)[0])
     applied = [note for note in composition.notes if note.startswith(_SETTINGS)]
     try:
-        experiment, composition = compose_experiment([f"experiment={name}", *changes])
+        experiment, composition = compose_experiment([f"experiment={name}", *several, *changes])
         result = store_run(experiment, composition, networks, f"imported from {model.source}")
     except BaseException:
         remove_options(options)
         raise
     notes = [f"{model.source}: {', '.join([*seen, *network])}", *model.notes]
+    if several:
+        beside = shlex.join(line.replace("'", "") for line in several)
+        notes.append(f"experiment={name} has the default track: give its tracks beside it, {beside}")
     notes = list(dict.fromkeys([*notes, *_remarks(files, model, absent), *applied]))
     return Imported(result.folder, options, notes, model.has_logs)
 

@@ -114,6 +114,31 @@ def test_a_model_becomes_a_run_and_nothing_of_it_is_run(call, tmp_path, networks
     assert len(list(tmp_path.glob("runs/mine/*"))) == 1
 
 
+def test_a_model_of_several_tracks_is_a_run_on_all_of_them(call, tmp_path, weights):
+    settings = b"WORLD_NAME: [Oval_track, Bowtie_track]\nREVERSE_DIR: ['False', 'True']\n"
+    files = files_of(weights) | {"training_params.yaml": settings}
+    write_folder(tmp_path / "sent", files)
+    ended = call("import", "sent", "--name", "mine", "tracking=off")
+    assert ended.code == 0, ended.stderr
+    tracks = StoredRun(ended.folder).experiment.tracks
+    assert {name: track.direction for name, track in tracks.items()} == {
+        "Oval_track": "forward",
+        "Bowtie_track": "reversed",
+    }
+    (used,) = [
+        line for line in ended.stderr.splitlines() if "used as track=[Oval_track,Bowtie_track]" in line
+    ]
+    (beside,) = [line for line in ended.stderr.splitlines() if "give its tracks beside it" in line]
+    assert used.startswith("training_params.yaml")
+    words = beside.partition("beside it, ")[2].split()
+    given = [word.strip("'") for word in words]
+    assert compose_experiment(given)[0].tracks == tracks
+    again = call("import", "sent", "--name", "other", "tracking=off", "track=Oval_track")
+    assert again.code == 0, again.stderr
+    (folder,) = (tmp_path / "runs" / "other").iterdir()
+    assert list(StoredRun(folder).experiment.tracks) == ["Oval_track"]
+
+
 @pytest.mark.parametrize("pack", [tar_of, zip_of, None], ids=["tar.gz", "zip", "folder"])
 def test_an_archive_holds_what_the_folder_does(tmp_path, pack):
     tensors = {"a/kernel": np.arange(6, dtype=np.float32).reshape(2, 3), "b/bias": np.ones(4, np.float32)}
