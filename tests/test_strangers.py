@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -230,6 +231,16 @@ def test_what_a_study_stores_counts_once_its_user_has_named_the_same(account, ov
     assert composed(stored=True) == (named, ())
     account()
     assert composed(stored=True)[0] == plain
+
+
+@pytest.mark.parametrize("entity", [(), ("tracking.entity=team",)])
+def test_the_words_that_choose_a_foreign_project_are_accepted_as_they_stand(account, entity):
+    chosen = ("tracking=wandb", "tracking.project=season", *entity)
+    *_, (note,) = (compose_entry("train", chosen, stored=True).notes,)
+    words = shlex.split(note.partition("to use it, give ")[2])
+    assert words == list(chosen)
+    assert compose_entry("train", words).mapping["tracking"]["kind"] == "wandb"
+    assert compose_entry("train", chosen, stored=True).notes == ()
 
 
 def test_the_record_of_an_account_holds_no_text_and_is_its_own(call, account, tmp_path):

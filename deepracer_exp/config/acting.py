@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import importlib.machinery
 import os
+import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -135,15 +136,26 @@ def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
         if one.is_own or one.key == REWARD:
             continue
         group, key, *_ = one.key.split(".")
+        advice = "repeat it to use it"
         if group == "tracking":
+            if (
+                config[group].get("kind") == "wandb"
+            ):  # whose keys the tracker taken in its place does not have
+                advice = f"to use it, give {_wandb_words(config[group])}"
             config[group] = dict(_PLAIN_TRACKING)
         else:
             config[group] = {**config[group], key: {"kind": "local"} if key == "executor" else None}
         left_out.append(
             f"{one.key}={without_passwords(one.text)}: not taken over from {where}, because you have not used it "
-            "before; repeat it to use it"
+            f"before; {advice}"
         )
     return left_out
+
+
+def _wandb_words(tracking: Mapping[str, Any]) -> str:
+    """Return the overrides that choose a project in Weights & Biases, for a shell."""
+    keys = [key for key in ("project", "entity") if tracking.get(key) is not None]
+    return shlex.join(["tracking=wandb", *(f"tracking.{key}={tracking[key]}" for key in keys)])
 
 
 def refuse_reward(file: str | None, where: str, copy: Path | None = None) -> None:
