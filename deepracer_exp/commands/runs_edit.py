@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -206,7 +207,7 @@ def _delete(args: argparse.Namespace) -> int:
     from deepracer_exp.runs.clean import deletable, remove, total
     from deepracer_exp.runs.files import read_run_id
     from deepracer_exp.runs.resolve import resolve
-    from deepracer_exp.tracking.delivery import mark_deleted
+    from deepracer_exp.tracking.delivery import marked_deleted
 
     runs, overrides = runs_and_overrides(args)
     stores = read_stores(overrides)
@@ -227,9 +228,11 @@ def _delete(args: argparse.Namespace) -> int:
             return 0
     for item in items:
         run_id = read_run_id(item.run)
+        mark: AbstractContextManager[None] = nullcontext()
         if run_id is not None:
-            mark_deleted(item.run, run_id, stores.uri, stores.runs_dir)
-        if not remove(item):
-            raise BadInput(f"{item.run}: a training or a clone has started meanwhile; it was not deleted")
+            mark = marked_deleted(item.run, run_id, stores.uri, stores.runs_dir)
+        with mark:
+            if not remove(item):
+                raise BadInput(f"{item.run}: a training or a clone has started meanwhile; it was not deleted")
     print(f"deleted {count(len(items), 'run')}")
     return 0

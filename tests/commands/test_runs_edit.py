@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.runs import clean
 from deepracer_exp.runs.checkpoint_files import pin
 from deepracer_exp.tracking.store import resolve_store
 from tests.tracking.conftest import Season, client, empty_database, free_port, season, server
@@ -86,6 +88,21 @@ def test_a_run_is_deleted_here_and_in_mlflow_only_with_yes(recorded, client, cal
     assert call("runs", "delete", recorded.name, "--yes").code == 0
     assert not recorded.exists()
     assert client.get_run(run_id).info.lifecycle_stage == "deleted"
+
+
+@pytest.mark.parametrize("why", ["in use", "cannot be removed"])
+def test_a_run_that_cannot_be_removed_stays_active_in_mlflow(recorded, client, call, monkeypatch, why):
+    def removed(_: object) -> bool:
+        if why == "in use":
+            return False
+        raise RunFailed("checkpoints: cannot be removed: Permission denied")
+
+    monkeypatch.setattr(clean, "remove", removed)
+    run_id = json.loads((recorded / "tracking.json").read_text())["run_id"]
+    ended = call("runs", "delete", recorded.name, "--yes")
+    assert ended.code == (2 if why == "in use" else 3)
+    assert recorded.is_dir()
+    assert client.get_run(run_id).info.lifecycle_stage == "active"
 
 
 def test_what_is_needed_or_elsewhere_is_never_deleted(season, call, tmp_path):
