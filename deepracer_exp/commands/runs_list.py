@@ -109,7 +109,9 @@ def _columns(rows: "Sequence[Row]") -> list[str]:
 
 
 def _check_column(what: str, column: str, columns: Sequence[str]) -> None:
-    if column not in columns and not column.startswith("tag."):
+    from deepracer_exp.runs.labels import USER_TAG
+
+    if column not in columns and not column.startswith(USER_TAG):
         raise BadInput(f"{what}: no such column{nearest(column, columns)}; accepted: {', '.join(columns)}")
 
 
@@ -153,15 +155,17 @@ def _json(value: Any) -> Any:
 def _print_table(rows: "Sequence[Row]") -> None:
     from rich.table import Table
 
+    from deepracer_exp.runs.labels import USER_TAG
+
     table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
     table.columns[0].overflow = "fold"
     for name in ("score (s)", "laps", "best lap (s)", "age"):
         table.add_column(name, justify="right")
     several = len({row["user"] for row in rows}) > 1
-    labelled = [key for key in _columns(rows) if key in ("name", "note") or key.startswith("tag.")]
+    labelled = [key for key in _columns(rows) if key in ("name", "note") or key.startswith(USER_TAG)]
     shown = [*["user"] * several, *(key for key in labelled if any(row.get(key) for row in rows))]
     for name in shown:
-        table.add_column(name.removeprefix("tag."), overflow="fold")
+        table.add_column(name.removeprefix(USER_TAG), overflow="fold")
     now = datetime.datetime.now(datetime.UTC)
     for row in rows:
         began = datetime.datetime.fromisoformat(row["began"])

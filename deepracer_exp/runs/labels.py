@@ -16,6 +16,8 @@ from .files import LABELS
 
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,59}")
 _LONGEST = 2000
+USER_TAG = "tag."
+"""Beginning of the names of people's own tags, as columns of lists and as tags in MLflow."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,11 @@ class Labels:
     """By which lists show the run and commands find it, beside its folder's name."""
     note: str | None = None
     tags: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def named_tags(self) -> dict[str, str]:
+        """Return the tags with `USER_TAG` before their keys."""
+        return {f"{USER_TAG}{key}": value for key, value in self.tags.items()}
 
 
 _LABELS = TypeAdapter(Labels)

@@ -14,9 +14,6 @@ COLUMNS = ("run", "name", "state", "score_s", "laps", "best_lap_s", "began", "us
 """Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `score_s` the
 race score of the best checkpoint and `best_lap_s` the fastest exploring lap, both in seconds."""
 
-TAG = "tag."
-"""Beginning of the columns of tags."""
-
 Row = dict[str, Any]
 
 
@@ -39,7 +36,7 @@ def _of_folder(folder: Path, is_held: Callable[[Path], bool]) -> Row:
     row |= {"score_s": (summary.get("best") or {}).get("eval_race_score_s"), "laps": summary.get("laps")}
     row |= {"best_lap_s": summary.get("best_lap_time_s"), "name": labels.name, "note": labels.note}
     row |= {key: machine.get(key) for key in ("user", "host")}
-    return row | {f"{TAG}{key}": value for key, value in labels.tags.items()}
+    return row | labels.named_tags
 
 
 def _began_s(folder: Path) -> float:

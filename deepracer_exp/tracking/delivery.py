@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.files import METRICS, SUMMARY, TRACKING, read_metrics, read_object, read_run_id
-from deepracer_exp.runs.labels import Labels, read_labels
+from deepracer_exp.runs.labels import USER_TAG, Labels, read_labels
 from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
 
 from .calls import StoreRefusedError, StoreUnavailableError
-from .metadata import END_TAG, NAME, USER_NOTE, USER_TAG, label_tags
+from .metadata import END_TAG, NAME, USER_NOTE, label_tags
 from .metrics import now_ms, points_at, points_of
 from .store import Store, has_store, open_client, resolve_store
 from .tracking_file import Status, TrackedRun, TrackingFile, read_tracked_run
@@ -155,8 +155,12 @@ def recorded_labels(run_id: str, uri: str | None, runs_dir: Path) -> Labels:
     return Labels(tags.get(NAME), tags.get(USER_NOTE), own)
 
 
-def mark_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) -> None:
-    """Mark a run as deleted in the store, as of `deliver`, that recorded it; `mlflow gc` removes it for good.
+@contextmanager
+def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) -> Iterator[None]:
+    """Mark a run as deleted in the store, as of `deliver`, that recorded it, once the block has removed its folder.
+
+    The store is asked before, so that nothing is removed where it does not answer. `mlflow gc` removes the run there
+    for good.
 
     Raises:
         BadInput: the run was recorded in another store, or this one does not answer.
@@ -167,9 +171,13 @@ def mark_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) ->
             f"{run_dir}: was recorded in {recorded}; give tracking.uri={recorded} to delete it there"
         )
     if not has_store(uri, runs_dir):
+        yield
         return
     with open_client(f"{run_dir}: nothing was deleted", uri, runs_dir) as client:
-        if client.get_run(run_id).info.lifecycle_stage == "active":
+        is_active = client.get_run(run_id).info.lifecycle_stage == "active"
+    yield
+    if is_active:
+        with open_client(f"{run_dir}: deleted here, but not marked in MLflow", uri, runs_dir) as client:
             client.delete_run(run_id)
 
 

@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.runs.labels import USER_TAG
 from deepracer_exp.runs.listing import Row, iso_time
 
 from .calls import pages
-from .metadata import END_TAG, HOST, NAME, USER_NOTE, USER_TAG
+from .metadata import END_TAG, HOST, NAME, USER_NOTE
 from .metrics import BEST, METRICS
 from .store import open_client
 from .study_run import KIND

@@ -50,8 +50,8 @@ def param_text(value: Scalar) -> str:
 NOTE = "mlflow.note.content"
 """Tag of a run or an experiment that MLflow shows as its description."""
 
-NAME, USER_NOTE, USER_TAG = "mlflow.runName", "note", "tag."
-"""Tags of a run that people set: its name, a note, and the beginning of the keys of their own tags."""
+NAME, USER_NOTE = "mlflow.runName", "note"
+"""Tags of a run that people set: its name and a note; their own tags have keys that begin with `USER_TAG`."""
 
 PARENT = "mlflow.parentRunId"
 """Tag of a run that is nested under another one in the UI."""
@@ -138,7 +138,7 @@ def label_tags(labels: Labels) -> dict[str, str]:
     """Return the tags of a run that say what people say of it."""
     given = {NAME: labels.name, USER_NOTE: labels.note}
     tags = {key: value for key, value in given.items() if value is not None}
-    return tags | {f"{USER_TAG}{key}": value for key, value in labels.tags.items()}
+    return tags | labels.named_tags
 
 
 _COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.constants", "budget.env_steps")
