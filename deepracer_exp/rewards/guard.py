@@ -6,13 +6,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 _WALL_FACTOR = 10
 """Wall-clock limit over CPU limit: the machine may be that busy, and `sleep` uses no CPU."""
-_STREAMS = ("stdin", "stdout", "stderr")
+_STREAMS = {"stdin": 0, "stdout": 1, "stderr": 2}
+"""The standard streams and the numbers of their files."""
 _REFUSED: tuple[tuple[Any, str], ...] = (
     *(
         (signal, name)
@@ -178,15 +180,11 @@ class Guard:
             if getattr(sys, name, None) is not stream:
                 replaced.append(f"sys.{name}")
                 setattr(sys, name, stream)
-        closed = [
-            f"sys.{name}"
-            for name, stream in self._streams.items()
-            if not self._closed[name] and _is_closed(stream)
-        ]
-        if closed:  # further output goes to the stream that is left
-            out, err = sys.stdout, sys.stderr
-            sys.stdout = err if _is_closed(out) else out
-            sys.stderr = out if _is_closed(err) else err
+        closed = []
+        for name, stream in self._streams.items():
+            if not self._closed[name] and _is_closed(stream):
+                closed.append(f"sys.{name}")
+                _open_again(name, stream)
         for done, names_of in ("replaced", replaced), ("closed", closed):
             if names_of:
                 return f"{done} {names_of[0]}, which everything else here uses too"
@@ -194,4 +192,24 @@ class Guard:
 
 
 def _is_closed(stream: Any) -> bool:
-    return bool(getattr(stream, "closed", False))
+    try:
+        return bool(getattr(stream, "closed", False))
+    except ValueError:  # its buffer was detached
+        return True
+
+
+def _open_again(name: str, stream: Any) -> None:
+    """Replace a closed standard stream: by one to the same file, which Python leaves open, or by a stream that is left.
+
+    One that is not the interpreter's own, such as a notebook's, has no file to open.
+    """
+    if stream is getattr(sys, f"__{name}__"):
+        with suppress(OSError):
+            mode = "r" if name == "stdin" else "w"
+            again = open(_STREAMS[name], mode, 1, "utf-8", "backslashreplace", closefd=False)  # noqa: SIM115
+            setattr(sys, f"__{name}__", again)
+            setattr(sys, name, again)
+            return
+    left = [other for other in (sys.stdout, sys.stderr) if not _is_closed(other)]
+    if left and name != "stdin":
+        setattr(sys, name, left[0])
