@@ -143,7 +143,8 @@ def supervised(call: Callable[[], int]) -> int:
 
     Reward functions run within a command's process. They can exit it (`os._exit(0)`), crash it or damage the
     interpreter. Hence an exit code counts only if it comes through a pipe, after the call has returned. A process that
-    ends in another way has failed; one line says so, from a process in which no reward has run.
+    ends in another way has failed; one line says so, from a process in which no reward has run. After a signal it was
+    interrupted, however it ended: some libraries abort the process if Ctrl-C comes while they are loaded.
 
     Args:
         call: returns 0 to 255; an exception ends the child with a traceback.
@@ -169,10 +170,14 @@ def supervised(call: Callable[[], int]) -> int:
     os.close(result)
     os.close(hears)
 
+    interruptions: list[int] = []
+
     def pass_on(signum: int, _: FrameType | None) -> None:
         """Give the child a signal that was sent to this process alone; Ctrl-C in a terminal reaches both."""
+        interruptions.append(signum)
         if not _has_heard(heard, signum):
-            os.kill(child, signum)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.kill(child, signum)
 
     for signum in _SIGNALS:
         signal.signal(signum, pass_on)
@@ -187,6 +192,9 @@ def supervised(call: Callable[[], int]) -> int:
     if -ended in _SIGNALS:
         return 128 - ended
     how = f"left it with exit code {ended}" if ended >= 0 else f"was ended by {signal.Signals(-ended).name}"
+    if interruptions:
+        print(f"deepracer-exp: interrupted; the process {how} before the command was done", file=sys.stderr)
+        return 128 + interruptions[0]
     print(
         f"deepracer-exp: the process {how} before the command was done; a reward function can do that",
         file=sys.stderr,

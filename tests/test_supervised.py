@@ -78,6 +78,21 @@ def test_a_signal_is_heard_once_whether_one_process_or_the_group_gets_it(whom, s
     assert process.communicate() == ("", "")
 
 
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("dies", "how"), [("os.abort()", "was ended by SIGABRT"), ("os._exit(0)", "left it with exit code 0")]
+)
+def test_a_signal_that_was_passed_on_is_the_exit_code_however_the_child_dies_of_it(signum, dies, how) -> None:
+    hears = "signal.signal(signal.SIGINT, dies); signal.signal(signal.SIGTERM, dies)"
+    body = f"dies = lambda *_: {dies}; {hears}; print('listens', flush=True); time.sleep(600)"
+    process = command(body)
+    assert process.stdout.readline() == "listens\n"
+    os.killpg(process.pid, signum)
+    assert process.wait() == 128 + signum
+    line = f"deepracer-exp: interrupted; the process {how} before the command was done\n"
+    assert process.communicate() == ("", line)
+
+
 def test_the_child_dies_with_its_supervisor() -> None:
     process = command("print(os.getpid(), flush=True); time.sleep(600)")
     child = int(process.stdout.readline())
