@@ -11,7 +11,7 @@ from typing import Any
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.runs.trace import read_trace
-from deepracer_exp.tracking.metrics import BEST, metric_name
+from deepracer_exp.tracking.metrics import BEST, MACHINE, metric_name
 from deepracer_exp.training.metrics import TIMES
 
 Row = Mapping[str, Any]
@@ -60,8 +60,8 @@ def different_points(rows: Sequence[Row], history: History) -> str | None:
         for key, value in row.items():
             if key != "env_steps" and value is not None and math.isfinite(value):
                 wanted.setdefault(metric_name(key), []).append((row["env_steps"], float(value)))
-    # The evaluation of the best checkpoint, recorded at the end, is in no row.
-    for key in {key for key in {**wanted, **history} if not key.startswith(BEST)}:
+    # The evaluation of the best checkpoint, recorded at the end, is in no row, and the use of the machine neither.
+    for key in {key for key in {**wanted, **history} if not key.startswith((BEST, MACHINE))}:
         expected, found = (_points(key, of.get(key, ())) for of in (wanted, history))
         if expected != found:
             lacking, more = (sorted(points)[:3] for points in (expected - found, found - expected))

@@ -52,6 +52,9 @@ MLflow's pages group metrics by what precedes the last slash and sort the groups
 Within `race` the order of recording matters: the comparison of runs opens with the first metric.
 """
 
+MACHINE = "system/"
+"""Prefix of the use of the machine: recorded beside the rows, no part of the run's record."""
+
 BEST = "race/best/"
 """Prefix of the evaluation of the best checkpoint, recorded when the run ends."""
 

@@ -234,6 +234,7 @@ def test_a_point_twice_or_not_at_all_is_a_difference() -> None:
         "train/completion": [(20, 2.0), (10, 1.0)],
         "train/best_lap_time_s": [(20, 9.0)],
         "time/wall_clock_s": [(10, 0.1), (20, 0.7)],
+        "system/system_memory_usage_percentage": [(10, 7.0), (10, 8.0)],
     }
     assert different_points(rows, history) is None
     for key, points in (

@@ -10,7 +10,7 @@ from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.runs.files import read_metrics
-from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.tracking.metrics import MACHINE, metric_name
 from deepracer_exp.training.metrics import TIMES
 
 ITERATIONS = 14
@@ -31,7 +31,8 @@ def points_of(where, runs_dir, folder) -> dict[str, list[tuple[int, float]]]:
     keys = client.get_run(run_id).data.metrics
     assert client.get_run(run_id).info.status == "FINISHED"
     found = {key: [(p.step, p.value) for p in client.get_metric_history(run_id, key)] for key in keys}
-    return {key: points for key, points in found.items() if key not in map(metric_name, TIMES)}
+    times = [metric_name(column) for column in TIMES]
+    return {key: points for key, points in found.items() if key not in times and not key.startswith(MACHINE)}
 
 
 def killed_after(start, arguments, ready) -> None:
