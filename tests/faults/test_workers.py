@@ -6,25 +6,23 @@ import time
 import pytest
 
 MODES = pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
-SOON_S = 30.0
+DEATHS_ALONE = ("collector.hang_timeout_s=600",)
+"""The watchdog would end a worker later than the tests wait: what ends the run is that the death is noticed."""
 HANGS_SOON = ("collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
 LEARNS_LONG = ("algorithm.epochs=100", "algorithm.batch_size=32")
 """Little driving and much learning, so that a signal interrupts the update or the sending of weights."""
 
 
 def _lost(training, *words):
-    began = time.monotonic()
     ended = training.end()
-    took_s = time.monotonic() - began
     ended.assert_run_failed(*words)
     training.assert_nothing_left()
-    assert took_s < SOON_S
     return ended
 
 
 @MODES
 def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
-    training = start_training(f"collector={mode}")
+    training = start_training(f"collector={mode}", *DEATHS_ALONE)
     training.wait_for_iterations(2)
     victim = training.workers()[1]
     victim.send_signal(signal.SIGKILL)
@@ -44,7 +42,7 @@ def test_a_worker_that_stops_is_ended_and_named(start_training, mode):
 @MODES
 @pytest.mark.slow
 def test_a_worker_killed_while_it_starts_ends_the_run(start_training, mode):
-    training = start_training(f"collector={mode}")
+    training = start_training(f"collector={mode}", *DEATHS_ALONE)
     training.wait_for_worker().send_signal(signal.SIGKILL)
     _lost(training, "orker 0")
 
@@ -61,7 +59,7 @@ def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("signum", "options", "words"),
-    [(signal.SIGKILL, (), "died by signal SIGKILL"), (signal.SIGSTOP, HANGS_SOON, "took no ")],
+    [(signal.SIGKILL, DEATHS_ALONE, "died by signal SIGKILL"), (signal.SIGSTOP, HANGS_SOON, "took no ")],
     ids=["killed", "stopped"],
 )
 def test_a_worker_lost_while_the_learner_learns_ends_the_run(start_training, signum, options, words):
@@ -105,7 +103,7 @@ def test_workers_that_hang_do_not_outlive_a_killed_training(start_training, tmp_
 
 @pytest.mark.slow
 def test_a_fork_server_that_is_killed_ends_the_run(start_training):
-    training = start_training()
+    training = start_training(*DEATHS_ALONE)
     training.wait_for_iterations(1)
     training.workers()[0].parent().send_signal(signal.SIGKILL)
     _lost(training, "collector worker")
