@@ -127,6 +127,9 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     ]
     if others:
         found.append(("Other courses in it", ", ".join(others)))
+    several = trainings(view)
+    if several is not None:
+        found.append(("Trainings in it", several))
     if recording.metadata is not None:
         actions = recording.metadata.actions
         space = "continuous" if not actions else f"{len(actions)} actions"
@@ -146,6 +149,15 @@ def facts(view: LogView) -> list[tuple[str, str]]:
         streams = count(driven["stream"].nunique(), "evaluation")
         found.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))
     return found
+
+
+def trainings(view: LogView) -> str | None:
+    """Return which trainings a recording is made of, in words; None: of one."""
+    rounds = view.recording.rounds
+    if not rounds:
+        return None
+    listed = ", ".join(f"{one.name} from iteration {one.first_iteration}" for one in rounds)
+    return f"{len(rounds)}, taken as clones one after the other: {listed}"
 
 
 def headline(view: LogView) -> str:

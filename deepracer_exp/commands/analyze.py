@@ -140,7 +140,7 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.findings import findings
     from deepracer_exp.analysis.lap_replay import laps_of_log
     from deepracer_exp.analysis.log_report import LogPage, write_page
-    from deepracer_exp.analysis.log_tables import headline
+    from deepracer_exp.analysis.log_tables import headline, trainings
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
@@ -179,6 +179,9 @@ def _analyze(args: argparse.Namespace) -> int:
             write_line(Path(args.line), line[0])
 
     print(f"{view.name}: {headline(view)}")
+    several = trainings(view)
+    if several is not None:
+        print(f"     trainings in it: {several}. One alone: give its files in a folder of their own")
     for number, one in enumerate(found, 1):
         print(f"{number:3d}  {one.sentence}")
     for sentence in replay.sentences if replay is not None else ():

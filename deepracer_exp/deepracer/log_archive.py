@@ -141,6 +141,12 @@ def label(name: str) -> str:
     return _ENDINGS.sub("", name) or name
 
 
+def without_worker(name: str) -> str:
+    """Return the name of a log with # for the number of its worker: the same for all workers of a training."""
+    found = _WORKER.search(name)
+    return name if found is None else f"{name[: found.start(1)]}#{name[found.end(1) :]}"
+
+
 def same_job(one: str, other: str) -> bool:
     """Return whether two names belong to one job, by the time stamp in them or the id after it."""
     stamps = [set(_STAMP.findall(name)) for name in (one, other)]

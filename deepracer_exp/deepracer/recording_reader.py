@@ -26,7 +26,18 @@ from .deduplicate import (
     rows_also_in,
     steps_of,
 )
-from .log_archive import PACKED, LogFile, Place, label, log_folder, named_parts, natural, place_of, same_job
+from .log_archive import (
+    PACKED,
+    LogFile,
+    Place,
+    label,
+    log_folder,
+    named_parts,
+    natural,
+    place_of,
+    same_job,
+    without_worker,
+)
 from .recording import (
     METRICS_COLUMNS,
     TRAINING,
@@ -168,7 +179,7 @@ class _Assembly:
         """Add the drives of a log, unless they are known already from CSVs or another log."""
         file, place = files[0], _place(files, log)
         if place.kind == TRAINING:
-            name = place.name.replace(str(place.worker), "#") if place.worker else place.name
+            name = without_worker(place.name)
             if log.job:
                 # All workers of a job began with the same checkpoint; the next job in the same folder with another.
                 name = f"{log.job}, {first_checkpoint(log)}"

@@ -10,6 +10,7 @@ import pytest
 from deepracer_exp.analysis import log_report
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs import own_recording
+from tests.deepracer.made_up_logs import drives, log_text
 from tests.page_html import Html
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
@@ -75,6 +76,20 @@ def test_logs_from_elsewhere_have_their_page_in_the_current_folder(run_dir, call
     assert ended.code == 0, ended.stderr
     assert "from-aws-analysis.html" in ended.stdout
     assert "control steps" in findings_told(tmp_path / "from-aws-analysis.html")
+
+
+def test_several_trainings_in_a_folder_are_named(call, tmp_path):
+    (tmp_path / "both").mkdir()
+    for seed, name in enumerate("ab"):
+        log = log_text(drives([0, 1], seed=seed))
+        (tmp_path / "both" / f"worker_0-{name}.log").write_text(log)
+    ended = call("analyze", "both")
+    assert ended.code == 0, ended.stderr
+    (line,) = [line for line in ended.stdout.splitlines() if "trainings in it: 2" in line]
+    assert re.search(r"worker_#-a from iteration 0, .*worker_#-b from iteration 1\.", line)
+    assert "Trainings in it" in (tmp_path / "both-analysis.html").read_text()
+    (tmp_path / "both" / "worker_0-b.log").unlink()
+    assert "trainings in it" not in call("analyze", "both").stdout
 
 
 def test_a_target_has_its_chance_and_others_stand_beside_it(run_dir, call):

@@ -150,6 +150,21 @@ def test_jobs_in_one_place_that_began_with_other_checkpoints_are_trainings_of_th
     assert set(made.training(recording)["worker"]) == {0, 1}
 
 
+@pytest.mark.parametrize("names", [("a", "b"), ("20220101", "20220111")])
+def test_logs_of_workers_with_one_name_are_one_training_and_of_two_names_two(tmp_path, names):
+    for number, name in enumerate(names):
+        for worker in range(2):
+            rows = made.drives([0, 1], seed=10 * number + worker)
+            (tmp_path / f"worker_{worker}-{name}.log").write_text(made.log_text(rows))
+    recording = read_recording(tmp_path)
+    assert [one.name.rpartition("/")[2] for one in recording.rounds] == [f"worker_#-{name}" for name in names]
+    of = made.training(recording).groupby("episode")[["iteration", "worker"]].first()
+    assert of.to_numpy().tolist() == [[i, w] for i in (0, 1) for w in (0, 0, 1, 1)]
+    (tmp_path / f"worker_0-{names[1]}.log").unlink()
+    (tmp_path / f"worker_1-{names[1]}.log").unlink()
+    assert not read_recording(tmp_path).rounds
+
+
 def test_checkpoints_of_a_clone_count_the_iterations_of_its_csvs(tmp_path):
     files = made.training_csvs("training-simtrace", iterations=2)
     files["logs/training/x-robomaker.log"] = made.worker_text(0, first=50)
