@@ -19,13 +19,19 @@ from deepracer_exp.errors import RunFailed
 
 from .actor_critic import ActorCritic
 from .schedules import Schedule, build_schedule
+from .smoothness import Smoothness
 
 _CPU = torch.device("cpu")
 _PICTURES_AT_ONCE = 1024
 _TEMPERATURE = 0.1
 """Temperature to which a teacher's distribution of actions is sharpened."""
 _VALUE_LOSSES = {"huber": "smooth_l1", "mean squared error": "l2"}
-_LOSS_NAMES = {"loss_objective": "policy loss", "loss_critic": "value loss", "loss_entropy": "entropy"}
+_LOSS_NAMES = {
+    "loss_objective": "policy loss",
+    "loss_critic": "value loss",
+    "loss_entropy": "entropy",
+    "loss_smoothness": "smoothness loss",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +122,7 @@ class PPO(Algorithm):
         schedule: Schedule,
         seed: int,
         device: torch.device = _CPU,
+        commands: Tensor | None = None,
     ) -> None:
         """Set up loss, advantages and optimizer.
 
@@ -125,6 +132,7 @@ class PPO(Algorithm):
             schedule: Of the learning rate.
             seed: Of the stream that shuffles the minibatches.
             device: Where updates are computed; if it is not the CPU, by a copy of the networks there.
+            commands: What the actions of a discrete policy mean, see `Smoothness`.
         """
         super().__init__(actor_critic, config, schedule, seed)
         self._generator = torch.Generator().manual_seed(seed)
@@ -154,6 +162,11 @@ class PPO(Algorithm):
             log_explained_variance=False,
             device=device,
         )
+        self._smoothness = (
+            Smoothness(self._learner, config.smoothness, commands, seed, device)
+            if config.smoothness
+            else None
+        )
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch; override it for a loss of your own.
@@ -163,10 +176,13 @@ class PPO(Algorithm):
                 `action_log_prob`, `advantage` and `value_target`.
 
         Returns:
-            `loss_objective`, `loss_critic` and `loss_entropy`, which are added up, and `entropy`, `clip_fraction`,
-            `mean_ratio` and `kl_approx`, which are recorded.
+            `loss_objective`, `loss_critic`, `loss_entropy` and, with `algorithm.smoothness`, `loss_smoothness`, which
+            are added up, and `entropy`, `clip_fraction`, `mean_ratio` and `kl_approx`, which are recorded.
         """
-        return self._loss(minibatch)
+        losses = self._loss(minibatch)
+        if self._smoothness is not None:
+            losses["loss_smoothness"] = self._smoothness(minibatch, losses["loss_objective"])
+        return losses
 
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
         """Run all epochs on one batch, see `Algorithm.update`."""
@@ -211,6 +227,8 @@ class PPO(Algorithm):
             for index, state in optimizer["state"].items()
         }
         own = {"optimizer": {**optimizer, "state": moments}, "generator": self._generator.get_state()}
+        if self._smoothness is not None:
+            own["smoothness"] = self._smoothness.state_dict()
         return super().state_dict() | own
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -218,6 +236,9 @@ class PPO(Algorithm):
         super().load_state_dict(state)
         self._optimizer.load_state_dict(state["optimizer"])
         self._generator.set_state(state["generator"])
+        # A policy that was trained without it may be trained on with it.
+        if self._smoothness is not None and "smoothness" in state:
+            self._smoothness.load_state_dict(state["smoothness"])
 
     def _shuffled(self, count: int) -> Tensor:
         return torch.randperm(count, generator=self._generator).to(self._device)
@@ -248,9 +269,12 @@ class PPO(Algorithm):
         unexplained, total = (target - value).var(correction=0), target.var(correction=0)
         steps = batch.select(*self._learner.in_keys, "action", "action_log_prob")
         steps.update(estimates.select("advantage", "value_target"))
+        steps = steps.reshape(-1)
+        if self._smoothness is not None:
+            self._smoothness.prepare(steps, batch)
         # A constant target has no variance to explain.
         explained = 1 - unexplained / total.clamp_min(torch.finfo(total.dtype).tiny)
-        return steps.reshape(-1), explained.item() if total > 0 else 0.0
+        return steps, explained.item() if total > 0 else 0.0
 
     def _value_of(self, steps: TensorDictBase) -> Tensor:
         steps = steps.select(*self._learner.value.in_keys)
@@ -267,6 +291,8 @@ class PPO(Algorithm):
             minibatch = self._learner.trunk(minibatch)
         losses = self.loss(minibatch)
         loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        if "loss_smoothness" in losses:
+            loss = loss + losses["loss_smoothness"]
         self._optimizer.zero_grad()
         loss.backward()
         grad_norm = nn.utils.get_total_norm([p.grad for p in self._parameters if p.grad is not None])
@@ -282,7 +308,7 @@ class PPO(Algorithm):
     def _fail(self, losses: TensorDictBase) -> NoReturn:
         """Raise RunFailed with the first thing that is not finite."""
         for key, name in _LOSS_NAMES.items():
-            if not torch.isfinite(losses[key]):
+            if key in losses and not torch.isfinite(losses[key]):
                 raise RunFailed(f"{name} is {losses[key].item()}; the gradient step was not made")
         for name, parameter in self._learner.named_parameters():
             if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
@@ -309,9 +335,10 @@ class Distillation(PPO):
         seed: int,
         teacher: TensorDictModuleBase,
         device: torch.device = _CPU,
+        commands: Tensor | None = None,
     ) -> None:
         """Set up PPO and the teacher, whose weights stay as they are."""
-        super().__init__(actor_critic, config, schedule, seed, device)
+        super().__init__(actor_critic, config, schedule, seed, device, commands)
         self._teacher = teacher.to(device)
         self._imitates = False
 
@@ -380,6 +407,7 @@ def build_agent(
     seed: int,
     teacher: TensorDictModuleBase | None = None,
     device: torch.device = _CPU,
+    commands: Tensor | None = None,
 ) -> Algorithm:
     """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
 
@@ -390,15 +418,16 @@ def build_agent(
         seed: Of the algorithm's own random streams.
         teacher: A policy with the same actions that is imitated for the first `config.teacher_iterations`.
         device: Where updates are computed; a class of the user's own chooses it itself.
+        commands: What the actions of a discrete policy mean, see `Smoothness`.
 
     Raises:
         BadInput: a class of the user's own cannot be used.
     """
     schedule = build_schedule(lr_schedule)
     if teacher is not None:
-        return Distillation(actor_critic, config, schedule, seed, teacher, device)
+        return Distillation(actor_critic, config, schedule, seed, teacher, device, commands)
     if config.target is None:
-        return PPO(actor_critic, config, schedule, seed, device)
+        return PPO(actor_critic, config, schedule, seed, device, commands)
     own = OwnClass(target=config.target, kwargs=config.kwargs)
     # Its constructor may draw weights; the global random state has no part in them.
     with torch.random.fork_rng(devices=[]):

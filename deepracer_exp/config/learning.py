@@ -109,6 +109,8 @@ class AlgorithmConfig:
     """Control steps, over all cars, between two updates; null when episodes_per_iteration is used."""
     episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
     """Finished episodes between two updates (`num_episodes_between_training`); null when frames are used."""
+    smoothness: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
+    """Strength of the loss on actions that differ between neighbouring states (0: none), over the policy's own."""
     teacher_iterations: Annotated[int, Field(ge=0, le=10**6)] = 0
     """Iterations at the start in which the policy learns to act like the teacher (0: there is none)."""
     teacher_batch_size: Annotated[int, Field(ge=1, le=10**6)] = 128

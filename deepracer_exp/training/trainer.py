@@ -20,6 +20,7 @@ from deepracer_exp.collectors.base import Collector
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.deepracer.trace import to_table
+from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed, reading
@@ -189,6 +190,9 @@ class Trainer:
             experiment.seed,
             None if experiment.teacher is None else read_teacher(folder.path),
             torch.device(experiment.device),
+            torch.from_numpy(setup.actions.scaled).float()
+            if isinstance(setup.actions, DiscreteActions)
+            else None,
         )
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}
