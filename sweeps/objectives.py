@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 NONE = "\N{EN DASH}"
 """Shown where there is no value."""
+_MOST_CHANGES_PER_M = 10.0
+"""More than any policy that drives a lap: a change in every third control step at 0.5 m/s."""
 _LEAST_SHARE = 0.01  # of the lap; a trial that never moved must not divide by zero
 
 
@@ -40,8 +42,10 @@ MEASURES: Mapping[str, Measure] = {
     "race_score": Measure("Race score", "s", minimize=True),
     "lap_time": Measure("Lap time", "s", minimize=True),
     "completion": Measure("Completion", "%", minimize=False),
+    "zigzag": Measure("Zig-zag", "changes/m", minimize=True),
 }
-"""By the name of the objective. Race score: seconds per complete lap, failed laps included."""
+"""By the name of the objective. Race score: seconds per complete lap, failed laps included. Zig-zag: changes of
+steering from one side to the other a metre of straight."""
 
 
 def objectives_of(study: optuna.Study) -> tuple[str, ...]:
@@ -63,7 +67,8 @@ def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
     """Return the number that trials are sorted by, lower is better.
 
     One objective: its value. Several: the race score if it is one of them; otherwise lap time over the share of the
-    lap driven, which is close to seconds per complete lap, so that a fast car that rarely finishes is not the best.
+    lap driven if that is one, too, which is close to seconds per complete lap, so that a fast car that rarely finishes
+    is not the best; without lap time, the share of the lap.
     """
     by_name = dict(zip(objectives, values, strict=True))
     if len(objectives) == 1:
@@ -71,14 +76,17 @@ def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
         return by_name[name] if MEASURES[name].minimize else -by_name[name]
     if "race_score" in by_name:
         return by_name["race_score"]
-    return by_name["lap_time"] / max(by_name["completion"] / 100, _LEAST_SHARE)
+    if "lap_time" not in by_name:
+        return -by_name["completion"]
+    return by_name["lap_time"] / max(by_name.get("completion", 100.0) / 100, _LEAST_SHARE)
 
 
 def values_of(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s: float) -> list[float]:
-    """Return the values of the objectives, means over tracks; lap time and completion of the usual conditions.
+    """Return the values of the objectives, means over tracks; all but the race score of the usual conditions.
 
     A policy without a complete lap gets more seconds than `trial_time_s`, the longest that a trial of the evaluation
-    may take, and more the less of the lap it drives, because samplers need a number for it as well.
+    may take, and more the less of the lap it drives, because samplers need a number for it as well. Its zig-zag counts
+    as more than that of any lap for the same reason: a car that does not drive does not swerve.
     """
     from deepracer_exp.evaluation.result import USUAL
 
@@ -88,6 +96,9 @@ def values_of(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s:
         "race_score": evaluation.race_score_s,
         "lap_time": usual.mean_lap_time_s,
         "completion": usual.completion,
+        "zigzag": counted_zigzag(
+            usual.zigzag.changes_per_m, usual.completion, usual.mean_lap_time_s is not None
+        ),
     }
     return [fallback if values[one] is None else float(values[one] or 0.0) for one in objectives]
 
@@ -100,12 +111,23 @@ def without_lap(completion: float, trial_time_s: float) -> float:
     return trial_time_s * (2 - min(completion, 100.0) / 100)
 
 
+def counted_zigzag(changes_per_m: float | None, completion: float, has_lap: bool) -> float:
+    """Return the zig-zag that counts in a sweep: without a complete lap or a straight, more than any lap has."""
+    if has_lap and changes_per_m is not None:
+        return changes_per_m
+    return without_lap(completion, _MOST_CHANGES_PER_M)
+
+
 def intermediate_value(row: Mapping[str, Any], objective: str, trial_time_s: float) -> float | None:
     """Return the value of an evaluation during training; None if this row of metrics.jsonl has none."""
     completion = row.get("eval_completion")
     value = row.get({"race_score": "eval_race_score_s", "lap_time": "eval_lap_time_s"}.get(objective, ""))
     if completion is None:
         return None
+    if objective == "zigzag":
+        return counted_zigzag(
+            row.get("eval_zigzag_per_m"), completion, row.get("eval_lap_time_s") is not None
+        )
     if objective == "completion":
         return float(completion)
     return without_lap(completion, trial_time_s) if value is None else float(value)

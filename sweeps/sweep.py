@@ -355,12 +355,24 @@ def _draws(
     groups: Sequence[Group], objective: str, trial_time_s: float, rng: np.random.Generator
 ) -> "np.ndarray[Any, np.dtype[np.float64]]":
     """Return the objective's value on one track in each resample, (n,)."""
+    if objective == "zigzag":
+        return _zigzag_draws(groups, rng)
     tried, laps, time_s, progress = np.sum([_resampled(group, objective, rng) for group in groups], axis=0)
     completion = progress / tried
     if objective == "completion":
         return completion
     fallback = np.array([without_lap(one, trial_time_s) for one in completion])
     return np.where(laps > 0, time_s / np.maximum(laps, 1), fallback)
+
+
+def _zigzag_draws(
+    groups: Sequence[Group], rng: np.random.Generator
+) -> "np.ndarray[Any, np.dtype[np.float64]]":
+    """Return changes of steering a metre in each resample of the trials, (n,)."""
+    zigzags = [one for group in groups for one in group.zigzags]
+    sums = np.array([(one.changes, one.straight_m) for one in zigzags]).T
+    changes, straight_m = sums[:, rng.integers(len(zigzags), size=(_RESAMPLES, len(zigzags)))].sum(axis=2)
+    return changes / np.maximum(straight_m, 1.0)
 
 
 def _resampled(

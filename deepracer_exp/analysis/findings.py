@@ -20,6 +20,8 @@ from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
 from .tables import CANDIDATE_LAPS, DENSE
+from .zigzag import in_words
+from .zigzag_log import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_now
 
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""
@@ -34,6 +36,7 @@ FIGURES = {
     "crashes": "episode_ends_map",
     "runs_off": "off_track_risk",
     "steering": "slide_map",
+    "zigzag": "zigzag",
     "overfits": "training_progress",
     "laps_slower": "training_progress",
 }
@@ -64,7 +67,8 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
     if view.trained:
         overfits = _overfits(view)
         found += [_converged(view, overfits), _submit(view), _laps_slower(view)]
-    found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view), overfits]
+    found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view)]
+    found += [_zigzag(view), overfits]
     return [one for one in found if one is not None]
 
 
@@ -374,6 +378,17 @@ def _steering(places: Sequence[OffTrackPlace]) -> Finding:
     thresholds = {"unusual": off_track.UNUSUAL, "slide_deg": off_track.SLIDE_DEG}
     thresholds |= {"steers_deg": off_track.STEERS_DEG}
     return Finding("steering", f"Before it runs off, {'; '.join(words)}.", values, thresholds)
+
+
+def _zigzag(view: LogView) -> Finding | None:
+    figures, where = zigzag_now(view)
+    if figures is None or figures[0] < ZIGZAG_PER_M or not figures[1] >= ZIGZAG_DEG:
+        return None
+    sentence = (
+        f"The car zig-zags on straights: {in_words(*figures)} lost in the detour ({where}). Try {CURE}."
+    )
+    values = dict(zip(("changes_per_m", "amplitude_deg", "lost_s"), figures, strict=True))
+    return Finding("zigzag", sentence, values, {"changes_per_m": ZIGZAG_PER_M, "amplitude_deg": ZIGZAG_DEG})
 
 
 def _in(sectors: Sequence[Sector], place: OffTrackPlace) -> str:

@@ -13,7 +13,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head
 
-from .charts import actions, driving_line, laps, mistakes, rewards, training
+from .charts import actions, driving_line, laps, mistakes, rewards, training, zigzag
 from .charts.figure import Chart
 from .charts.runs import generalisation_matrix, generations, run_folder, runs_compared
 from .findings import Finding, findings
@@ -39,6 +39,7 @@ SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     ),
     "The line it drives": (
         *(driving_line.lap_line, driving_line.sector_times, driving_line.speed_steering_by_waypoint),
+        zigzag.zigzag,
         *(driving_line.racing_line, driving_line.acceleration_map, driving_line.slide_map),
     ),
     "Where it goes wrong": (mistakes.off_track_risk, mistakes.episode_ends_map, mistakes.visits_map),
@@ -56,7 +57,7 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "How it raced": (training.evaluations,),
     _BESIDE: (),
     "Lap times": (laps.lap_time_histogram, laps.lap_delta),
-    "The line it drives": SECTIONS["The line it drives"][:4],
+    "The line it drives": SECTIONS["The line it drives"][:5],
     "Where it goes wrong": (mistakes.episode_ends_map,),
     _PAID: (),
     "The course": (driving_line.waypoint_map,),

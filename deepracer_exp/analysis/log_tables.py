@@ -9,6 +9,8 @@ import pandas as pd
 from deepracer_exp.errors import count
 
 from .log_view import LogView
+from .zigzag import in_words
+from .zigzag_log import zigzag_now
 
 NONE = "\N{EN DASH}"
 MOST_ITERATIONS = 300
@@ -31,6 +33,7 @@ _ITERATION_COLUMNS = {
     "checkpoint": ("Checkpoint", ""),
     "eval_completion": ("Evaluated, %", ".1f"),
     "held_out_completion": ("Held out, %", ".1f"),
+    "eval_zigzag_per_m": ("Zig-zag, changes/m", ".2f"),
 }
 """Columns with their heads and formats."""
 _CANDIDATE_COLUMNS = {
@@ -145,6 +148,9 @@ def facts(view: LogView) -> list[tuple[str, str]]:
         words = f"{timed:,} of {count(laps, 'lap')} as in the service's metrics file, the others {counted}"
         words = counted if not timed else words if timed < laps else "as in the service's metrics file"
         found.append(("Lap times", words))
+    figures, where = zigzag_now(view)
+    if figures is not None:
+        found.append(("Zig-zag on straights", f"{in_words(*figures)} ({where})"))
     if len(driven):
         streams = count(driven["stream"].nunique(), "evaluation")
         found.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))

@@ -66,6 +66,8 @@ class LogView:
     """What a training is judged by: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`."""
     evaluation_episodes: pd.DataFrame
     """Episodes on the course of all other streams, with `stream`."""
+    evaluation_steps: pd.DataFrame
+    """Their steps, columns as of `steps`."""
     laps_timed: int
     """Complete laps whose time a metrics file gives; that of the others is counted from the rows."""
     problems: tuple[LogProblem, ...]
@@ -230,6 +232,7 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         iterations=iterations,
         judged=judged,
         evaluation_episodes=raced,
+        evaluation_steps=driven,
         laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,

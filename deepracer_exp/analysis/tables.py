@@ -88,6 +88,7 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
     "eval_lap_time_s": "s, mean of the complete laps of the evaluation on usual conditions; NaN on several tracks",
+    "eval_zigzag_per_m": "changes of steering a metre of straight in the evaluation",
 }
 """Names of the columns, with meaning and unit."""
 FINISHED = 0.75
@@ -424,16 +425,21 @@ def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataF
 
 
 def _evaluated(recording: Recording) -> pd.DataFrame:
-    """Return the means of each iteration's evaluation: of our own runs, or of the service's metrics."""
+    """Return the means of each iteration's evaluation: of our own runs, or of the service's metrics.
+
+    The zig-zag in it is that of our own runs only: in the service's traces evaluations have no iteration.
+    """
     if len(recording.evaluations):
         own = recording.evaluations.groupby("iteration").last()
         if recording.track is None:  # a mean over whichever tracks have a lap
             own["lap_time_s"] = np.nan
-        return own.rename(columns={"completion": "eval_completion", "lap_time_s": "eval_lap_time_s"})
+        names = ("completion", "lap_time_s", "zigzag_per_m")
+        return own.rename(columns={name: f"eval_{name}" for name in names})
     rows = _evaluation_rows(recording)
     groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
     means = groups["completion"].mean().to_frame("eval_completion")
-    return means.assign(held_out_completion=np.nan, eval_lap_time_s=groups["time_s"].mean())
+    lap_time_s = groups["time_s"].mean()
+    return means.assign(held_out_completion=np.nan, eval_lap_time_s=lap_time_s, eval_zigzag_per_m=np.nan)
 
 
 def _evaluation_rows(recording: Recording) -> pd.DataFrame:

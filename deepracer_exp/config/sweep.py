@@ -26,7 +26,7 @@ from .options import groups
 from .overrides import PLAIN_TEXT, key_of, parse_sweep
 from .parse import parse_config
 
-Objective = Literal["race_score", "lap_time", "completion"]
+Objective = Literal["race_score", "lap_time", "completion", "zigzag"]
 Pruner = Literal["entropy", "median", "percentile", "hyperband", "wilcoxon"]
 Sampler = Literal["tpe", "gp", "cmaes", "qmc", "random", "grid", "nsga2"]
 

@@ -79,6 +79,9 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
         "the same on conditions held out of the training; NaN where not evaluated",
     ),
     "lap_time_s": ("float64", "s, mean of the complete laps; NaN without one"),
+    "zigzag_per_m": ("float64", "changes of steering a metre of straight; NaN where not measured"),
+    "zigzag_deg": ("float64", "degrees to either side in these changes; NaN without one"),
+    "zigzag_lost_s": ("float64", "s a lap lost in these; NaN where not measured"),
 }
 """Columns of `Recording.evaluations`: type and meaning with unit."""
 

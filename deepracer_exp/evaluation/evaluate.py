@@ -27,13 +27,13 @@ from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 
 from .evaluator import Evaluator, tracks_of
 from .film import LapRecorder, best_attempt
-from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number
+from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number, zigzag_columns
 
 if TYPE_CHECKING:
     from .video import View
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
-_MINOR = ("median", "std", "score s")
+_MINOR = ("median", "std", "score s", "zig-zag /m")
 SIMULATOR, CAR = "simulator", "car"
 """Names of what is compared, beside the parts of `RealCarConfig`."""
 _PARTS = tuple(field.name for field in fields(RealCarConfig))
@@ -145,6 +145,7 @@ def _cells(found: Mapping[str, Any], intervals: bool) -> dict[str, str]:
         "resets": _mean(found["resets"], 1, intervals),
         "penalty s": _mean(found["penalty_s"], 1, intervals),
         "score s": number(found["race_score_s"], 2),
+        "zig-zag /m": _mean(found["zigzag"]["changes_per_m"], 2, intervals),
     }
 
 
@@ -190,7 +191,10 @@ def evaluate_run(
         laps = next(one for one in evaluation.groups if one.track == track and one.condition == USUAL)
         part = f"; {len(laps.lap_times_s)} of {len(laps.decided)} laps were complete" * (laps.lap_share < 1)
         out.print(f"\n{found[0].words}{part}", soft_wrap=not out.is_terminal, highlight=False)
-    out.print(f"\n  results  {file}", soft_wrap=True, highlight=False)
+    out.print(
+        f"\n  zig-zag  {evaluation.on(USUAL).zigzag.words()}, on straights", soft_wrap=True, highlight=False
+    )
+    out.print(f"  results  {file}", soft_wrap=True, highlight=False)
     files = {file: EVALUATIONS}
     if video is not None:
         from .video import write_video  # imports MuJoCo's renderer
@@ -254,6 +258,9 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
         if group.condition == USUAL:
             found[evaluate_metric("eval_lap_time_s", label)] = group.mean_lap_time_s
             found[evaluate_metric("eval_completion", label)] = group.completion
+            found |= {
+                evaluate_metric(column, label): value for column, value in zigzag_columns(group).items()
+            }
         else:
             found[evaluate_metric("held_out_completion", label)] = group.completion
     return found

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
-from deepracer_exp.deepracer.trace import PACKED
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup, directed_tracks
@@ -25,9 +26,13 @@ from deepracer_exp.rewards.source import RewardSource
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, Group
 
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.zigzag import ZigZag
+
 OnStep = Callable[[Race, RaceProtocol, TensorDict], None]
 """Gets the cars, the protocol, and what the policy read and wrote in this step, [trials]."""
 
+_DRIVEN = [PACKED[name] for name in ("X", "Y", "steer", "tstamp", "episode_status")]
 # An evaluation needs no reward; the run's own reward function may no longer exist.
 _NO_REWARD = RewardSource(
     name="none",
@@ -111,6 +116,7 @@ class Evaluator:
         """
         race, config = self.race, self.config
         protocol = RaceProtocol(config, self._closed, race.setup.car.control_period_s)
+        trace: list[NDArray[np.float64]] = []
         race.seed(config.seed)
         race.reset(None, self._course, self._start_ndist)
         how = ExplorationType.RANDOM if config.sample else ExplorationType.DETERMINISTIC
@@ -124,6 +130,7 @@ class Evaluator:
                 acted = policy(seen)
                 race.step(acted["action"].numpy())
                 row = race.trace
+                trace.append(np.column_stack([row[:, _DRIVEN], protocol.running]))
                 cars, progress = protocol.step(
                     row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
                 )
@@ -131,17 +138,36 @@ class Evaluator:
                     on_step(race, protocol, acted)
                 if len(cars):
                     race.put_back(cars, progress)
-        return Evaluation(tuple(self._groups(protocol)))
+        return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1))))
 
-    def _groups(self, protocol: RaceProtocol) -> list[Group]:
+    def _groups(self, protocol: RaceProtocol, trace: NDArray[np.float64]) -> list[Group]:
+        zigzags = [self._zigzag(trial.course, rows) for trial, rows in zip(self.trials, trace, strict=True)]
         names = [course.name for course in self.race.setup.courses]
         rows: dict[tuple[str, str], list[int]] = {}
         for row, trial in enumerate(self.trials):
             rows.setdefault((names[trial.course], trial.condition), []).append(row)
         return [
-            Group(track, condition, tuple(own), tuple(a for a in protocol.attempts if a.trial in set(own)))
+            Group(
+                track,
+                condition,
+                tuple(own),
+                tuple(a for a in protocol.attempts if a.trial in set(own)),
+                tuple(zigzags[trial] for trial in own),
+            )
             for (track, condition), own in rows.items()
         ]
+
+    def _zigzag(self, course: int, rows: NDArray[np.float64]) -> "ZigZag":
+        """Measure the zig-zag of a trial: rows [T] with the columns `_DRIVEN` and whether the trial was running."""
+        from deepracer_exp.analysis.zigzag import (  # imports pandas, which only evaluations need
+            DRIVES,
+            zigzag_of,
+        )
+
+        x_m, y_m, steering_deg, time_s, status, running = rows.T
+        drives = np.isin(status, [STATUS_CODE[word] for word in DRIVES if word]) & (running > 0)
+        track = self.race.setup.courses[course].tracks[0]
+        return zigzag_of(track, x_m, y_m, steering_deg, time_s, np.zeros(len(rows), np.intp), drives)
 
 
 def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, TrackConfig]:

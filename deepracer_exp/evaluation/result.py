@@ -3,12 +3,15 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .race_protocol import Attempt
+
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.zigzag import ZigZag
 
 Metric = Literal["progress", "lap_time", "race_score"]
 Rank = tuple[float, float]
@@ -35,6 +38,8 @@ class Group:
     trials: tuple[int, ...]
     """Rows of the batch."""
     attempts: tuple[Attempt, ...]
+    zigzags: "tuple[ZigZag, ...]" = ()
+    """Of each trial; empty where it was not measured."""
 
     @property
     def decided(self) -> list[Attempt]:
@@ -69,6 +74,13 @@ class Group:
         laps = len(self.lap_times_s)
         return sum(attempt.time_s for attempt in self.decided) / laps if laps else None
 
+    @property
+    def zigzag(self) -> "ZigZag":
+        """The zig-zag on straights in all trials together."""
+        from deepracer_exp.analysis.zigzag import total  # imports pandas, which only evaluations need
+
+        return total(self.zigzags)
+
     def rank(self, metric: Metric) -> Rank:
         """Return the policy's rank by a metric; without a complete lap, times fall back to progress."""
         if metric == "progress":
@@ -102,6 +114,20 @@ class Group:
             "resets": _mean(self._per_trial(self.attempts, lambda a: float(a.resets)), one),
             "penalty_s": _mean(self._per_trial(self.attempts, lambda a: a.penalty_s), one),
             "race_score_s": self.race_score_s,
+            "zigzag": self._zigzag_statistics(),
+        }
+
+    def _zigzag_statistics(self) -> dict[str, Any]:
+        changes, straight_m = (
+            np.array([getattr(one, name) for one in self.zigzags], np.float64)
+            for name in ("changes", "straight_m")
+        )
+        whole = self.zigzag
+        return {
+            "changes_per_m": _mean(changes, straight_m),
+            "amplitude_deg": whole.amplitude_deg,
+            "lost_s": whole.lost_s,
+            "straight_m": whole.straight_m,
         }
 
     def _per_trial(self, attempts: Sequence[Attempt], value: Any) -> NDArray[np.float64]:
@@ -173,6 +199,16 @@ class Evaluation:
         }
 
 
+def zigzag_columns(group: Group) -> dict[str, float | None]:
+    """Return the zig-zag of a group by the names of its metrics, as in metrics.jsonl."""
+    zigzag = group.zigzag
+    return {
+        "eval_zigzag_per_m": zigzag.changes_per_m,
+        "eval_zigzag_deg": zigzag.amplitude_deg,
+        "eval_zigzag_lost_s": zigzag.lost_s,
+    }
+
+
 def number(value: float | None, digits: int) -> str:
     """Return a number with so many digits, a dash for None and NaN."""
     return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
@@ -184,6 +220,7 @@ def _together(groups: Sequence[Group], track: str, condition: str) -> Group:
         condition,
         tuple(trial for group in groups for trial in group.trials),
         tuple(attempt for group in groups for attempt in group.attempts),
+        tuple(zigzag for group in groups for zigzag in group.zigzags),
     )
 
 

@@ -161,7 +161,8 @@ def _metrics(
             losses = {
                 name: _number(row.get(name)) for name in UPDATE_COLUMNS if name not in ("iteration", "epoch")
             }
-            tried = {name: _number(row.get(f"eval_{name}")) for name in ("completion", "lap_time_s")}
+            names = [name for name in EVALUATION_COLUMNS if name not in ("iteration", "held_out_completion")]
+            tried = {name: _number(row.get(f"eval_{name}")) for name in names}
             tried["held_out_completion"] = _number(row.get("held_out_completion"))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             problems.append(LogProblem(str(file), number, f"left out: {_one_line(error)}"))

@@ -12,6 +12,12 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "eval_completion": ("race/completion", "mean progress of the evaluation's laps in per cent"),
     "held_out_completion": ("race/held_out_completion", "the same on held-out conditions"),
     "eval_lap_share": ("race/lap_share", "share of the evaluation's laps that were completed (0 to 1)"),
+    "eval_zigzag_per_m": (
+        "race/zigzag_per_m",
+        "changes of steering from one side to the other a metre of straight, usual conditions",
+    ),
+    "eval_zigzag_deg": ("race/zigzag_deg", "mean angle to either side in these changes"),
+    "eval_zigzag_lost_s": ("race/zigzag_lost_s", "seconds a lap that the detour of the zig-zag takes"),
     "completion": ("train/completion", "mean progress of finished episodes in per cent"),
     "lap_share": (
         "train/lap_share",
@@ -108,7 +114,8 @@ def trial_metrics(values: Mapping[str, float | None]) -> dict[str, float | None]
 
 def trial_metric(objective: str) -> str:
     """Return the metric of a study's objective."""
-    return f"trial/{objective}" if objective == "completion" else f"trial/{objective}_s"
+    unit = {"completion": "", "zigzag": "_per_m"}.get(objective, "_s")
+    return f"trial/{objective}{unit}"
 
 
 def track_labels(names: Sequence[str]) -> list[str]:

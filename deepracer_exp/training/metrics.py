@@ -11,7 +11,7 @@ from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, zigzag_columns
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.tracking.metrics import track_labels, track_metric
 
@@ -303,6 +303,9 @@ EVAL_COLUMNS = (
     "eval_lap_share",
     "eval_lap_time_s",
     "eval_race_score_s",
+    "eval_zigzag_per_m",
+    "eval_zigzag_deg",
+    "eval_zigzag_lost_s",
 )
 NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)
 
@@ -317,5 +320,6 @@ def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
         usual.lap_share,
         usual.mean_lap_time_s,
         evaluation.race_score_s,
+        *zigzag_columns(usual).values(),
     )
     return dict(zip(EVAL_COLUMNS, figures, strict=True))
