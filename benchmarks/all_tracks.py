@@ -5,7 +5,7 @@
 For each track, `deepracer-exp train track=TRACK` runs as a process of its own in an empty folder until 90 per cent of
 the last 50 training episodes completed the lap, or until the budget's end. Read from its summary.json: control steps
 over all cars and wall seconds since the start of the process until then (null where the budget ended the run), the
-share of laps among the last 50 episodes, and the fastest lap of the whole training, in simulated seconds.
+share of laps among the last 50 episodes, and the fastest exploring lap of the whole training, in simulated seconds.
 
 Seconds are meaningful only with one job; several share the cores.
 """
@@ -67,7 +67,7 @@ def measure(option: str, track: Track, overrides: Sequence[str]) -> dict[str, An
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
     """Return the table."""
-    head = ("track", "name", "length (m)", "steps to 90%", "seconds to 90%", "best lap (s)")
+    head = ("track", "name", "length (m)", "steps to 90%", "seconds to 90%", "fastest exploring lap (s)")
     lines = []
     for row in rows:
         unreached = f"not in {row['env_steps']:,} ({row['lap_share'] or 0.0:.0%})"

@@ -39,13 +39,13 @@ class Measure:
 
 
 MEASURES: Mapping[str, Measure] = {
-    "race_score": Measure("Race score", "s", minimize=True),
-    "lap_time": Measure("Lap time", "s", minimize=True),
-    "completion": Measure("Completion", "%", minimize=False),
+    "race_score": Measure("Race score (usual and held-out)", "s", minimize=True),
+    "lap_time": Measure("Mean usual lap", "s", minimize=True),
+    "completion": Measure("Usual completion", "%", minimize=False),
     "zigzag": Measure("Zig-zag", "changes/m", minimize=True),
 }
-"""By the name of the objective. Race score: seconds per complete lap, failed laps included. Zig-zag: changes of
-steering from one side to the other a metre of straight."""
+"""By the name of the objective. Race score: seconds per complete lap, failed laps included; usual and held-out are
+conditions. Zig-zag: changes of steering from one side to the other a metre of straight."""
 
 
 def objectives_of(study: optuna.Study) -> tuple[str, ...]:

@@ -101,8 +101,8 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
     attrs = best.user_attrs
     found = [
         *((keys[key], parameter(value)) for key, value in best.params.items()),
-        ("Lap time in evaluation", shown_or_dash("lap_time", attrs.get("lap_time_s"))),
-        ("Completion in evaluation", shown_or_dash("completion", attrs.get("completion"))),
+        ("Mean usual lap", shown_or_dash("lap_time", attrs.get("lap_time_s"))),
+        ("Usual completion", shown_or_dash("completion", attrs.get("completion"))),
         ("How its training ended", str(attrs.get("reason") or outcome_words(outcome_of(best)))),
     ]
     try:
@@ -128,7 +128,7 @@ def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
     more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
     return [
         (best_line(study), "train the winner again"),
-        (f"{evaluate} --video lap.mp4", "race it, and film its fastest lap"),
+        (f"{evaluate} --video lap.mp4", "race it, and film its fastest usual lap"),
         (command_line("clone", winner, config), "train it further, at a tenth of the learning rate"),
         (f"{_resume(study)} sweep.trials={more}", "continue the search, with twice the trials"),
     ]
@@ -139,7 +139,7 @@ def _resume(study: optuna.Study) -> str:
 
 
 def _picture(study: optuna.Study) -> str | None:
-    """Return the picture of the winner's fastest lap in base64, None where there is none."""
+    """Return the picture of the fastest exploring lap of the winner's training in base64, None where there is none."""
     try:
         picture = read_bytes(best_run(study) / BEST_LAP, "the picture that a training draws")
     except BadInput:

@@ -114,8 +114,8 @@ class SweepView:
 
     def _running(self, running: Sequence[Claim]) -> Table:
         table = Table(box=None, pad_edge=False, header_style="dim")
-        for name in ("trial", "steps", "completion", "", "entropy", "evaluated"):
-            table.add_column(name, justify="left" if name in ("", "evaluated") else "right", no_wrap=True)
+        for name in ("trial", "steps", "exploring", "", "entropy", "usual laps"):
+            table.add_column(name, justify="left" if name in ("", "usual laps") else "right", no_wrap=True)
         table.add_column("values", ratio=1)
         for claim in running:
             table.add_row(*self._cells(claim), _params(claim))
@@ -170,7 +170,7 @@ def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
 
 def _values(result: TrialResult, objectives: Sequence[str]) -> str:
     lap_s, completion = result.attrs.get("lap_time_s"), result.attrs.get("completion")
-    lap = "no lap" if lap_s is None else f"lap {lap_s:.2f} s"
+    lap = "no lap" if lap_s is None else f"mean usual lap {lap_s:.2f} s"
     return f"{shown_values(objectives, result.values or ())} ({lap}, {completion:.0f}% driven)"
 
 

@@ -101,7 +101,7 @@ class Laps:
         turned_deg = rows["steer"].diff().abs()[np.diff(self.number[rows.index], prepend=-1) == 0]
         return {
             "complete laps, %": np.nan if self.chosen else 100.0 * complete / tried,
-            "best lap, s": float(laps["lap_time_s"].min()),
+            "fastest lap, s": float(laps["lap_time_s"].min()),
             "median lap, s": float(laps["lap_time_s"].median()),
             "mean speed, m/s": float(laps["dist_m"].sum()) / time_s if time_s else np.nan,
             "off the track or stuck, per lap": np.nan if self.chosen else float(began.sum()) / tried,

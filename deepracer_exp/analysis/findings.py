@@ -184,8 +184,8 @@ def _submit(view: LogView) -> Finding:
         whose = "their" if view.in_blocks else "its"
         sentence = (
             f"Submit {_checkpoint(first['checkpoint'], 'drove')} {_iterations(view, first['iteration'])}: a quarter "
-            f"of {whose} laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} {episodes} episodes "
-            f"are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
+            f"of {whose} exploring laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} {episodes} "
+            f"episodes are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
         )
         values |= {"p25_s": float(first["lap_time_p25_s"])}
         time_of = "lap_time_p25_s"
@@ -249,7 +249,7 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
         return None
     best_s, mean_s = float(laps_s.min()), float(laps_s.mean())
     if laps < LEAST_LAPS:
-        are = "is a complete lap" if laps == 1 else "are complete laps"
+        are = f"is a complete {view.lap_word}" if laps == 1 else f"are complete {view.lap_word}s"
         sentence = (
             f"{laps} of {count(len(episodes), 'episode')} {when} {are}, the fastest in {best_s:.2f} s: too few to "
             "say how likely the next one is."
@@ -257,18 +257,19 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
         return Finding("chance", sentence, {"laps": laps, "best_s": best_s}, {"least_laps": LEAST_LAPS})
     complete, sd_s = laps / len(episodes), float(laps_s.std(ddof=1))
     share = f"{complete:.0%} of the episodes were complete laps."
+    driven = count(laps, f"complete {view.lap_word}")
     values: _Numbers = {"laps": laps, "best_s": best_s, "mean_s": mean_s, "complete": complete, "sd_s": sd_s}
     if target_s is None:
         p25_s, median_s = (float(one) for one in np.quantile(laps_s, [0.25, 0.5]))
         sentence = (
-            f"Half of the {count(laps, 'complete lap')} {when} took at most {median_s:.2f} s, a quarter at most "
+            f"Half of the {driven} {when} took at most {median_s:.2f} s, a quarter at most "
             f"{p25_s:.2f} s; the fastest took {best_s:.2f} s. {share}"
         )
         return Finding("chance", sentence, values | {"p25_s": p25_s, "median_s": median_s})
     faster = int((laps_s <= target_s).sum())
     low, high = map(float, wilson(faster, laps))
     sentence = (
-        f"{faster:,} of {count(laps, 'complete lap')} {when} took at most {target_s:.2f} s: the chance of such a lap "
+        f"{faster:,} of {driven} {when} took at most {target_s:.2f} s: the chance of such a lap "
         f"is {_share(low)} to {_share(high)}"
     )
     values |= {"target_s": target_s, "faster": faster, "low": low, "high": high}
@@ -303,8 +304,8 @@ def _time_lost(view: LogView) -> Finding | None:
     # Where laps begin in different sectors, the best time of each is that of a car at speed.
     standing = " without a standing start" if len(set(begun)) > 1 else ""
     sentence = (
-        f"The best sectors of {count(len(times), 'lap')} {when} add up to {possible_s:.2f} s{standing}; the fastest "
-        f"of them took {best_s:.2f} s. {where}."
+        f"The best sectors of {count(len(times), view.lap_word)} {when} add up to {possible_s:.2f} s{standing}; the "
+        f"fastest of them took {best_s:.2f} s. {where}."
     )
     if len(times) < LEAST_LAPS:
         sentence += f" From {len(times)} laps this is a hint at most."

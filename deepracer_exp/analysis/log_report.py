@@ -151,6 +151,7 @@ def html(page: LogPage) -> str:
         problem_count=count(len(view.problems), "problem") if view.problems else "",
         replay=page.replay,
         candidates=candidate_rows(view),
+        trained=view.trained,
         evaluated=bool(view.candidates["evaluated"].any()),
         laps=best_laps(view),
         strip=page.strip,

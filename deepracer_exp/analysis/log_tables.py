@@ -21,16 +21,17 @@ _ITERATION_COLUMNS = {
     "iteration": ("Iteration", "d"),
     "episodes": ("Episodes", ",d"),
     "steps": ("Steps", ",.0f"),
-    "complete": ("Laps", ",d"),
+    "complete": ("Exploring laps", ",d"),
     "completion_mean": ("Driven, %", ".1f"),
     "reward_mean": ("Reward", ".4g"),
-    "lap_time_best_s": ("Best lap, s", ".2f"),
+    "lap_time_best_s": ("Fastest exploring, s", ".2f"),
     "lap_time_p25_s": ("25th percentile, s", ".2f"),
     "speed_mps": ("Speed, m/s", ".2f"),
     "entropy": ("Entropy, nats", ".3f"),
     "kl": ("KL, nats", ".2g"),
     "lr": ("Learning rate", ".2g"),
     "checkpoint": ("Checkpoint", ""),
+    "eval_lap_time_s": ("Evaluated lap, s", ".2f"),
     "eval_completion": ("Evaluated, %", ".1f"),
     "held_out_completion": ("Held out, %", ".1f"),
     "eval_zigzag_per_m": ("Zig-zag, changes/m", ".2f"),
@@ -40,7 +41,7 @@ _CANDIDATE_COLUMNS = {
     "checkpoint": ("Checkpoint", ""),
     "iteration": ("Drove iteration", "d"),
     "lap_time_p25_s": ("25th percentile, s", ".2f"),
-    "lap_time_best_s": ("Best lap, s", ".2f"),
+    "lap_time_best_s": ("Fastest lap, s", ".2f"),
     "lap_time_mean_s": ("Mean lap, s", ".2f"),
     "lap_share": ("Complete", ".0%"),
     "complete": ("Laps", ",d"),
@@ -187,8 +188,8 @@ def headline(view: LogView) -> str:
     if not laps:
         return f"{sentence}; {_without_a_lap(with_resets)}."
     more = f"; {count(with_resets, 'more lap')} with resets" if with_resets else ""
-    best = f", the best in {best_s:.2f} s" if math.isfinite(best_s) else ""
-    return f"{sentence}; {count(laps, 'complete lap')}{best}{more}."
+    best = f", the fastest in {best_s:.2f} s" if math.isfinite(best_s) else ""
+    return f"{sentence}; {count(laps, f'complete {view.lap_word}')}{best}{more}."
 
 
 def _without_a_lap(with_resets: int) -> str:

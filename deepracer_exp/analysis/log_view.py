@@ -84,6 +84,11 @@ class LogView:
         return len(metadata.actions if metadata is not None else ()) or int(self.steps["action"].max()) + 1
 
     @property
+    def lap_word(self) -> str:
+        """What a lap of `episodes` is called: that of a training explores."""
+        return "exploring lap" if self.trained else "lap"
+
+    @property
     def untraced(self) -> int:
         """Number of finished episodes of the training that are known from metrics files only."""
         more = int(self.iterations["episodes"].sum() - self.episodes["ended"].sum())

@@ -11,7 +11,14 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import BEST, RunRecord, read_config, run_folders, sees_pictures
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.resolve import best_of
-from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, FIGURES, INTERRUPTED, read_result
+from deepracer_exp.runs.result import (
+    BUDGET_REACHED,
+    FAILED,
+    FIGURES,
+    INTERRUPTED,
+    fastest_reliable,
+    read_result,
+)
 from deepracer_exp.tracks.boards import standings, what_it_sees
 
 COMMAND = "deepracer-exp"
@@ -36,13 +43,15 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
     ]
     result = read_result(run.path)
     if result is not None and result.evaluated:
-        known = [(name, getattr(result, key), form) for name, key, form, _ in FIGURES]
+        known = [(result.figure(name), getattr(result, key), form) for name, key, form, _ in FIGURES]
         found += [
             (f"{name[0].upper()}{name[1:]}", form.format(value))
             for name, value, form in known
             if value is not None
         ]
-        found.append(("Best checkpoint", f"{result.iteration:06d}"))
+        found.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
+        if (lap := fastest_reliable(run.rows)) is not None:
+            found.append(("Fastest reliable lap", str(lap)))
         place = official_place(run.config, result.lap_time_s)
         if place is not None:
             found.append(("Official board", place))
@@ -86,7 +95,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     steps = []
     if summary["iteration"]:
         evaluate = command_line("evaluate", word, config, OF_POLICY)
-        film = (f"{evaluate} --video lap.mp4", "film its fastest lap")
+        film = (f"{evaluate} --video lap.mp4", "film its fastest usual lap")
         if sees_pictures(config):
             film = (command_line("watch", word, config, OF_POLICY), "film what it sees, and where it looks")
         steps += [

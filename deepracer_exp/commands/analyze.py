@@ -37,7 +37,7 @@ _ANALYZE_EPILOG = """\
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
   deepracer-exp analyze RUN --compare logs/ --replay laps.html
                                                             the fastest lap of each, driven beside each other
-  deepracer-exp analyze RUN --line line.py                  the line of its fastest lap, for a reward function
+  deepracer-exp analyze RUN --line line.py                  the line of its fastest exploring lap, for a reward function
 
 The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
 read and why.
@@ -80,9 +80,11 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="reward function, of the zoo or a file, to replay on its steps",
     )
     parser.add_argument("--target", metavar="S", help="lap time in seconds: how likely is a lap below it?")
-    add_replay(parser, "its fastest lap and that of the first of --compare, or an ordinary one")
+    add_replay(parser, "its fastest exploring lap and that of the first of --compare, or an ordinary one")
     parser.add_argument(
-        "--line", metavar="FILE", help="write the line of its fastest lap (.csv, .npy, or .py: a Python list)"
+        "--line",
+        metavar="FILE",
+        help="write the line of its fastest exploring lap (.csv, .npy, or .py: a Python list)",
     )
     parser.add_argument("--lap", metavar="EPISODE", help="the lap of --line: a complete episode of the log")
     _add_page(parser, "report.html of a run, else NAME-analysis.html")

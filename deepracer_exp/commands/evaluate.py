@@ -47,7 +47,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
-    parser.add_argument("--video", metavar="FILE", help="film the fastest lap (.mp4)")
+    parser.add_argument("--video", metavar="FILE", help="film the fastest usual lap (.mp4)")
     parser.add_argument("--view", choices=("chase", "top"), default="chase", help="camera of the film")
     parser.add_argument(
         "--cfg", action="store_true", help="print the composed configuration as YAML and stop"
@@ -59,8 +59,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         _watch,
         help="film what a trained car sees, or watch a training",
         description=(
-            "Race a run's best policy and film its best lap: what the car sees, where the policy looks, how likely "
-            "each action is, and the view from above. With --live, serve a page on 127.0.0.1 with the newest "
+            "Race a run's best policy and film its fastest usual lap: what the car sees, where the policy looks, how "
+            "likely each action is, and the view from above. With --live, serve a page on 127.0.0.1 with the newest "
             "evaluation laps of a training while it runs, until Ctrl-C."
         ),
         epilog=_WATCH_EPILOG,
@@ -76,7 +76,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument("--live", action="store_true", help="serve a page that follows the training")
     parser.add_argument("--port", type=port, help="port of the page (default: a free one)")
-    add_replay(parser, "its best lap and an ordinary one, or the best of another run or of logs")
+    add_replay(parser, "its fastest usual lap and an ordinary one, or the fastest of another run or of logs")
 
     parser = add_command(
         commands,
@@ -160,12 +160,12 @@ def _checkpoints_given(args: argparse.Namespace) -> list[str]:
 
 
 _WATCH_EPILOG = """\
-  deepracer-exp watch RUN                                   film the best lap of its best checkpoint
+  deepracer-exp watch RUN                                   film the fastest usual lap of its best checkpoint
   deepracer-exp watch RUN checkpoint=last -o last.mp4
   deepracer-exp watch RUN evaluation.tracks=[Oval_track]    on another track
   deepracer-exp watch RUN --live                            a page that follows the training
-  deepracer-exp watch RUN --replay laps.html                a page: its best lap beside an ordinary one
-  deepracer-exp watch RUN RUN --replay laps.html            or beside the best lap of another run, or of logs
+  deepracer-exp watch RUN --replay laps.html                a page: its fastest usual lap beside an ordinary one
+  deepracer-exp watch RUN RUN --replay laps.html            or beside the fastest lap of another run, or of logs
 
 The page shows the laps that the training evaluates its policy by; evaluation=NAME shows others.
 """

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import count
-from deepracer_exp.runs.files import BEST_LAP, LEARNING, REPORT
+from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, read_metrics
+from deepracer_exp.runs.result import RELIABLE, fastest_reliable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 _FILES = {
     REPORT: "findings and figures",
-    BEST_LAP: "the fastest lap, or the longest attempt",
+    BEST_LAP: "the fastest exploring lap, or the longest attempt",
     LEARNING: "the learning curves",
 }
 
@@ -77,11 +78,13 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     print(f"\n{outcome.status}: {outcome.reason}")
     print(
         f"  {count(summary['iteration'], 'iteration')}, {count(summary['env_steps'], 'step')} in "
-        f"{summary['wall_clock_s']:.0f} s; in training {count(summary['episodes'], 'episode')}, {_laps(summary)}"
+        f"{summary['wall_clock_s']:.0f} s; exploring: {count(summary['episodes'], 'episode')}, {_laps(summary)}"
     )
     result = result_of(summary)
     if result is not None and result.evaluated:
-        print(f"\n  best policy   checkpoint {result.iteration:06d}, evaluated: {result.words()}")
+        several = ", mean of the laps on all tracks" * ("tracks" in summary)
+        print(f"\n  fastest reliable lap: {_reliable_lap(outcome.folder)}{several}")
+        print(f"  best checkpoint by {result.criterion}: {result.iteration:06d}, {result.words()}")
     print(f"\n  results       {outcome.folder}")
     for name, what in _FILES.items():
         if (outcome.folder / name).exists():
@@ -93,6 +96,17 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     steps = next_steps(outcome.folder, summary)
     print_steps([(line.replace(COMMAND, _command(), 1), what) for line, what in steps])
     _print_unrecorded([outcome], tracking)
+
+
+def _reliable_lap(run: Path) -> str:
+    """Return the fastest reliable lap of a run's evaluated policies in words, and whether its checkpoint is there."""
+    rows = read_metrics(run / METRICS)
+    found = fastest_reliable(rows)
+    if found is None:
+        share = max((row.get("eval_lap_share") or 0.0 for row in rows), default=0.0)
+        return f"none yet; {RELIABLE:.0%} of the usual laps must be complete, at best {share:.0%} were"
+    kept = (run / CHECKPOINTS / f"{found.iteration:06d}").is_dir()
+    return f"{found}" if kept else f"{found} (not kept; checkpoints.metric=reliable_lap keeps it)"
 
 
 def print_steps(steps: Sequence[tuple[str, str]]) -> None:
@@ -112,7 +126,7 @@ def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig")
     """Print one line per run."""
     print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
-        print(f"  {outcome.folder.name}  {outcome.status}  {_laps(outcome.summary)}  {outcome.reason}")
+        print(f"  {outcome.folder.name}  {outcome.status}  {_lap(outcome)}  {outcome.reason}")
     _print_unrecorded(outcomes, tracking)
 
 
@@ -163,6 +177,12 @@ def _store_word(runs_dir: "Path", uri: str | None) -> str:
 def _command() -> str:
     # `make race` calls us by a path that a newcomer's shell does not know.
     return "deepracer-exp" if shutil.which("deepracer-exp") else shlex.quote(sys.argv[0])
+
+
+def _lap(outcome: "TrainResult") -> str:
+    """Return the fastest reliable lap of a run's evaluated policies, or what exploration did if there is none."""
+    found = fastest_reliable(read_metrics(outcome.folder / METRICS)) if outcome.summary else None
+    return f"exploring: {_laps(outcome.summary)}" if found is None else f"fastest reliable lap: {found}"
 
 
 def _laps(summary: Mapping[str, Any]) -> str:

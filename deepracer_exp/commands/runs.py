@@ -102,7 +102,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         metavar="PAGE.html",
         help="page to write: these tables, learning curves and lap times",
     )
-    add_replay(compare, "the fastest lap of each run's best checkpoint")
+    add_replay(compare, "the fastest usual lap of each run's best checkpoint")
 
     lineage = add_command(
         actions,
@@ -220,7 +220,7 @@ def _compare(args: argparse.Namespace) -> int:
         protocol = stored[0].experiment.evaluation
         (first,) = laps_to_replay(stored[0], None, protocol)
         write_laps(args.replay, [first, *laps_to_replay(stored[1], None, protocol, beside=first)])
-        console.print(f"\n{args.replay}: the fastest laps of their best checkpoints", soft_wrap=True)
+        console.print(f"\n{args.replay}: the fastest usual laps of their best checkpoints", soft_wrap=True)
     return 0
 
 
@@ -234,7 +234,7 @@ def _page_tables(records: "Sequence[RunRecord]") -> "list[tuple[str, PageTable, 
     runs = [(letter, record.name) for letter, record in zip(heads[1:], records, strict=True)]
     achieved = [(name, *texts) for name, texts, _ in results(records)]
     chosen = [(key, *map(value_text, values)) for key, values in run_differences(records).items()]
-    note = "Race score, complete laps, completion and mean lap are those of the best checkpoint, evaluated."
+    note = "Usual and held-out laps are those of the best checkpoint, evaluated; exploring laps those of the training."
     return [
         ("Runs", Table(("", "run"), tuple(runs), 2), ""),
         ("Results", Table(heads, tuple(achieved), 1), note),

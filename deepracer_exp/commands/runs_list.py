@@ -28,7 +28,7 @@ _EPILOG = """\
   deepracer-exp runs list --where state=finished --where 'score_s<12' --sort score_s
   deepracer-exp runs list --where user=anna --where tag.car=blue --format csv > season.csv
 
-columns: run name state score_s laps best_lap_s began user host note id tag.KEY
+columns: run name state lap_s score_s exploring_laps exploring_lap_s began user host note id tag.KEY
 conditions: COLUMN=VALUE  COLUMN!=VALUE  COLUMN<NUMBER  <=  >  >=  COLUMN~TEXT (contains it)
 """
 _CONDITION = re.compile(r"([a-z_]+|tag\.[\w.-]+)\s*(!=|<=|>=|=|<|>|~)\s*(.*)", re.DOTALL)
@@ -159,7 +159,7 @@ def _print_table(rows: "Sequence[Row]") -> None:
 
     table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
     table.columns[0].overflow = "fold"
-    for name in ("score (s)", "laps", "best lap (s)", "age"):
+    for name in ("lap (s)", "race score (s)", "exploring laps", "fastest (s)", "age"):
         table.add_column(name, justify="right")
     several = len({row["user"] for row in rows}) > 1
     labelled = [key for key in _columns(rows) if key in ("name", "note") or key.startswith(USER_TAG)]
@@ -172,9 +172,10 @@ def _print_table(rows: "Sequence[Row]") -> None:
         table.add_row(
             row["run"],
             row["state"],
+            _number(row["lap_s"], ".2f"),
             _number(row["score_s"], ".2f"),
-            _number(row["laps"], ",.0f"),
-            _number(row["best_lap_s"], ".2f"),
+            _number(row["exploring_laps"], ",.0f"),
+            _number(row["exploring_lap_s"], ".2f"),
             _age((now - began).total_seconds()),
             *(str(row.get(key) or "") for key in shown),
         )

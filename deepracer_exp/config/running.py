@@ -93,7 +93,7 @@ class CheckpointsConfig:
     every: Count | None
     """Iterations between two evaluations (group `evaluation`); the last iteration is evaluated, too. null: never;
     the best policy is then chosen by the training's own episodes."""
-    metric: Literal["race_score", "lap_time", "progress"]
+    metric: Literal["race_score", "reliable_lap", "lap_time", "progress"]
     """The metric that ranks evaluations."""
     keep: Newest
     """How many of the newest evaluated checkpoints are kept besides the best and the last."""

@@ -63,7 +63,7 @@ class ConvergedRule:
     best_patience: Count
     """Iterations without a better policy, if policies are evaluated."""
     best_gain: Fraction
-    """Improvement of the race score that counts, as a share."""
+    """Improvement of the race score (usual and held-out) that counts, as a share."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.resolve import StoredRun
-from deepracer_exp.runs.result import CRITERIA
+from deepracer_exp.runs.result import BOTH, CRITERIA
 
 from .evaluate import fit
 from .evaluator import Evaluator
@@ -58,7 +58,7 @@ class LapStatistics:
     held_out_completion: float
     held_out_lap_time_s: float
     race_score_s: float | None
-    """Seconds per complete lap on all conditions, failed laps included."""
+    """Seconds per complete lap on usual and held-out conditions together, failed laps included."""
     rank: Rank
     """By the run's own metric, higher is better."""
 
@@ -160,8 +160,10 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
 
 
 def _words(found: LapStatistics) -> str:
-    score = "no complete lap" if found.race_score_s is None else f"race score {found.race_score_s:.2f} s"
-    return f"{score}, completion {found.completion:.1f}%"
+    name = BOTH if math.isfinite(found.held_out_completion) else "race score (usual)"
+    score = "no complete lap" if found.race_score_s is None else f"{name} {found.race_score_s:.2f} s"
+    lap = "" if math.isnan(found.median_s) else f", median usual lap {found.median_s:.2f} s"
+    return f"{score}, usual completion {found.completion:.1f}%{lap}"
 
 
 def comparison_table(results: Sequence[CheckpointResult], chosen: str, console: Console) -> Table:
@@ -223,10 +225,10 @@ def _page_table(results: Sequence[CheckpointResult]) -> PageTable:
 
 
 _LEGEND = (
-    f"laps: share of complete laps, with its {CONFIDENCE:.0%} interval in brackets",
-    "done: completion, the mean share of the lap driven",
-    "p25: a quarter of the laps are faster",
-    "score: race score, seconds per complete lap on all conditions, including failed laps",
+    f"laps: share of complete laps on usual conditions, with its {CONFIDENCE:.0%} interval in brackets",
+    "done: completion, the mean share of the lap driven on usual conditions",
+    "p25: a quarter of the usual laps are faster",
+    "score: race score, seconds per complete lap, usual and held-out laps together, including failed ones",
 )
 
 

@@ -164,7 +164,7 @@ def best_attempt(evaluation: Evaluation, trials: Container[int] | None = None) -
 
 
 def drive_best_lap(evaluator: Evaluator, policy: nn.Module) -> tuple[Lap, TensorDict]:
-    """Drive all trials, and again to record the best lap: every drive of a policy is the same.
+    """Drive all trials, and again to record the fastest usual lap: every drive of a policy is the same.
 
     Returns:
         The lap of n steps, and what the policy read and wrote in these, [n].

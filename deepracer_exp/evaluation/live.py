@@ -177,7 +177,7 @@ def track_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecor
     groups = [group for group in evaluation.groups if group.condition == USUAL]
     for course, group in zip(evaluator.race.setup.courses, groups, strict=True):
         times_s = group.lap_times_s
-        words = f"{len(times_s)} of {len(group.decided)} laps complete"
+        words = f"{len(times_s)} of {len(group.decided)} usual laps complete"
         words += f", the fastest in {min(times_s):.2f} s" if len(times_s) else ""
         laps = [recorder.lap(attempt) for attempt in group.attempts]
         lines = [np.column_stack([lap.x_m, lap.y_m, lap.speed_mps]) for lap in laps if len(lap) > 1]

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from deepracer_exp.runs.result import RELIABLE
+
 from .race_protocol import Attempt
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.zigzag import ZigZag
 
-Metric = Literal["progress", "lap_time", "race_score"]
+Metric = Literal["progress", "lap_time", "race_score", "reliable_lap"]
 Rank = tuple[float, float]
 """Compared in order, higher is better."""
 Interval = tuple[float, float]
@@ -82,11 +84,17 @@ class Group:
         return total(self.zigzags)
 
     def rank(self, metric: Metric) -> Rank:
-        """Return the policy's rank by a metric; without a complete lap, times fall back to progress."""
+        """Return the policy's rank by a metric; without a complete lap, times fall back to progress.
+
+        `reliable_lap` ranks mean lap times of policies that complete `RELIABLE` of their laps above all others, which
+        rank by progress.
+        """
+        if metric == "reliable_lap" and self.lap_share < RELIABLE:
+            return 0.0, self.completion
         if metric == "progress":
             mean = self.mean_lap_time_s
             return self.completion, 0.0 if mean is None else 1 / mean
-        score = self.mean_lap_time_s if metric == "lap_time" else self.race_score_s
+        score = self.race_score_s if metric == "race_score" else self.mean_lap_time_s
         return (0.0, self.completion) if score is None else (1.0, -score)
 
     def statistics(self) -> dict[str, Any]:
@@ -162,18 +170,20 @@ class Evaluation:
 
     @property
     def race_score_s(self) -> float | None:
-        """Race score on all conditions together, mean over tracks; None without a lap on every track."""
+        """Race score on usual and held-out conditions together, mean over tracks; None without a lap on every track."""
         tracks_with_lap, negative_s = self.rank("race_score")
         return -negative_s if tracks_with_lap == 1.0 else None
 
     def rank(self, metric: Metric) -> Rank:
-        """Return the policy's rank by a metric on all conditions together.
+        """Return the policy's rank by a metric: of usual and held-out laps together, by `reliable_lap` of usual ones.
 
         A few laps on the usual conditions cannot distinguish a policy that completes 19 of 20 laps from one that
-        completes all, so held-out laps count too. On several tracks, times are means over tracks, and one more track
-        with a complete lap outranks any time, because lap times of different tracks do not compare.
+        completes all, so held-out laps count too, unless the fastest lap is wanted. On several tracks, times are means
+        over tracks, and one more track with a complete (for `reliable_lap`: reliable) lap outranks any time, because
+        lap times of different tracks do not compare.
         """
-        by_track = [[group for group in self.groups if group.track == track] for track in self.tracks]
+        counted = [group for group in self.groups if metric != "reliable_lap" or group.condition == USUAL]
+        by_track = [[group for group in counted if group.track == track] for track in self.tracks]
         ranks = [
             _together(groups, track, "all").rank(metric)
             for track, groups in zip(self.tracks, by_track, strict=True)

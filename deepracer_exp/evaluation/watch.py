@@ -262,7 +262,7 @@ class _Distribution:
 
 
 def film_run(run: StoredRun, config: EvaluateConfig, file: Path | None, out: Console, err: Console) -> None:
-    """Race a run's checkpoint under a protocol and film its best lap on the usual conditions.
+    """Race a run's checkpoint under a protocol and film its fastest lap on the usual conditions.
 
     `file` is the .mp4 to write; None: named after the checkpoint, in the run's folder.
 

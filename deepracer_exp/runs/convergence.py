@@ -25,7 +25,7 @@ from deepracer_exp.config.stopping import (
 from deepracer_exp.errors import count
 
 from . import trends
-from .result import RELIABLE
+from .result import reliable_lap_s
 from .trends import Average, Found
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ class TrendRule(StoppingRule):
             share = entropy_share(entropy, self._entropy_at_start, self._action_count)
         return {
             "entropy": share,
-            _LAP_SPEED: _lap_speed(row),
+            _LAP_SPEED: 1 / lap_s if (lap_s := reliable_lap_s(row)) else None,
             "laps_per_1000_steps": _STEPS * (row["laps"] - laps) / max(row["env_steps"] - steps, 1),
             **{name: row.get(name) for name in ("completion", "mean_return", *EVALUATED)},
         }
@@ -245,12 +245,6 @@ class TrendRule(StoppingRule):
             return None
         idle = count(rule.patience, "iteration")
         return f"{completion.now:.1f}% completion, entropy {entropy.now:.1%}, no growth for {idle}", values
-
-
-def _lap_speed(row: Row) -> float | None:
-    """Return 1 / mean lap time of an evaluation, None where too few laps are complete to compare it."""
-    share, lap_time_s = row.get("eval_lap_share"), row.get("eval_lap_time_s")
-    return None if share is None or lap_time_s is None or share < RELIABLE else 1 / lap_time_s
 
 
 def build_rule(config: StoppingConfig, action_count: int | None) -> StoppingRule:

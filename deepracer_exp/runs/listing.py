@@ -10,9 +10,23 @@ from deepracer_exp.errors import BadInput
 from .files import CONFIG, PROVENANCE, SUMMARY, read_object, read_run_id, run_folders
 from .labels import read_labels
 
-COLUMNS = ("run", "name", "state", "score_s", "laps", "best_lap_s", "began", "user", "host", "note", "id")
-"""Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `score_s` the
-race score of the best checkpoint and `best_lap_s` the fastest exploring lap, both in seconds."""
+COLUMNS = (
+    "run",
+    "name",
+    "state",
+    "lap_s",
+    "score_s",
+    "exploring_laps",
+    "exploring_lap_s",
+    "began",
+    "user",
+    "host",
+    "note",
+    "id",
+)
+"""Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `lap_s`
+the mean usual lap of the best checkpoint, `score_s` its race score (usual and held-out), `exploring_lap_s` the fastest
+exploring lap, all in seconds."""
 
 Row = dict[str, Any]
 
@@ -33,8 +47,10 @@ def _of_folder(folder: Path, is_held: Callable[[Path], bool]) -> Row:
     except BadInput:  # one damaged run does not hide the others
         return row | {"state": "unreadable"}
     row["state"] = str(summary.get("status") or ("running" if is_held(folder) else "killed"))
-    row |= {"score_s": (summary.get("best") or {}).get("eval_race_score_s"), "laps": summary.get("laps")}
-    row |= {"best_lap_s": summary.get("best_lap_time_s"), "name": labels.name, "note": labels.note}
+    best = summary.get("best") or {}
+    row |= {"lap_s": best.get("eval_lap_time_s"), "score_s": best.get("eval_race_score_s")}
+    row |= {"exploring_laps": summary.get("laps"), "exploring_lap_s": summary.get("best_lap_time_s")}
+    row |= {"name": labels.name, "note": labels.note}
     row |= {key: machine.get(key) for key in ("user", "host")}
     return row | labels.named_tags
 

@@ -123,8 +123,8 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
     """Return the folder of an experiment's best run.
 
     Of a sweep it is the run of its best trial, whatever else was trained under the same name. Otherwise runs whose
-    best checkpoint was evaluated are ranked by that; where none was, by the share of complete laps and the fastest lap
-    of their training. The newest of equals is taken, and a single run without results, such as an imported model.
+    best checkpoint was evaluated are ranked by that; where none was, by the share of complete exploring laps
+    and the fastest of them. The newest of equals is taken, and a single run without results, such as an imported model.
 
     Raises:
         BadInput: there is no such experiment, none of its runs has a result, they cannot be ranked (another car,

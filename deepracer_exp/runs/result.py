@@ -1,7 +1,7 @@
 """How a run ended and how good its best checkpoint is, by its summary."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,18 +18,21 @@ IN_TRAINING = "training"
 RELIABLE = 0.95
 """Share of complete laps on usual conditions from which on a policy counts as reliable."""
 CRITERIA = {
-    "race_score": "race score",
-    "lap_time": "mean lap",
-    "progress": "completion",
-    IN_TRAINING: "laps in training",
+    "race_score": "race score (usual and held-out)",
+    "reliable_lap": "reliable lap (usual)",
+    "lap_time": "mean lap (usual and held-out)",
+    "progress": "completion (usual and held-out)",
+    IN_TRAINING: "exploring laps",
 }
 """What a measure is called; the best of several policies or runs is the one with the highest rank by it."""
+BOTH = "race score (usual and held-out)"
+"""Name of the race score of an evaluation under both conditions."""
 FIGURES: tuple[tuple[str, str, str, int], ...] = (
-    ("race score, s", "race_score_s", "{:.2f}", -1),
-    ("complete laps, %", "laps_percent", "{:.0f}", 1),
-    ("completion, %", "completion", "{:.1f}", 1),
+    ("mean usual lap, s", "lap_time_s", "{:.2f}", -1),
+    ("usual laps complete, %", "laps_percent", "{:.0f}", 1),
+    ("usual completion, %", "completion", "{:.1f}", 1),
     ("held-out completion, %", "held_out_completion", "{:.1f}", 1),
-    ("mean lap, s", "lap_time_s", "{:.2f}", -1),
+    (f"{BOTH}, s", "race_score_s", "{:.2f}", -1),
 )
 """Figures of an evaluated policy wherever they are shown: name and unit, attribute of RunResult, format, and whether a
 higher value is better (1) or a lower one (-1)."""
@@ -52,7 +55,7 @@ class RunResult:
     iteration: int | None = None
     """After which the policy was evaluated, the number of its checkpoint; None: not evaluated."""
     race_score_s: float | None = None
-    """Seconds per complete lap on all conditions, failed laps included."""
+    """Seconds per complete lap on usual and held-out conditions, failed laps included."""
     laps_percent: float | None = None
     """Complete laps of a hundred tried on the usual conditions."""
     completion: float | None
@@ -60,7 +63,7 @@ class RunResult:
     held_out_completion: float | None = None
     """The same on the held-out conditions."""
     lap_time_s: float | None
-    """Mean of the evaluated complete laps, or the fastest of the training."""
+    """Mean of the evaluated complete laps on the usual conditions, or the fastest exploring lap."""
 
     @property
     def evaluated(self) -> bool:
@@ -73,16 +76,69 @@ class RunResult:
         return CRITERIA.get(self.measure, self.measure)
 
     def words(self) -> str:
-        """Return the figures that are known: ``race score 8.02 s, completion 100.0%, mean lap 7.97 s``."""
+        """Return the figures that are known: ``mean usual lap 7.97 s, usual completion 100.0%``."""
         if not self.evaluated:
-            known = [("completion, %", self.completion, "{:.1f}"), ("best lap, s", self.lap_time_s, "{:.2f}")]
+            known = [
+                ("exploring completion, %", self.completion, "{:.1f}"),
+                ("fastest exploring lap, s", self.lap_time_s, "{:.2f}"),
+            ]
         else:
-            known = [(name, getattr(self, key), form) for name, key, form, _ in FIGURES]
+            known = [(self.figure(name), getattr(self, key), form) for name, key, form, _ in FIGURES]
         parts = [(*name.split(", "), form.format(value)) for name, value, form in known if value is not None]
         text = ", ".join(f"{name} {with_unit(value, unit)}" for name, unit, value in parts)
         if self.lap_time_s is None:
             text += ", no complete lap"
-        return text if self.evaluated else f"in training {text}"
+        return text
+
+    def figure(self, name: str) -> str:
+        """Return the name of one of FIGURES; without held-out conditions, the race score is that of the usual ones."""
+        return (
+            name if self.held_out_completion is not None else name.replace("(usual and held-out)", "(usual)")
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReliableLap:
+    """The lap of the evaluated policy that was the fastest of the reliable ones of its run."""
+
+    iteration: int
+    """After which the policy was evaluated, the number of its checkpoint."""
+    lap_time_s: float
+    """Mean of its complete laps on the usual conditions, with several tracks of all of them."""
+    laps: int | None
+    """Complete ones; None in runs of older versions, which have their share only; likewise the next one."""
+    laps_tried: int | None
+
+    def __str__(self) -> str:
+        """Return it in words: ``checkpoint 40, 6.72 s, 8 of 8``."""
+        laps = (
+            f"{self.laps} of {self.laps_tried}" if self.laps_tried else f"{RELIABLE:.0%} or more of the laps"
+        )
+        return f"checkpoint {self.iteration}, {self.lap_time_s:.2f} s, {laps}"
+
+
+def fastest_reliable(rows: Iterable[Mapping[str, Any]]) -> ReliableLap | None:
+    """Return the fastest lap among evaluated policies that completed `RELIABLE` of their usual laps, None without.
+
+    Args:
+        rows: of metrics.jsonl.
+    """
+    reliable = [row for row in rows if reliable_lap_s(row) is not None]
+    if not reliable:
+        return None
+    best = min(reliable, key=lambda row: row["eval_lap_time_s"])
+    return ReliableLap(
+        iteration=best["iteration"],
+        lap_time_s=best["eval_lap_time_s"],
+        laps=best.get("eval_laps"),
+        laps_tried=best.get("eval_laps_tried"),
+    )
+
+
+def reliable_lap_s(row: Mapping[str, Any]) -> float | None:
+    """Return the mean lap time of a row's evaluation, None if it has none or completed too few of its usual laps."""
+    share, lap_time_s = row.get("eval_lap_share"), row.get("eval_lap_time_s")
+    return None if share is None or share < RELIABLE else lap_time_s
 
 
 def read_result(run: Path) -> RunResult | None:

@@ -198,15 +198,15 @@ OURS = "Trainings of `deepracer-exp`."
 """Beginning of an experiment's description that was not edited."""
 
 _RACE = {
-    "score_s": "race score {:.2f} s",
-    "lap_time_s": "lap {:.2f} s",
+    "lap_time_s": "mean usual lap {:.2f} s",
     "completion": "{:.1f}% of the lap",
     "held_out_completion": "{:.1f}% on conditions not trained on",
+    "score_s": "race score (usual and held-out) {:.2f} s",
 }
 
 
 def race_result(metrics: Mapping[str, float | None]) -> str:
-    """Return an evaluation, by MLflow's names, in words: ``race score 8.34 s, lap 8.21 s, 99.1% of the lap``."""
+    """Return an evaluation, by MLflow's names, in words: ``mean usual lap 8.21 s, 99.1% of the lap``."""
     values = {name.rpartition("/")[2]: value for name, value in metrics.items()}
     parts = [words.format(values[name]) for name, words in _RACE.items() if values.get(name) is not None]
     return ", ".join(parts) or "no complete lap"
@@ -228,7 +228,7 @@ def result_note(summary: Mapping[str, Any], run_id: str, files: Mapping[str, Any
 def experiment_note(best_run: str, run_id: str, experiment_id: str, metrics: Mapping[str, float]) -> str:
     """Return an experiment's description with its best run."""
     link = f"[{best_run}](#/experiments/{experiment_id}/runs/{run_id}?{WORKFLOW})"
-    return f"{OURS} Lowest race score so far: {link}, {race_result(metrics)}.\n\n{picture(run_id)}"
+    return f"{OURS} Lowest race score (usual and held-out) so far: {link}, {race_result(metrics)}.\n\n{picture(run_id)}"
 
 
 def study_experiment_note(experiment_id: str, run_id: str, winner: str) -> str:
@@ -238,6 +238,6 @@ def study_experiment_note(experiment_id: str, run_id: str, winner: str) -> str:
 
 
 def picture(run_id: str) -> str:
-    """Return the Markdown for the picture of a run's fastest lap."""
+    """Return the Markdown for the picture of a run's fastest exploring lap."""
     address = f"get-artifact?path={BEST_LAP}&run_uuid={run_id}"
-    return f"The fastest lap of the training:\n\n![fastest lap]({address})"
+    return f"The fastest exploring lap:\n\n![fastest exploring lap]({address})"

@@ -7,11 +7,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 METRICS: Mapping[str, tuple[str, str]] = {
-    "eval_race_score_s": ("race/score_s", "seconds per complete lap on all conditions, failed laps included"),
-    "eval_lap_time_s": ("race/lap_time_s", "mean time of the evaluation's complete laps"),
-    "eval_completion": ("race/completion", "mean progress of the evaluation's laps in per cent"),
+    "eval_race_score_s": (
+        "race/score_s",
+        "seconds per complete lap on usual and held-out conditions together, failed laps included",
+    ),
+    "eval_lap_time_s": ("race/lap_time_s", "mean time of the evaluation's complete laps on usual conditions"),
+    "eval_completion": ("race/completion", "mean progress of its laps on usual conditions in per cent"),
     "held_out_completion": ("race/held_out_completion", "the same on held-out conditions"),
-    "eval_lap_share": ("race/lap_share", "share of the evaluation's laps that were completed (0 to 1)"),
+    "eval_lap_share": (
+        "race/lap_share",
+        "share of its laps on usual conditions that were completed (0 to 1)",
+    ),
+    "eval_laps": ("race/laps", "number of these"),
+    "eval_laps_tried": ("race/laps_tried", "number of laps tried on usual conditions"),
     "eval_zigzag_per_m": (
         "race/zigzag_per_m",
         "changes of steering from one side to the other a metre of straight, usual conditions",
@@ -23,9 +31,9 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "train/lap_share",
         "share of recent episodes with a lap (0 to 1), the lowest of all tracks",
     ),
-    "best_lap_time_s": ("train/best_lap_time_s", "fastest lap so far, with sampled actions"),
-    "mean_lap_time_s": ("train/mean_lap_time_s", "mean time of the iteration's completed laps"),
-    "laps": ("train/laps", "laps completed so far"),
+    "best_lap_time_s": ("train/best_lap_time_s", "fastest exploring lap so far"),
+    "mean_lap_time_s": ("train/mean_lap_time_s", "mean time of the iteration's exploring laps"),
+    "laps": ("train/laps", "exploring laps completed so far"),
     "mean_return": ("train/mean_return", "mean sum of rewards of finished episodes"),
     "episodes": ("train/episodes", "episodes finished so far"),
     "iteration": ("train/iteration", "training iteration"),

@@ -30,12 +30,12 @@ NOTHING = "\N{EN DASH}"
 
 _HALVES = 60  # columns from which the figures stand in two halves side by side
 _WIDE = 76  # columns from which the limit of the budget stands beside the bar
-# Columns of a name, a value, between the halves, of the right half.
-_LABEL, _VALUE, _GAP, _RIGHT = 12, 10, 3, 24
+# Columns of a name, of one in the left half, of a value, between the halves, of the right half.
+_LABEL, _LEFT_LABEL, _VALUE, _GAP, _RIGHT = 15, 12, 10, 2, 25
 _FRAME_LINES = 10  # of the panel beside figures and table, and the terminal's last
 # Columns between tracks, and of a track: 18 tracks in three columns of a terminal of 80.
 _TABLE_GAP, _CELL = 2, 22
-_PERCENT, _LAP = 4, 7  # columns of per cent and lap time in it
+_PERCENT, _LAP = 4, 8  # columns of per cent and lap time in it
 
 # What is shown of a row by its label: key, format and unit.
 _FIGURES = {
@@ -43,9 +43,10 @@ _FIGURES = {
     "return": ("mean_return", ",.2f", ""),
     "entropy": ("entropy", ".3f", ""),
     "learn rate": ("lr", ".2g", ""),
-    "laps": ("laps", ",.0f", ""),
-    "best lap": ("best_lap_time_s", ".2f", " s"),
-    "mean lap": ("mean_lap_time_s", ".2f", " s"),
+    "exploring laps": ("laps", ",.0f", ""),
+    "their fastest": ("best_lap_time_s", ".2f", " s"),
+    "their mean": ("mean_lap_time_s", ".2f", " s"),
+    "usual lap": ("eval_lap_time_s", ".2f", " s"),
     "env steps": ("env_steps", ",.0f", ""),
     "speed": ("env_steps_per_s", ",.0f", " steps/s"),
     "iteration": ("iteration", ",.0f", ""),
@@ -58,12 +59,25 @@ _CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
     "entropy": ("magenta", None),
 }
 """Colour, and the values of the lowest and highest bar, of the figures that are drawn as curves."""
-_PAIRS = (("completion", "laps"), ("return", _SHARE), ("entropy", "best lap"), ("learn rate", "mean lap"))
-_PAIRS_OF_TRACKS = (("completion", "laps"), ("return", _SHARE), ("entropy", "learn rate"))
-_PAIRS_OF_STEPS = (("env steps", "iteration"), ("speed", "episodes"))
+_COMPLETE = "complete"
+_PAIRS = (
+    *(("completion", "exploring laps"), ("return", _SHARE), ("entropy", "their fastest")),
+    ("learn rate", "their mean"),
+)
+_PAIRS_OF_TRACKS = (("completion", "exploring laps"), ("return", _SHARE), ("entropy", "learn rate"))
+_PAIRS_OF_STEPS = (("usual lap", _COMPLETE), ("env steps", "iteration"), ("speed", "episodes"))
 _BY_IMPORTANCE = (
-    *("iteration", "completion", "laps", _SHARE, "best lap", "entropy", "return", "mean lap", "env steps"),
-    *("speed", "episodes", "learn rate"),
+    *(
+        "iteration",
+        "usual lap",
+        _COMPLETE,
+        "completion",
+        "exploring laps",
+        _SHARE,
+        "their fastest",
+        "entropy",
+    ),
+    *("return", "their mean", "env steps", "speed", "episodes", "learn rate"),
 )
 
 
@@ -107,6 +121,7 @@ class ProgressDisplay:
         self._started_s, self._shown_s = 0.0, -math.inf
         self._pending = False
         self._row: Row = {}
+        self._evaluated: Row = {}
         self._fraction = self._elapsed_s = 0.0
         self._eta_s: float | None = None
         self._history: dict[str, list[float]] = {label: [] for label in _CURVES}
@@ -144,6 +159,8 @@ class ProgressDisplay:
             value = _value(row, _FIGURES[label][0])
             if value is not None:
                 values.append(value)
+        if row.get("eval_lap_share") is not None:
+            self._evaluated = row  # stays until the next evaluation
         self._tracks.add(row)
         self._pending = True
         line_s = min(max(LINE_S, _LINE_SHARE * self._elapsed_s), _LINE_AT_MOST_S)
@@ -171,13 +188,18 @@ class ProgressDisplay:
             self._figure("speed").replace(" steps/s", "/s"),
             f"return {self._figure('return')}",
             f"completion {self._figure('completion')}",
-            f"laps {self._figure('laps')} ({share} of last {self._header.remembered})",
-            self._tracks.least() if self._tracks else f"best lap {self._figure('best lap')}",
+            self._evaluated_lap(),
+            f"exploring laps {self._figure('exploring laps')} ({share} of last {self._header.remembered})",
+            self._tracks.least() if self._tracks else f"their fastest {self._figure('their fastest')}",
             f"entropy {self._figure('entropy')}",
             f"lr {self._figure('learn rate')}",
             _left(self._eta_s),
         ]
         return " · ".join(parts)
+
+    def _evaluated_lap(self) -> str:
+        """Return the mean lap of the last evaluation on usual conditions, and how many of its laps were complete."""
+        return f"usual lap {self._figure('usual lap')} ({self._figure(_COMPLETE)})"
 
     def _panel(self) -> Panel:
         # On a wider terminal the halves would be too far apart to be read together.
@@ -231,21 +253,21 @@ class ProgressDisplay:
         pairs = _PAIRS_OF_TRACKS if self._tracks else _PAIRS  # lap times are in the table
         left = width - _GAP - _RIGHT
         both = [
-            Text(" " * _GAP).join((self._cell(one, left), self._cell(other, _RIGHT)))
+            Text(" " * _GAP).join((self._cell(one, left, _LEFT_LABEL), self._cell(other, _RIGHT)))
             for one, other in (*pairs, *_PAIRS_OF_STEPS)
         ]
         return [*both[: len(pairs)], Text(""), *both[len(pairs) :]]
 
     def _column(self, width: int) -> list[Text]:
-        hidden = ("best lap", "mean lap") if self._tracks else ()
+        hidden = ("their fastest", "their mean") if self._tracks else ()
         return [self._cell(label, width) for label in _BY_IMPORTANCE if label not in hidden]
 
-    def _cell(self, label: str, width: int) -> Text:
+    def _cell(self, label: str, width: int, room: int = _LABEL) -> Text:
         name = f"{label} {self._header.remembered}" if label == _SHARE else label
-        cell = Text.assemble((name.ljust(_LABEL), "dim"), (self._figure(label).ljust(_VALUE), "bold"))
+        cell = Text.assemble((name.ljust(room), "dim"), (self._figure(label).ljust(_VALUE), "bold"))
         if label in _CURVES:
             style, bounds = _CURVES[label]
-            cell.append(sparkline(self._history[label], width - _LABEL - _VALUE, bounds), style=style)
+            cell.append(sparkline(self._history[label], width - room - _VALUE, bounds), style=style)
         cell.truncate(width, overflow="ellipsis", pad=True)
         return cell
 
@@ -253,13 +275,16 @@ class ProgressDisplay:
         if label == _SHARE:
             share = _value(self._row, "lap_share")
             return NOTHING if share is None else f"{100 * share:.0f}%"
+        if label == _COMPLETE:
+            laps, tried = (self._evaluated.get(key) for key in ("eval_laps", "eval_laps_tried"))
+            return NOTHING if tried is None else f"{laps} of {tried}"
         key, spec, unit = _FIGURES[label]
-        value = _value(self._row, key)
+        value = _value(self._evaluated if key.startswith("eval_") else self._row, key)
         return NOTHING if value is None else format(value, spec) + unit
 
 
 class TrackTable:
-    """Completion and best lap of each track."""
+    """Completion and fastest exploring lap of each track."""
 
     def __init__(self, labels: Sequence[str]):
         """Start empty.
@@ -306,7 +331,7 @@ class TrackTable:
         rows = -(-len(cells) // columns)
         used = -(-len(cells) // rows)
         cells += [Text(" " * cell)] * (rows * used - len(cells))
-        head = Text(_columns("track", "%", "lap s", cell), style="dim")
+        head = Text(_columns("track", "%", "fastest", cell), style="dim")
         grid = [[head] * used, *(cells[row::rows] for row in range(rows))]
         return [Text(" " * _TABLE_GAP).join(row) for row in grid]
 

@@ -38,9 +38,11 @@ class Replay:
     """Mean per cent of the lap over the last ten iterations before the end."""
     completion_whole: float | None
     lap_time_s: float | None
-    """Fastest lap up to the end: of the evaluations where the run has them, otherwise of the training. With several
-    tracks the mean of theirs, None while one has none."""
+    """Fastest lap up to the end: of the evaluated policies where the run has them, otherwise the fastest exploring lap.
+    With several tracks the mean of theirs, None while one has none."""
     lap_time_whole_s: float | None
+    evaluated: bool
+    """Whether the laps are those of evaluated policies."""
 
     @property
     def saved(self) -> float:
@@ -87,6 +89,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
         completion_whole=_ended_with(rows),
         lap_time_s=_fastest(rows[:count], rows),
         lap_time_whole_s=_fastest(rows, rows),
+        evaluated=_is_evaluated(rows),
     )
 
 
@@ -95,7 +98,7 @@ def table(replays: Sequence[Replay]) -> Table:
     grid = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("run", "rule"):
         grid.add_column(name, overflow="fold")
-    for name in ("ends after", "steps", "saved", "completion", "best lap", "lap lost"):
+    for name in ("ends after", "steps", "saved", "completion", "fastest lap", "lap lost"):
         grid.add_column(name, justify="right", no_wrap=True)
     for one in replays:
         grid.add_row(
@@ -105,7 +108,7 @@ def table(replays: Sequence[Replay]) -> Table:
             f"{one.env_steps:,}",
             f"{one.saved:.0%}, {one.saved_s:.0f} s" if one.decision else NOTHING,
             _of(one.completion, one.completion_whole, "{:.1f}", "%"),
-            _of(one.lap_time_s, one.lap_time_whole_s, "{:.2f}", "s"),
+            _of(one.lap_time_s, one.lap_time_whole_s, "{:.2f}", "s") + " exploring" * (not one.evaluated),
             NOTHING if one.lap_loss is None else f"{one.lap_loss:.1%}",
         )
     for rule in dict.fromkeys(one.rule for one in replays):
@@ -163,9 +166,13 @@ def _ended_with(rows: Sequence[Row]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
+def _is_evaluated(rows: Sequence[Row]) -> bool:
+    return any(row.get("eval_lap_time_s") is not None for row in rows)
+
+
 def _fastest(rows: Sequence[Row], every: Sequence[Row]) -> float | None:
     """Return the fastest lap in `rows`; `every` row of the run decides which columns have lap times."""
-    if any(row.get("eval_lap_time_s") is not None for row in every):
+    if _is_evaluated(every):
         columns = ["eval_lap_time_s"]
     else:
         columns = [key for key in every[-1] if key.startswith("best_lap_time_s/")] or ["best_lap_time_s"]

@@ -76,11 +76,11 @@ def test_figures_of_the_best_checkpoint_are_those_of_the_summary(record):
     table = {name: texts for name, texts, _ in results([evaluated, record("b")])}
     assert {name: texts[0] for name, texts in table.items() if texts[1] == NOTHING} == {
         "best checkpoint": "000010",
-        "race score, s": "8.50",
-        "complete laps, %": "88",
-        "completion, %": "96.2",
+        "race score (usual and held-out), s": "8.50",
+        "usual laps complete, %": "88",
+        "usual completion, %": "96.2",
         "held-out completion, %": "81.0",
-        "mean lap, s": "8.25",
+        "mean usual lap, s": "8.25",
     }
 
 
@@ -96,10 +96,10 @@ def test_metrics_of_the_training_are_those_of_its_last_iteration(record):
 
 def test_the_fastest_is_the_best_and_what_no_run_has_is_left_out(record):
     table = {name: (texts, best) for name, texts, best in results([record("a"), record("b", lap_s=9.0)])}
-    assert table["best lap in training, s"] == (["10.00", "9.00"], 1)
-    assert table["laps in training"] == (["20", "20"], None)
+    assert table["fastest exploring lap, s"] == (["10.00", "9.00"], 1)
+    assert table["exploring laps"] == (["20", "20"], None)
     assert table["control steps"][1] is None
-    assert "mean lap, s" not in table
+    assert "mean usual lap, s" not in table
     assert "cost" not in table
 
 
@@ -126,7 +126,7 @@ def test_runs_of_any_kind_are_drawn_over_each_other(record):
     best = {"metric": "race_score", "iteration": 10, "rank": [1.0, -9.0], **evaluated}
     raced = dataclasses.replace(record("raced", eval_lap_time_s=8.4), summary={"best": best})
     panels = [p for row in learning_curves_compared({"A": raced, "B": record("not")}).rows for p in row]
-    assert [panel.title for panel in panels][-2:] == ["Lap time in evaluation, mean", "Lap times"]
+    assert [panel.title for panel in panels][-2:] == ["Evaluated usual laps, mean", "Lap times"]
     (star,) = (one for one in layers(panels[-1], "points") if one.marker.symbol == "star")
     np.testing.assert_allclose(star.y, [8.2, np.nan], rtol=1e-6)
     none = learning_curves_compared({"A": record("x", lap_s=None), "B": record("y", lap_s=None)})
@@ -154,12 +154,12 @@ def test_the_command_shows_differences_and_results_and_writes_the_page_it_is_ask
     words = [line.split() for line in ended.stdout.splitlines()]
     assert ["A", "runs/e/first"] in words
     assert ["seed", "1", "2"] in words
-    assert ["best", "lap", "in", "training,", "s", "10.00", "9.25"] in words
+    assert ["fastest", "exploring", "lap,", "s", "10.00", "9.25"] in words
     assert [page.name for page in tmp_path.rglob("*.html")] == output[1:]
     for page in tmp_path.rglob("*.html"):
         text = Html(page.read_text()).text
         assert "Runs of default compared" in text
-        for row in ("A first B second", "seed 1 2", "best lap in training, s 10.00 9.25"):
+        for row in ("A first B second", "seed 1 2", "fastest exploring lap, s 10.00 9.25"):
             assert row in text
 
 

@@ -200,7 +200,7 @@ def test_laps_with_resets_are_no_laps_of_the_driving_line() -> None:
     assert view.episodes["resets"].tolist() == [0, 0, 0, 0, 0, 1]
     assert view.episodes["lap_time_s"].notna().tolist() == [True] * 5 + [False]
     assert view.episodes["reset_lap_time_s"].notna().tolist() == [False] * 5 + [True]
-    assert "5 complete laps, the best in 9.9" in headline(view)
+    assert "5 complete exploring laps, the fastest in 9.9" in headline(view)
     assert headline(view).endswith("; 1 more lap with resets.")
     found = of(view, "chance")
     assert (found.values["laps"], found.values["complete"]) == (5, pytest.approx(5 / 6))
@@ -236,7 +236,7 @@ def test_laps_that_are_in_metrics_files_only_can_be_submitted() -> None:
     metrics = pd.DataFrame({"episode": np.arange(100, 108)}).assign(**known)
     view = prepare(replace(recording, metrics=metrics))
     assert of(view, "submit").sentence.startswith("Submit the checkpoint (its name is not logged")
-    words = "8 more episodes known from metrics files only; 8 complete laps, the best in 9.50 s"
+    words = "8 more episodes known from metrics files only; 8 complete exploring laps, the fastest in 9.50 s"
     assert words in headline(view)
     charts = {one.name: one for one in charts_of(view)}
     assert "a quarter of the 5 episodes with a trace" in charts["quarters"].caption
@@ -249,7 +249,7 @@ def test_the_chance_of_a_lap_is_measured_and_fitted_on_the_laps_of_the_last_thir
     view = laps_of((6, 0, 1.0), (6, 0, 1.0), (4, 0, 2.0), (2, 0, 3.0))
     found = of(view, "chance", target_s=Drive(speed_mps=2.5).lap_time_s())
     assert (found.values["laps"], found.values["faster"]) == (6, 2)
-    assert "2 of 6 complete laps since iteration 2 took at most 7.15 s" in found.sentence
+    assert "2 of 6 complete exploring laps since iteration 2 took at most 7.15 s" in found.sentence
     assert (found.values["low"], found.values["high"]) == pytest.approx((0.0968, 0.7), abs=1e-3)
     assert found.values["normal"] == pytest.approx(0.303, abs=0.001)
 
@@ -392,7 +392,7 @@ def test_a_run_of_ours_is_advised_to_take_a_checkpoint_that_it_has() -> None:
         view = training(completions, evaluated=FALLING)
         assert "000010" not in of(view, rule).sentence
         own = replace(view, recording=replace(view.recording, best=best))
-        assert "checkpoint 000010 (the best by race score)" in of(own, rule).sentence
+        assert "checkpoint 000010 (the best by race score (usual and held-out))" in of(own, rule).sentence
         assert "enough laps" not in "".join(one.caption for one in charts_of(own))
 
 
@@ -423,7 +423,7 @@ def test_a_race_without_training_is_judged_by_its_laps() -> None:
     assert [one.rule for one in findings(view)] == ["chance", "time_lost", "runs_off"]
     assert of(view, "chance").sentence.startswith("3 of 3 episodes in the evaluations are complete laps")
     assert headline(view).startswith("No training; ")
-    assert "3 complete laps, the best in 8.92 s" in headline(view)
+    assert "3 complete laps, the fastest in 8.92 s" in headline(view)
     drawn = {chart.name for chart in charts_of(view)}
     assert "of the training" not in html(LogPage(view, findings(view)))
     assert {"lap_line", "sector_times", "speed_steering_by_waypoint", "lap_time_histogram"} <= drawn

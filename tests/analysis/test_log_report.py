@@ -77,7 +77,13 @@ def test_the_page_is_small_loads_nothing_and_has_words_and_tables_without_script
     own = re.sub(r'(?s)<script type="text/plain".*?</script>', "", html)
     assert not re.search(r"https?://|url\(|@import", own)
     assert [file.name for file in path.parent.iterdir()] == ["report.html"]
-    titles = ("The best laps", "Candidates for submission", "Iterations", "What was trained", "What was read")
+    titles = (
+        "The fastest exploring laps",
+        "Candidates for submission",
+        "Iterations",
+        "What was trained",
+        "What was read",
+    )
     heads = ("Lap time, s", "25th percentile, s", "Entropy, nats")
     assert [words for words in (headline(view), *titles, *heads) if words not in read.text] == []
     assert read.text.count("figures need JavaScript") == html.count("data-plot=")
@@ -262,7 +268,7 @@ def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
     assert replayed.best_laps.rows[0][:3] == ("1", "3", "1")
     assert [chart.name for chart in replayed.charts] == ["replayed_laps", "replayed_places"]
     text = Html(page_html(LogPage(view, findings(view), replay=replayed))).text
-    assert text.index(replayed.sentences[0]) < text.rindex("The best laps")
+    assert text.index(replayed.sentences[0]) < text.rindex("The fastest exploring laps")
 
 
 def test_the_gallery_lists_every_figure_of_the_page_and_every_finding_names_one_of_them():

@@ -61,16 +61,16 @@ def result(name: str, found: LapStatistics | None, **changes: object) -> Checkpo
         (
             {"000010": figures(95, 9.0), "000020": figures(50, 8.5)},
             "000020",
-            "best by race score: race score 8.50 s, completion 90.0%; "
-            "next is 000010: race score 9.00 s, completion 90.0%",
+            "best by race score (usual and held-out): race score (usual) 8.50 s, usual completion 90.0%, median usual "
+            "lap 8.50 s; next is 000010: race score (usual) 9.00 s, usual completion 90.0%, median usual lap 9.00 s",
         ),
         ({"000010": figures(100, 8.5), "000020": figures(90, 8.5)}, "000010", "next is 000020"),
         (
             {"000010": figures(0, math.nan, done=62.0), "000020": figures(0, math.nan, done=41.0)},
             "000010",
-            "no complete lap, completion 62.0%",
+            "no complete lap, usual completion 62.0%",
         ),
-        ({"000010": figures(50, 9.0), "000020": None}, "000010", "race score 9.00 s"),
+        ({"000010": figures(50, 9.0), "000020": None}, "000010", "race score (usual) 9.00 s"),
     ],
     ids=["best by the run's metric", "a tie goes to the oldest", "no lap", "never a corrupt one"],
 )
@@ -82,7 +82,7 @@ def test_a_checkpoint_is_recommended_with_the_next_one(found, name, words):
 
 def test_a_recommendation_other_than_best_says_so_and_without_any_there_is_none():
     listed = [result("000010", figures(100, 9.0), labels=("best",)), result("000020", figures(100, 8.5))]
-    other = "`best`, chosen in the trials of the training, is 000010: race score 9.00 s"
+    other = "`best`, chosen in the trials of the training, is 000010: race score (usual) 9.00 s"
     assert other in recommend(listed, "race_score")[1]
     assert recommend([result("000010", None)], "race_score") is None
 

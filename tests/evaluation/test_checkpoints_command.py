@@ -47,7 +47,7 @@ def test_every_kept_checkpoint_drives_the_same_trials(run_dir, call, tmp_path):
     assert re.search(r"000009 .*last", ended.stdout)
     assert "000008 is pinned: promoted as racer@champion" in ended.stdout
     page = Html((tmp_path / "picture.html").read_text())
-    assert "Checkpoints of tiny Recommended: 000007, best by race score" in page.text
+    assert "Checkpoints of tiny Recommended: 000007, best by race score (usual and held-out)" in page.text
     assert "checkpoint kept as steps laps %" in page.text
     assert "figure-speed_and_stability" in page.ids
     # Whatever one driver leaves to the next would show.
@@ -55,7 +55,7 @@ def test_every_kept_checkpoint_drives_the_same_trials(run_dir, call, tmp_path):
         line.split()[0]: line.split()[-6:] for line in ended.stdout.splitlines() if line.startswith("0000")
     }
     assert rows["000007"] == rows["000009"] != rows["000008"]
-    assert "recommended: 000007: best by race score" in ended.stdout
+    assert "recommended: 000007: best by race score (usual and held-out)" in ended.stdout
 
 
 def test_a_corrupt_checkpoint_is_shown_and_left_out(run_dir, call):

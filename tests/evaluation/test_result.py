@@ -115,3 +115,35 @@ def test_one_more_track_with_a_lap_is_worth_more_than_any_time():
     both_slow = on_two_tracks(attempt(time_s=9.0), attempt(time_s=60.0))
     both_fast = on_two_tracks(attempt(time_s=9.0), attempt(time_s=50.0))
     assert short_only < both_slow < both_fast
+
+
+def lap_and_failures(time_s, laps, failures, track="a", condition="usual"):
+    """Return a group with as many complete laps, and failures that drove half of it."""
+    failed = [attempt(laps + at, 1.0, progress=50.0) for at in range(failures)]
+    return group(*(attempt(at, time_s) for at in range(laps)), *failed, track=track, condition=condition)
+
+
+def test_the_fastest_policy_of_those_that_complete_nineteen_of_twenty_usual_laps_is_the_best():
+    ranks = [
+        Evaluation((lap_and_failures(*one),)).rank("reliable_lap")
+        for one in ((5.0, 0, 20), (4.0, 18, 2), (7.0, 19, 1), (6.0, 20, 0))
+    ]
+    assert ranks == sorted(ranks)
+    assert ranks[-2:] == [(1.0, -7.0), (1.0, -6.0)]
+
+
+def test_held_out_laps_do_not_count_for_the_reliable_lap():
+    held_out = lap_and_failures(60.0, 1, 7, condition="held_out")
+    evaluation = Evaluation((lap_and_failures(6.0, 8, 0), held_out))
+    assert evaluation.rank("reliable_lap") == (1.0, -6.0)
+    assert evaluation.rank("lap_time") == pytest.approx((1.0, -12.0))
+
+
+def test_a_policy_is_reliable_if_it_is_on_each_track():
+    def on_two_tracks(*laps):
+        here, there = (lap_and_failures(*one, track=name) for one, name in zip(laps, "ab", strict=True))
+        return Evaluation((here, there)).rank("reliable_lap")
+
+    one_fails = on_two_tracks((4.0, 40, 0), (9.0, 7, 1))
+    both = on_two_tracks((5.0, 8, 0), (15.0, 8, 0))
+    assert one_fails < on_two_tracks((6.0, 8, 0), (16.0, 8, 0)) < both == (1.0, -10.0)

@@ -91,7 +91,7 @@ def test_the_headline_has_the_steps_of_trials_that_were_pruned_or_failed(tmp_pat
     add(study, None, "collapsed", env_steps=200_000)
     add(study, None, "failed", env_steps=50_000)
     assert study_summary(study) == [
-        "Trial 0 is the best: race score 9.50 s.",
+        "Trial 0 is the best: race score (usual and held-out) 9.50 s.",
         "3 of 60 trials ended, 1 of them complete; they drove 1.0 M control steps, 25% of them in trials that were "
         "pruned or failed.",
     ]
@@ -136,7 +136,7 @@ def test_the_winners_on_fresh_laps_have_an_interval_and_the_value_before(tmp_pat
     again = [{"trial": 0, "values": [9.87], "interval": [9.61, 10.23]}, {"trial": 1, "values": [9.3]}]
     study.set_user_attr("reranked", again)
     text = Html(study_page(study)).text
-    assert "Trial 1 is the best: race score 9.30 s on fresh laps." in text
+    assert "Trial 1 is the best: race score (usual and held-out) 9.30 s on fresh laps." in text
     assert "9.61 s to 10.23 s" in text
 
 

@@ -40,7 +40,12 @@ ENDED = [
 
 def test_it_counts_trials_by_outcome_and_names_the_best():
     view = shown([*ENDED, claim(2)])
-    for words in ("2 of 4: 1 done, 1 pruned, 0 failed", "trial 0, race score 8.25 s", "8,192", "51%"):
+    for words in (
+        "2 of 4: 1 done, 1 pruned, 0 failed",
+        "trial 0, race score (usual and held-out) 8.25 s",
+        "8,192",
+        "51%",
+    ):
         assert words in view
 
 
@@ -69,7 +74,9 @@ def test_before_the_first_trial_it_says_that_workers_start():
 def test_without_a_terminal_each_trial_that_ends_is_a_line():
     lines = shown(ENDED, is_terminal=False).splitlines()
     assert lines[0] == "spring: 4 trials, 2 workers; runs in runs/spring"
-    assert lines[1].startswith("trial 0 done (converged) after 8,192 steps: race score 8.25 s")
+    assert lines[1].startswith(
+        "trial 0 done (converged) after 8,192 steps: race score (usual and held-out) 8.25 s"
+    )
     assert lines[2].startswith(
         "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01; 2 of 4, about"
     )

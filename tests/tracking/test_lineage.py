@@ -33,7 +33,7 @@ def test_any_member_shows_the_whole_family_and_no_other(clan):
         assert list(found) == ["1-root", "2-child", "4-grandchild", "3-sibling"]
         assert [member.generation for member in found.values()] == [0, 1, 2, 1]
         assert found["4-grandchild"].changes == {"algorithm.lr": (0.0001, 1e-5)}
-        assert best_members(root) == {id(found["2-child"]): "best by mean lap"}
+        assert best_members(root) == {id(found["2-child"]): "best by mean lap (usual and held-out)"}
     (alone,) = family(clan.runs_dir / "season" / "9-stranger", clan.runs_dir).walk()
     assert alone.name == "9-stranger"
 
@@ -43,18 +43,18 @@ def test_the_best_of_each_generation_stands_at_the_end(clan, call):
     assert ended.code == 0, ended.stderr
     last = [" ".join(line.split()) for line in ended.stdout.splitlines()[-3:]]
     assert last == [
-        "generation 0 completion 90.0%, mean lap 11.00 s 1-root",
-        "generation 1 completion 90.0%, mean lap 9.50 s 2-child",
-        "generation 2 completion 90.0%, mean lap 10.00 s 4-grandchild",
+        "generation 0 mean usual lap 11.00 s, usual completion 90.0% 1-root",
+        "generation 1 mean usual lap 9.50 s, usual completion 90.0% 2-child",
+        "generation 2 mean usual lap 10.00 s, usual completion 90.0% 4-grandchild",
     ]
 
 
 def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
     ended = call("runs", "lineage", "4-grandchild")
     assert rows(ended.stdout, "4-grandchild", "<- this run")
-    assert rows(ended.stdout, "2-child", "* best by mean lap")
+    assert rows(ended.stdout, "2-child", "* best by mean lap (usual and held-out)")
     assert len(rows(ended.stdout, "<- this run")) == len(rows(ended.stdout, "* best")) == 1
-    assert rows(ended.stdout, "generation 2, from 000030, completion 90.0%, mean lap 10.00 s")
+    assert rows(ended.stdout, "generation 2, from 000030, mean usual lap 10.00 s, usual completion 90.0%")
     assert rows(ended.stdout, "algorithm.lr 0.0001 -> 1e-05")
     assert "\x1b" not in ended.stdout
     assert all(line == line.rstrip() for line in ended.stdout.splitlines())
@@ -97,8 +97,8 @@ def test_a_clone_on_another_track_has_a_best_of_its_own(clan, call):
     there = clan.clone("5-away", parent, 2, track={"name": "bowtie", "knots": [1]})
     clan.result(there, (1, -20.0), 20.0)
     ended = call("runs", "lineage", "1-root")
-    assert rows(ended.stdout, "5-away", "* best on bowtie by mean lap")
-    assert rows(ended.stdout, "2-child", "* best on oval by mean lap")
+    assert rows(ended.stdout, "5-away", "* best on bowtie by mean lap (usual and held-out)")
+    assert rows(ended.stdout, "2-child", "* best on oval by mean lap (usual and held-out)")
     assert rows(ended.stdout, "track oval -> bowtie")
     assert rows(ended.stdout, "generation 2", "bowtie", "20.00 s")
     assert rows(ended.stdout, "generation 2", "oval", "10.00 s")
@@ -109,8 +109,8 @@ def test_laps_of_the_training_count_where_nothing_was_evaluated(season, call):
     season.result(root, lap_share=0.5, best_lap_time_s=12.0, last={"completion": 61.0})
     season.result(season.clone("2", root), lap_share=0.9, best_lap_time_s=13.0)
     ended = call("runs", "lineage", "1")
-    assert rows(ended.stdout, "in training completion 61.0%, best lap 12.00 s")
-    assert rows(ended.stdout, "2", "* best by laps in training")
+    assert rows(ended.stdout, "exploring completion 61.0%, fastest exploring lap 12.00 s")
+    assert rows(ended.stdout, "2", "* best by exploring laps")
 
 
 def test_many_changes_are_counted(season, call):

@@ -203,7 +203,7 @@ def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(st
     fast = train("fast", 8.7654321)
     of_run = mlflow.get_run(fast).data.tags["mlflow.note.content"]
     assert of_run.startswith("**finished**: converged: all")
-    assert "**Best policy, iteration 4**: race score 8.77 s, lap 8.77 s, 100.0% of the lap" in of_run
+    assert "**Best policy, iteration 4**: mean usual lap 8.77 s, 100.0% of the lap" in of_run
     assert f"(get-artifact?path=best_lap.png&run_uuid={fast})" in of_run
     assert of_run.endswith("as it began")
     assert "[fast]" in note_of_experiment()

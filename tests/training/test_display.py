@@ -85,7 +85,7 @@ def test_the_panel_fits_the_terminal_and_shows_every_figure_that_has_room(width,
     assert {len(line) for line in panel} == {min(width, 100)}
     assert "67%" in text
     if width < 60:  # those that matter most
-        for word in ["iteration   40", "completion  99.5%", "laps        525"]:
+        for word in ["iteration      40", "completion     99.5%", "exploring laps 525"]:
             assert word in text, word
         return
     laps = LAPS if header is HEADER else []
@@ -93,10 +93,22 @@ def test_the_panel_fits_the_terminal_and_shows_every_figure_that_has_room(width,
         assert word in text, word
 
 
-def test_eighteen_tracks_fit_a_terminal_of_80_by_24_with_completion_and_best_lap_of_each():
+def test_eighteen_tracks_fit_a_terminal_of_80_by_24_with_completion_and_fastest_exploring_lap_of_each():
     panel = screen(80, 24, SEVERAL, (ROW_OF_TRACKS, 0.5, 23.0))
     for number, label in enumerate(TRACKS):
         assert re.search(rf"{label} +{81 + number} +{20.25 + number:.2f}\b", "\n".join(panel)), label
+
+
+def test_the_lap_of_the_last_evaluation_stays_and_is_not_mixed_with_exploring_ones():
+    evaluated = {"eval_lap_share": 0.875, "eval_lap_time_s": 8.76, "eval_laps": 7, "eval_laps_tried": 8}
+    updates = [(ROW, 0.1, 1.0), (ROW | evaluated, 0.2, 1.0), (ROW | dict.fromkeys(evaluated), 0.3, 1.0)]
+    for width in (50, 80):
+        panel = " ".join("\n".join(screen(width, 40, HEADER, *updates)).split())
+        assert "usual lap 8.76 s" in panel
+        assert "complete 7 of 8" in panel
+        assert "their fastest 9.33 s" in panel
+    line = lines(lambda display, clock: [display.update(*one) for one in updates])[-1]
+    assert "usual lap 8.76 s (7 of 8) · exploring laps 525 (96% of last 20) · their fastest 9.33 s" in line
 
 
 @pytest.mark.parametrize("missing", [None, math.nan, math.inf])
@@ -158,7 +170,7 @@ def test_a_plain_line_names_the_track_on_which_the_car_comes_least_far():
         display.update({**ROW_OF_TRACKS, "completion/track_h": None}, 0.6, 20.0)
 
     assert "least 12.3% on track_h" in lines(act, SEVERAL)[-1]
-    assert "best lap" not in lines(act, SEVERAL)[-1]
+    assert "their fastest" not in lines(act, SEVERAL)[-1]
 
 
 @given(st.lists(st.floats(-1e6, 1e6), max_size=300), st.integers(1, 40))

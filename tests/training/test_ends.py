@@ -109,7 +109,7 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
     assert f"completion {best['eval_completion']:.1f}%" in ended.stdout
     found = findings(prepare(read_own_recording(ended.folder)))
     (submit,) = [one.sentence for one in found if one.rule == "submit"]
-    assert submit.startswith(f"Race with checkpoint {name}, the best by race score: ")
+    assert submit.startswith(f"Race with checkpoint {name}, the best by race score (usual and held-out): ")
     compared = call("checkpoints", ended.folder.name)
     assert compared.code == 0, compared.stderr
     assert f"recommended: {name}: " in compared.stdout

@@ -41,9 +41,10 @@ def lap_line(view: LogView) -> Chart | None:
     )
     mean_mps = view.course.length_m / float(row["lap_time_s"])
     whose = f"iteration {row['iteration']}" if view.trained else str(row["stream"])
+    kind = "exploring lap" if view.trained else "lap"
     return Chart(
         name="lap_line",
-        title=f"The fastest lap: {row['lap_time_s']:.3f} s, {whose}, episode {row['episode']}",
+        title=f"The fastest {kind}: {row['lap_time_s']:.3f} s, {whose}, episode {row['episode']}",
         caption="One dot for each control step of the fastest complete lap, coloured by the speed of the car; "
         f"at a constant {mean_mps:.2f} m/s the centre line would take as long. Dots close together are slow: find "
         "where the car slows down and ask whether the bend requires it.",

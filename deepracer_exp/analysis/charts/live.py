@@ -14,14 +14,17 @@ from .style import BLUE, GREEN, ORANGE, PALE, PURPLE
 _CURVES: Mapping[str, tuple[str, Mapping[str, tuple[str | None, str]]]] = {
     "Driven, per cent": (
         "per cent",
-        {"completion": ("mean of an episode", BLUE), "eval_completion": ("evaluation", ORANGE)},
+        {
+            "completion": ("exploring episodes, mean", BLUE),
+            "eval_completion": ("evaluated usual laps, mean", ORANGE),
+        },
     ),
     "Lap time": (
         "s",
         {
-            "mean_lap_time_s": ("mean in training", BLUE),
-            "best_lap_time_s": ("best in training", GREEN),
-            "eval_lap_time_s": ("evaluation", ORANGE),
+            "mean_lap_time_s": ("exploring laps, mean", BLUE),
+            "best_lap_time_s": ("fastest exploring lap", GREEN),
+            "eval_lap_time_s": ("evaluated usual laps, mean", ORANGE),
         },
     ),
     "Return of an episode, mean": ("return", {"mean_return": (None, BLUE)}),
@@ -48,7 +51,7 @@ def curves_so_far(rows: Sequence[Mapping[str, Any]]) -> Chart:
     return Chart(
         name="curves_so_far",
         title="How it learns",
-        caption="In training the policy explores; in evaluation it takes its most probable actions.",
+        caption="Exploring, the policy draws its actions; evaluated, it takes the most probable ones.",
         rows=in_rows(panels),
         share_x=True,
     )

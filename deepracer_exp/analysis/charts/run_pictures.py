@@ -145,12 +145,12 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     driving, returns, laps, entropy = figure.subplots(2, 2, sharex=True).flat
     # A column of nulls alone has no numeric type.
     numbers = metrics.apply(pd.to_numeric).assign(lap_share=100 * metrics["lap_share"].astype(float))
-    laps_label = "share of complete laps" + (", on the track where it is lowest" if tracks else "")
+    laps_label = "share of complete exploring laps" + (", on the track where it is lowest" if tracks else "")
     _curves(
         driving,
         numbers,
         "Driven, per cent",
-        {"completion": ("mean completion of an episode", BLUE), "lap_share": (laps_label, GREEN)},
+        {"completion": ("mean completion of an exploring episode", BLUE), "lap_share": (laps_label, GREEN)},
         [f"completion/{name}" for name in tracks],
     )
     driving.set_ylim(-3, 103)
@@ -158,8 +158,8 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     _curves(
         laps,
         numbers,
-        "Mean lap time of each track, seconds" if tracks else "Lap time, seconds",
-        {"mean_lap_time_s": ("mean", BLUE), "best_lap_time_s": ("best", ORANGE)},
+        "Mean exploring lap of each track, seconds" if tracks else "Exploring lap, seconds",
+        {"mean_lap_time_s": ("mean", BLUE), "best_lap_time_s": ("fastest so far", ORANGE)},
         [f"mean_lap_time_s/{name}" for name in tracks],
     )
     _curves(entropy, numbers, "Entropy of the policy, nats", {"entropy": ("", PURPLE)})
@@ -210,7 +210,7 @@ def _curves(
 def _result(episode: pd.Series) -> str:
     lap_s = float(episode["lap_time_s"])
     if math.isfinite(lap_s):
-        return f"lap in {lap_s:.2f} s"
+        return f"exploring lap in {lap_s:.2f} s"
     return f"{episode['progress']:.1f}% of the lap, {str(episode['status']).replace('_', ' ')}"
 
 

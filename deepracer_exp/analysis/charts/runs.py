@@ -111,7 +111,7 @@ def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> list[Panel]:
         points(np.concatenate(places), np.concatenate(best_s), BLUE, "a run", size=8),
     ]
     axis: dict[str, Any] = {"x_names": list(groups), "x_range": (-0.5, n - 0.5), "y_label": "lap time, s"}
-    return [Panel(title="Best lap of each run", layers=layers, **axis)]
+    return [Panel(title="Fastest exploring lap of each run", layers=layers, **axis)]
 
 
 def generations(views: Sequence[LogView]) -> Chart | None:
@@ -231,8 +231,8 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     for column, title, unit in (
         ("completion", "Completion, mean", "per cent of the lap"),
         ("mean_return", "Return of an episode, mean", "return"),
-        *([("mean_lap_time_s", "Lap time in training, mean", "lap time, s")] if has_laps else []),
-        *([("eval_lap_time_s", "Lap time in evaluation, mean", "lap time, s")] if was_evaluated else []),
+        *([("mean_lap_time_s", "Exploring laps, mean", "lap time, s")] if has_laps else []),
+        *([("eval_lap_time_s", "Evaluated usual laps, mean", "lap time, s")] if was_evaluated else []),
     ):
         layers: list[Layer] = []
         for number, (label, record) in enumerate(records.items()):
@@ -250,10 +250,21 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
     if has_laps:
         at = np.arange(len(records))
         laps: list[Layer] = [
-            bars(at, best_s, BLUE, "best in training"),
-            points(at, mean_s, ORANGE, "mean in training, last iteration", size=11, symbol="diamond"),
+            bars(at, best_s, BLUE, "fastest exploring lap"),
+            points(
+                at, mean_s, ORANGE, "exploring laps of the last iteration, mean", size=11, symbol="diamond"
+            ),
             *(
-                [points(at, evaluated_s, VERMILION, "mean of the best checkpoint", size=14, symbol="star")]
+                [
+                    points(
+                        at,
+                        evaluated_s,
+                        VERMILION,
+                        "usual laps of the best checkpoint, mean",
+                        size=14,
+                        symbol="star",
+                    )
+                ]
                 if was_evaluated
                 else []
             ),
@@ -264,7 +275,7 @@ def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
         name="learning_curves_compared",
         title="Learning curves and lap times" if has_laps else "Learning curves",
         caption="Lines are moving averages of three iterations; the line of the evaluations connects them without "
-        "averaging. In training the policy explores and is slower.",
+        "averaging. An exploring policy draws its actions and is slower.",
         rows=in_rows(panels),
     )
 

@@ -87,7 +87,7 @@ def learning_vs_lap_time(view: LogView) -> Chart | None:
         *_joined(table, "lap_time_p25_s", GREEN, "25th percentile"),
         *_joined(table, "lap_time_best_s", BLUE, "best"),
     ]
-    panels = [Panel(title="Lap time", y_label="lap time, s", layers=laps)]
+    panels = [Panel(title="Exploring laps", y_label="lap time, s", layers=laps)]
     for name in known:
         title, unit, color = metrics[name]
         label = ITERATION if name == known[-1] else ""
@@ -143,7 +143,7 @@ def quarters(view: LogView) -> Chart | None:
 
 
 def evaluations(view: LogView) -> Chart | None:
-    """Draw the episodes of evaluations and races, beside the best lap of the training."""
+    """Draw the episodes of evaluations and races, beside the fastest exploring lap of the training."""
     episodes = view.evaluation_episodes
     if not len(episodes):
         return None
@@ -172,13 +172,13 @@ def evaluations(view: LogView) -> Chart | None:
         ]
         best_s = float(view.episodes["lap_time_s"].min()) if view.trained else np.nan
         if np.isfinite(best_s):
-            laps.append(mark(best_s, "best of the training", GREEN, horizontal=True))
+            laps.append(mark(best_s, "fastest exploring lap", GREEN, horizontal=True))
         times_s.append(best_s)
         low, high = np.nanmin(times_s), np.nanmax(times_s)
         rim = max(0.1 * (high - low), 0.1)
         panels.append(("Lap time", "lap time, s", laps, (low - rim, high + rim)))
     which = f"one of {len(names)} evaluations or races" if len(names) > 1 else "an evaluation or race"
-    slower = " The best lap of the training is the fastest of many."
+    slower = " The fastest exploring lap is that of many."
     short = [name if len(name) <= 26 else f"{name[:17]}…{name[-8:]}" for name in names]
     axis: dict[str, Any] = {"x_names": short, "x_range": (-0.5, len(names) - 0.5)}
     return Chart(
