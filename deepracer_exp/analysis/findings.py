@@ -184,8 +184,8 @@ def _submit(view: LogView) -> Finding:
         whose = "their" if view.in_blocks else "its"
         sentence = (
             f"Submit {_checkpoint(first['checkpoint'], 'drove')} {_iterations(view, first['iteration'])}: a quarter "
-            f"of {whose} exploring laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} {episodes} "
-            f"episodes are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
+            f"of {whose} exploring laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} "
+            f"{episodes} episodes are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
         )
         values |= {"p25_s": float(first["lap_time_p25_s"])}
         time_of = "lap_time_p25_s"

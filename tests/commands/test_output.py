@@ -41,6 +41,52 @@ def test_a_finished_training_names_the_store_that_recorded_it(trained, capsys, u
     assert "compare runs" not in capsys.readouterr().out
 
 
+def rows_of(*laps: tuple[int, float | None, int]) -> str:
+    names = ("iteration", "eval_lap_time_s", "eval_laps")
+    rows = [dict(zip(names, one, strict=True)) for one in laps]
+    rows = [one | {"eval_lap_share": one["eval_laps"] / 8, "eval_laps_tried": 8} for one in rows]
+    return "".join(f"{json.dumps(row)}\n" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("rows", "kept", "words"),
+    [
+        (rows_of((30, 7.0, 8), (40, 6.72, 8)), "000040", "checkpoint 40, 6.72 s, 8 of 8"),
+        (
+            rows_of((30, 6.5, 8), (40, 6.72, 8)),
+            "000040",
+            "checkpoint 30, 6.50 s, 8 of 8 (not kept; checkpoints.metric=reliable_lap keeps it)",
+        ),
+        (
+            rows_of((30, 6.5, 5), (40, 6.72, 7)),
+            "000040",
+            "none yet; 95% of the usual laps must be complete, at best 88% were",
+        ),
+    ],
+)
+def test_the_last_lines_of_a_training_name_the_fastest_reliable_lap(tmp_path, capsys, rows, kept, words):
+    (tmp_path / "metrics.jsonl").write_text(rows)
+    (tmp_path / "checkpoints" / kept).mkdir(parents=True)
+    best = {"iteration": 40, "metric": "race_score", "rank": [1.0, -8.0], "eval_completion": 100.0}
+    best |= {"eval_lap_time_s": 6.72, "eval_race_score_s": 8.0}
+    summary = {"iteration": 0, "env_steps": 8192, "wall_clock_s": 9.0, "episodes": 12, "laps": 3}
+    summary |= {
+        "status": "stopped early",
+        "reason": "it does not learn",
+        "best_lap_time_s": 6.1,
+        "best": best,
+    }
+    (tmp_path / "config.yaml").write_text("name: season\n")
+    print_result(TrainResult("stopped early", "it does not learn", 0, tmp_path, summary), None)
+    shown = capsys.readouterr().out.splitlines()
+    assert f"  fastest reliable lap: {words}" in shown
+    assert any("exploring: 12 episodes, 3 laps, the fastest in 6.10 s" in line for line in shown)
+    (chosen,) = (line for line in shown if "best checkpoint by" in line)
+    assert chosen.startswith(
+        "  best checkpoint by race score (usual and held-out): 000040, mean usual lap 6.72 s"
+    )
+
+
 @pytest.mark.parametrize("store", ["http://127.0.0.1:9", None])
 def test_what_mlflow_lacks_of_a_sweep_is_counted_with_the_command_that_sends_it(
     tmp_path, capsys, store, monkeypatch

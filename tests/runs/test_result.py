@@ -1,0 +1,61 @@
+"""What is said of a run's policies names whose laps are meant, under which conditions."""
+
+import pytest
+
+from deepracer_exp.runs.result import fastest_reliable, result_of
+
+
+def row(iteration: int, lap_s: float | None, laps: int, tried: int = 8) -> dict:
+    return {
+        "iteration": iteration,
+        "eval_lap_time_s": lap_s,
+        "eval_lap_share": laps / tried,
+        "eval_laps": laps,
+        "eval_laps_tried": tried,
+    }
+
+
+def test_the_fastest_reliable_lap_is_that_of_a_policy_that_completes_nineteen_of_twenty():
+    rows = [
+        row(10, 5.0, 7),
+        {"iteration": 11},
+        row(20, None, 0),
+        row(30, 7.0, 8),
+        row(40, 6.72, 8),
+        row(50, 6.9, 8),
+    ]
+    assert str(fastest_reliable(rows)) == "checkpoint 40, 6.72 s, 8 of 8"
+    assert str(fastest_reliable([row(10, 5.0, 19, 20)])) == "checkpoint 10, 5.00 s, 19 of 20"
+    assert fastest_reliable(rows[:3]) is None
+
+
+def test_a_run_of_an_older_version_has_the_share_of_its_laps_only():
+    old = {"iteration": 40, "eval_lap_time_s": 6.72, "eval_lap_share": 1.0}
+    assert str(fastest_reliable([old])) == "checkpoint 40, 6.72 s, 95% or more of the laps"
+    assert fastest_reliable([{"iteration": 40, "eval_lap_time_s": 6.72}]) is None
+
+
+BEST = {"iteration": 40, "metric": "race_score", "rank": [1.0, -8.0], "eval_race_score_s": 8.02}
+BEST |= {"eval_completion": 100.0, "eval_lap_time_s": 7.97, "eval_lap_share": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("summary", "words"),
+    [
+        (
+            {"best": BEST | {"held_out_completion": 84.7}},
+            "mean usual lap 7.97 s, usual laps complete 100%, usual completion 100.0%, held-out completion 84.7%, "
+            "race score (usual and held-out) 8.02 s",
+        ),
+        (
+            {"best": BEST},
+            "mean usual lap 7.97 s, usual laps complete 100%, usual completion 100.0%, race score (usual) 8.02 s",
+        ),
+        (
+            {"lap_share": 0.5, "best_lap_time_s": 12.0, "last": {"completion": 61.0}},
+            "exploring completion 61.0%, fastest exploring lap 12.00 s",
+        ),
+    ],
+)
+def test_figures_name_conditions_and_exploration(summary, words):
+    assert result_of(summary).words() == words
