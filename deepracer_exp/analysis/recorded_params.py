@@ -14,6 +14,7 @@ from deepracer_exp.tracks.track import Track, Tracks
 from .log_course import progress_along, recorded_wheels_on_road
 
 Ids = NDArray[np.intp]
+Floats = NDArray[np.float64]
 
 UNPAID = ("prepare", "pause", "park")
 """Statuses at which the service gives no reward and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
@@ -55,6 +56,7 @@ class RecordedParams:
         self.known = np.isfinite(steps[["X", "Y", "yaw", "progress"]].to_numpy()).all(axis=1)
         self.paid = self.known & ~steps["episode_status"].isin(UNPAID).to_numpy()
         self.track_index: Ids = self._against(course, episode)
+        self._previous_progress = self._progress_before(episode)
 
     @property
     def is_reversed(self) -> NDArray[np.bool_]:
@@ -62,7 +64,7 @@ class RecordedParams:
         return np.array([road.is_reversed for road in self.track_params])[self.track_index]
 
     def columns(self, chosen: Ids) -> dict[str, np.ndarray]:
-        """Return the columns `rewards.params.COLUMNS` of some rows, which must be known."""
+        """Return the columns `rewards.params.BATCH_COLUMNS` of some rows, which must be known."""
         part, track_index = self._steps.iloc[chosen], self.track_index[chosen]
         front = part[["X", "Y"]].to_numpy(np.float64)
         at = self._tracks.project(front, track_index)
@@ -83,6 +85,7 @@ class RecordedParams:
             "is_left_of_center": is_left,
             "is_offtrack": self._off_track(part, track_index),
             "sim_time": part["tstamp"].to_numpy(np.float64),
+            "previous_progress": self._previous_progress[chosen],
         }
 
     def dicts(self, chosen: Ids) -> Iterator[dict[str, Any]]:
@@ -99,6 +102,13 @@ class RecordedParams:
             on_road = recorded_wheels_on_road(self._tracks, track_index[open_], part.iloc[open_], self._car)
             off[open_] = ~on_road.any(axis=1)
         return off.astype(bool)
+
+    def _progress_before(self, episode: NDArray[np.int64]) -> Floats:
+        """Return the progress one step before each row; its own where that step is missing or was not rewarded, (n,)."""
+        progress, number = (self._steps[key].to_numpy(np.float64) for key in ("progress", "steps"))
+        follows = (np.diff(episode, prepend=-1) == 0) & (np.diff(number, prepend=np.nan) == 1)
+        follows &= np.roll(self.paid, 1)
+        return np.where(follows, np.roll(progress, 1), progress)
 
     def _against(self, course: Track, episode: NDArray[np.int64]) -> Ids:
         """Return 1 for the rows of episodes driven against the course's own direction, (n,)."""

@@ -182,6 +182,8 @@ class EpisodeConfig:
     """Movement per step, in metres, up to which a car counts as standing."""
     reversed_steps: Natural
     """Steps in a row of falling progress that end an episode (0: never)."""
+    lap_terminates: bool = True
+    """Whether a complete lap of a closed track ends an episode as leaving the road does: no reward can follow."""
 
 
 @dataclass(frozen=True, kw_only=True)

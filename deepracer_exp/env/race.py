@@ -53,7 +53,7 @@ class Race:
         lidar: what the LIDARs last read, (N, size), float32; (N, 0) where there is none.
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
-        truncated: the last step reached `episode.max_steps`, (N,), bool.
+        truncated: the last step cut the drive off, see `StepResult`, (N,), bool.
         trace: one row per car for the last step, columns `deepracer.trace.PACKED_COLUMNS`, (N, C), float64.
     """
 

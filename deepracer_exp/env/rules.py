@@ -127,6 +127,8 @@ class StepResult:
     """Not in the prepare step, so that rewards are paid."""
     progress: Floats
     """Per cent of the lap."""
+    previous_progress: Floats
+    """Per cent of the lap at the step before; in the step of an episode's first reward, `progress`."""
     all_wheels_on_track: Bools
     off_track: Bools
     """No wheel on the road."""
@@ -134,7 +136,7 @@ class StepResult:
     """Codes of `deepracer.trace.STATUS_CODE`."""
     terminated: Bools
     truncated: Bools
-    """`episode.max_steps` was reached."""
+    """The drive was cut off where it could go on: at `episode.max_steps`, or at the end of a lap of a closed track."""
 
 
 class RaceRules:
@@ -290,13 +292,17 @@ class RaceRules:
         off_track: Bools = np.asarray(~wheels_on.any(axis=1))
         moved_m = np.hypot(*(now.front - self._last_front).T)
         status = self._episode_rules.apply(self.steps, percent, self._last_progress, moved_m, off_track)
+        previous = np.where(self.steps > 2, self._last_progress, percent)
         # `reset` writes zeros into what is kept here; a StepResult must not change.
         self._last_progress, self._last_front = percent.copy(), now.front
         truncated = status == STATUS_CODE["time_up"]
+        if not self._episodes.lap_terminates:
+            truncated |= (status == STATUS_CODE["lap_complete"]) & self.tracks.closed[self.track_index]
         return StepResult(
             now=now,
             running=self.steps > 1,
             progress=percent,
+            previous_progress=previous,
             all_wheels_on_track=np.asarray(wheels_on.all(axis=1)),
             off_track=off_track,
             status=status,
@@ -307,7 +313,7 @@ class RaceRules:
     def params(
         self, result: StepResult, steering_deg: np.ndarray, speed_mps: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Return the columns of `params.COLUMNS` for the last step and the commands chosen at its poses, (N,)."""
+        """Return the columns of `params.BATCH_COLUMNS` for the last step and the commands chosen at its poses, (N,)."""
         now = result.now
         return {
             "all_wheels_on_track": result.all_wheels_on_track,
@@ -325,6 +331,7 @@ class RaceRules:
             "is_left_of_center": now.is_left,
             "is_offtrack": result.off_track,
             "sim_time": self.clock_steps * self._period_s,
+            "previous_progress": result.previous_progress,
         }
 
     def nearer_waypoint(self) -> np.ndarray:

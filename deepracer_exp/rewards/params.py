@@ -19,6 +19,11 @@ _DTYPES: dict[str, type] = {
 }
 COLUMNS = tuple(_DTYPES)
 """The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
+BATCH_COLUMNS = (*COLUMNS, "previous_progress")
+"""Those of `reward_batch`, which has the progress at the step before, where `reward_function` remembers its last call.
+
+Per cent of the lap; at the first step of an episode that is rewarded, the progress itself.
+"""
 
 
 class TrackParams(NamedTuple):
@@ -40,9 +45,9 @@ class TrackParams(NamedTuple):
 def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> dict[str, np.ndarray]:
     """Return the columns of the given cars (None: all), each as a copy of its documented type."""
     chosen: dict[str, np.ndarray] = {}
-    for key, dtype in _DTYPES.items():
+    for key in BATCH_COLUMNS:
         column = columns[key]
-        chosen[key] = np.array(column if cars is None else column[cars], dtype=dtype)
+        chosen[key] = np.array(column if cars is None else column[cars], dtype=_DTYPES.get(key, np.float64))
     return chosen
 
 
@@ -82,7 +87,7 @@ def scalar_params(row: Row, road: TrackParams) -> dict[str, Any]:
 def batch_params(
     selected: Mapping[str, np.ndarray], road: TrackParams, waypoints: np.ndarray
 ) -> dict[str, Any]:
-    """Build the same 27 keys for n cars at once, for `reward_batch`.
+    """Build the same 27 keys and `previous_progress` for n cars at once, for `reward_batch`.
 
     Args:
         selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2); copied.

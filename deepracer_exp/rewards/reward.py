@@ -111,7 +111,7 @@ class RewardFunction:
         A module with `reward_batch` takes any number of cars.
 
         Args:
-            columns: `params.COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
+            columns: `params.BATCH_COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
             track_params: Params that are constant on each of the courses.
             active: Cars to reward, shape (n_cars,); None: all.
             track_index: Index in `track_params` of each car's course, shape (n_cars,); None: all drive on the first.

@@ -149,8 +149,10 @@ def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iter
     )
 
 
-def batch_differs(setup: RaceSetup, sampled: Situations, rewards: np.ndarray) -> Iterator[str]:
-    """Warn if the module's `reward_batch`, which trainings use, differs from its `reward_function`.
+def batch_differs(setup: RaceSetup, n: int) -> Iterator[str]:
+    """Warn if the module's `reward_batch`, which trainings use, differs from its `reward_function` in n situations.
+
+    `reward_function` gets the step before each of them first: it may remember what `reward_batch` is given.
 
     Raises:
         BadInput, RewardFailed: `reward_batch` cannot be used.
@@ -158,8 +160,11 @@ def batch_differs(setup: RaceSetup, sampled: Situations, rewards: np.ndarray) ->
     batch = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     if not batch.is_batch:
         return
-    paid = batch(sampled.columns, (sampled.road,))
+    at = sample(setup, n)
+    before = situations(setup, at, earlier=True)
+    now = situations(setup, at).given(previous_progress=before.columns["progress"])
+    paid, rewards = batch(now.columns, (now.road,)), Probe(setup).rewards(now, before)
     wrong = np.flatnonzero(~np.isclose(paid, rewards, rtol=1e-6, atol=1e-9))
     if len(wrong):
         first = f"first {paid[wrong[0]]:.6g} instead of {rewards[wrong[0]]:.6g}"
-        yield f"reward_batch, which trainings use, differs in {len(wrong)} of {len(sampled):,} situations: {first}"
+        yield f"reward_batch, which trainings use, differs in {len(wrong)} of {n:,} situations: {first}"

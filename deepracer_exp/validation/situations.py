@@ -22,7 +22,7 @@ class Situations:
     """Params of n situations on one road."""
 
     columns: dict[str, np.ndarray]
-    """`rewards.params.COLUMNS`, each (n,), `closest_waypoints` (n, 2)."""
+    """`rewards.params.BATCH_COLUMNS`, each (n,), `closest_waypoints` (n, 2)."""
     road: TrackParams
 
     def __len__(self) -> int:
