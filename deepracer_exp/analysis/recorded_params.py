@@ -104,7 +104,7 @@ class RecordedParams:
         return off.astype(bool)
 
     def _progress_before(self, episode: NDArray[np.int64]) -> Floats:
-        """Return the progress one step before each row; its own where that step is missing or was not rewarded, (n,)."""
+        """Return the progress one step before each row, (n,); its own where that was not rewarded or is missing."""
         progress, number = (self._steps[key].to_numpy(np.float64) for key in ("progress", "steps"))
         follows = (np.diff(episode, prepend=-1) == 0) & (np.diff(number, prepend=np.nan) == 1)
         follows &= np.roll(self.paid, 1)

@@ -9,7 +9,7 @@ from deepracer_exp.deepracer.trace import STATUS_CODE
 from deepracer_exp.env.rules import RaceRules, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.state import Measures
-from deepracer_exp.rewards.params import COLUMNS
+from deepracer_exp.rewards.params import BATCH_COLUMNS
 from deepracer_exp.sim.batch import CarBatch
 
 from .situations import Situations
@@ -89,7 +89,7 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
         # On an open track the rear wheels start behind the road.
         driving &= ~done & (result.all_wheels_on_track | (result.progress < 5))
         batch.drive(wanted_mps, np.radians(steering_deg), moving=result.running & driving)
-    columns = {key: np.stack([step[key] for step in steps]) for key in COLUMNS}
+    columns = {key: np.stack([step[key] for step in steps]) for key in BATCH_COLUMNS}
     return [
         DrivenLap(
             speed_mps=float(max(share[i] * highest_mps, lowest_mps)),

@@ -35,10 +35,10 @@ def in_folder(view: LogView, folder: Path) -> LogView:
 
 def test_names_that_differ_in_time_and_seed_are_one_group() -> None:
     names = [
-        "20261122-013219-reinvent_base-progress_gain-seed0",
-        "20261123-010101-reinvent_base-progress_gain-seed12",
+        "20261122-013219-reinvent_base-progress_delta-seed0",
+        "20261123-010101-reinvent_base-progress_delta-seed12",
     ]
-    assert {group_name(name) for name in names} == {"reinvent_base-progress_gain"}
+    assert {group_name(name) for name in names} == {"reinvent_base-progress_delta"}
     assert group_name("seed0") == "seed0"
 
 

@@ -76,7 +76,7 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
 
 
 def test_step_by_step_and_all_at_once_pay_the_same(own, reward):
-    name = "progress_gain"
+    name = "progress_delta"
     text = named_reward_source(name).text.replace("def reward_batch", "def unused")
     at_once, one_by_one = replay_reward(own, name), replay_reward(own, reward(text))
     np.testing.assert_allclose(

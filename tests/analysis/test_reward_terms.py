@@ -16,7 +16,7 @@ from .made_up import Drive, made_up_recording
 
 CAR = compose_experiment([])[0].car
 WITH_TERMS = (
-    *("center_speed_blend", "progress_delta", "progress_gain", "racing_line"),
+    *("center_speed_blend", "progress_delta", "racing_line"),
     *("self_motivator", "steps_to_finish"),
 )
 
@@ -74,7 +74,7 @@ def test_a_recordings_own_function_is_run_if_it_was_just_trained(view: LogView) 
 
 
 def test_without_a_course_there_are_no_terms(view: LogView) -> None:
-    assert contributed_terms(replace(view, course=None), named_reward_source("progress_gain"), CAR) is None
+    assert contributed_terms(replace(view, course=None), named_reward_source("progress_delta"), CAR) is None
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from deepracer_exp.runs import own_recording
 from tests.deepracer.made_up_logs import drives, log_text
 from tests.page_html import Html
 
-LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
+LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
 
 
 @pytest.fixture

@@ -44,8 +44,8 @@ def test_values_override_a_chosen_experiment():
 
 @pytest.mark.parametrize("prefix", ["", "+", "++"])
 def test_a_constant_of_the_reward_needs_no_plus(prefix):
-    experiment, _ = compose_experiment([f"{prefix}reward.constants.SPEED_WEIGHT=2.5"])
-    assert experiment.reward.constants == {"SPEED_WEIGHT": 2.5}
+    experiment, _ = compose_experiment([f"{prefix}reward.constants.PROGRESS_WEIGHT=2.5"])
+    assert experiment.reward.constants == {"PROGRESS_WEIGHT": 2.5}
 
 
 def test_an_option_may_be_named_as_its_file():

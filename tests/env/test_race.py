@@ -184,12 +184,43 @@ def test_a_course_can_be_completed(race_of, column, steer_ahead, course):
     race = race_of(*course, "action_space=continuous", n_cars=2)
     for _ in range(400):
         race.step(steer_ahead(race, -0.7))
-        if race.terminated.any():
+        ended = race.terminated | race.truncated
+        if ended.any():
             break
-    assert (column(race, "episode_status")[race.terminated] == STATUS_CODE["lap_complete"]).all()
-    assert (column(race, "progress")[race.terminated] == 100.0).all()
-    assert race.terminated.any()
-    assert not race.truncated.any()
+    assert ended.any()
+    assert (column(race, "episode_status")[ended] == STATUS_CODE["lap_complete"]).all()
+    assert (column(race, "progress")[ended] == 100.0).all()
+    # The road goes on behind a closed track's line, and the car sees it as anywhere else.
+    closed = race.setup.track.closed
+    assert (race.truncated[ended] == closed).all()
+    assert (race.terminated[ended] != closed).all()
+
+
+def test_a_lap_terminates_an_episode_where_the_experiment_says_so(race_of, column, steer_ahead):
+    race = race_of("track=reinvent_base", "episode.lap_terminates=true", "action_space=continuous")
+    while not race.terminated[0]:
+        race.step(steer_ahead(race, -0.7))
+        assert not race.truncated[0]
+    assert column(race, "episode_status")[0] == STATUS_CODE["lap_complete"]
+
+
+def test_a_batch_gets_the_progress_of_the_step_before(race_of, column, tmp_path):
+    file = tmp_path / "before.py"
+    functions = (
+        "def reward_function(params): pass",
+        "def reward_batch(params): return params['previous_progress']",
+    )
+    file.write_text("\n".join(functions))
+    race = race_of(f"reward.file={file}", "action_space=continuous", "episode.max_steps=9", n_cars=3)
+    before = np.zeros(3)
+    for action in random_actions(40, 3):
+        race.step(action)
+        now, driven = column(race, "progress"), column(race, "steps")
+        # The function is called from the second step on, where it has nothing to compare with yet.
+        expected = np.select([driven == 1, driven == 2], [0.0, now], before)
+        np.testing.assert_array_equal(race.reward, expected)
+        before = now.copy()
+        race.reset(np.flatnonzero(race.terminated | race.truncated))
 
 
 def test_a_car_that_drives_back_is_reversed(race_of, column):

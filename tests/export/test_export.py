@@ -14,12 +14,12 @@ def test_onnx_goes_into_the_runs_folder_and_is_checked(trained, call):
 
 
 def test_aws_files_go_to_the_given_folder_with_notes_on_changes(trained, call):
-    run = trained("reward.constants.SPEED_WEIGHT=2.5", "algorithm.batch_size=1000", "budget.iterations=1")
+    run = trained("reward.constants.PROGRESS_WEIGHT=2.5", "algorithm.batch_size=1000", "budget.iterations=1")
     ended = call("export", str(run.folder), "format=aws", "-o", "custom_files")
     assert ended.code == 0, ended.stderr
     names = sorted(path.name for path in (ended.cwd / "custom_files").iterdir())
     assert names == ["hyperparameters.json", "model_metadata.json", "reward_function.py"]
-    assert "SPEED_WEIGHT = 2.5" in (ended.cwd / "custom_files" / "reward_function.py").read_text()
+    assert "PROGRESS_WEIGHT = 2.5" in (ended.cwd / "custom_files" / "reward_function.py").read_text()
     assert "batch_size=512, the nearest to 1000 that the AWS console accepts" in ended.stdout
 
 

@@ -17,7 +17,15 @@ import pytest
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.rewards.guard import Guard
-from deepracer_exp.rewards.params import COLUMNS, TrackParams, batch_params, rows, scalar_params, select
+from deepracer_exp.rewards.params import (
+    BATCH_COLUMNS,
+    COLUMNS,
+    TrackParams,
+    batch_params,
+    rows,
+    scalar_params,
+    select,
+)
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
 from deepracer_exp.rewards.source import RewardSource
@@ -37,7 +45,7 @@ KEYS = {
 
 
 def columns(n: int, dtype: type = np.float64) -> dict[str, np.ndarray]:
-    made = {key: np.arange(n).astype(dtype) for key in COLUMNS}
+    made = {key: np.arange(n).astype(dtype) for key in BATCH_COLUMNS}
     made["steps"] = np.full(n, 7)
     made["closest_waypoints"] = np.tile(np.array([0, 1], np.int32), (n, 1))
     return made
@@ -78,14 +86,15 @@ def test_the_params_are_the_27_keys_of_the_service_as_plain_python(dtype: type) 
     assert [v for k, v in params.items() if k.startswith("objects_")] == [[]] * 6
 
 
-def test_batch_params_hold_the_same_keys_and_values() -> None:
+def test_batch_params_hold_the_same_keys_and_values_and_the_progress_before() -> None:
     selected = select(columns(3), None)
     batch = batch_params(selected, ROAD[0], np.array(WAYPOINTS))
     for car, row in enumerate(rows(selected)):
         for key, value in scalar_params(row, ROAD[0]).items():
             shared = key in TrackParams._fields or key.startswith("objects_")
             np.testing.assert_array_equal(batch[key] if shared else batch[key][car], value)
-    assert set(batch) == set(KEYS)
+    assert set(batch) == set(KEYS) | {"previous_progress"}
+    np.testing.assert_array_equal(batch["previous_progress"], np.arange(3))
 
 
 def test_cars_that_are_not_active_get_nothing_and_are_not_called() -> None:
@@ -410,7 +419,7 @@ def test_a_bad_batch_fails_the_run_in_one_line(body: str, car: int | None, messa
     assert str(error).startswith(f"reward mine: reward_batch {message}")
     assert error.car == car
     assert error.params is not None
-    assert set(error.params) == set(KEYS)
+    assert set(error.params) == set(KEYS) | ({"previous_progress"} if car is None else set())
     if car is not None:
         assert error.params["x"] == float(car)
         assert str(error).endswith(f"(car {car}, step 7)")

@@ -19,7 +19,7 @@ from tests.conftest import refused
 PLAIN = "def reward_function(params):\n    return 1.0\n"
 
 
-def config(name: str = "progress_gain", file: str | None = None, **constants: float) -> RewardConfig:
+def config(name: str = "progress_delta", file: str | None = None, **constants: float) -> RewardConfig:
     return RewardConfig(name=name, file=file, constants=constants, time_limit_s=5.0)
 
 
@@ -42,12 +42,12 @@ def test_every_zoo_function_is_found_by_its_name(name: str) -> None:
 
 
 def test_an_unknown_name_is_refused_with_the_nearest_one() -> None:
-    with pytest.raises(BadInput, match=r"did you mean progress_gain\?.*racing_line"):
-        load_reward_source(config("progres_gain"))
+    with pytest.raises(BadInput, match=r"did you mean progress_delta\?.*racing_line"):
+        load_reward_source(config("progres_delta"))
 
 
 @pytest.mark.parametrize(
-    "name", ["", "__init__", "../reward_zoo/progress_gain", "os.path", "progress_gain.py"]
+    "name", ["", "__init__", "../reward_zoo/progress_delta", "os.path", "progress_delta.py"]
 )
 def test_only_names_of_the_zoo_reach_a_file(name: str) -> None:
     with pytest.raises(BadInput, match="not in the reward zoo"):

@@ -46,22 +46,22 @@ def test_every_ready_made_sweep_gives_trials_that_can_be_trained(name):
 def test_numbers_and_choices_are_distributions():
     found = space(
         *("algorithm.lr=tag(log,interval(1e-5,1e-3))", "algorithm.epochs=range(3,9,2)"),
-        *("algorithm.batch_size=64,128", "reward.constants.EDGE_COST=range(0,1,0.25)"),
+        *("algorithm.batch_size=64,128", "reward.constants.STEP_COST=range(0,1,0.25)"),
     )
     assert {one.key: one.distribution for one in found.dimensions} == {
         "algorithm.lr": FloatDistribution(1e-5, 1e-3, log=True),
         "algorithm.epochs": IntDistribution(3, 7, step=2),
         "algorithm.batch_size": CategoricalDistribution((64, 128)),
-        "reward.constants.EDGE_COST": FloatDistribution(0.0, 0.75, step=0.25),
+        "reward.constants.STEP_COST": FloatDistribution(0.0, 0.75, step=0.25),
     }
 
 
 def test_a_trial_trains_with_the_drawn_values_to_the_last_digit():
-    searched = space("algorithm.lr=interval(0.1,1)", "reward.constants.EDGE_COST=interval(0,1)", "seed=7")
+    searched = space("algorithm.lr=interval(0.1,1)", "reward.constants.STEP_COST=interval(0,1)", "seed=7")
     lr, cost = 0.1 + 0.2, 1 / 3
-    overrides = searched.suggest(FixedTrial({"algorithm.lr": lr, "reward.constants.EDGE_COST": cost}))
+    overrides = searched.suggest(FixedTrial({"algorithm.lr": lr, "reward.constants.STEP_COST": cost}))
     experiment, _ = compose_experiment(overrides)
-    assert (experiment.algorithm.lr, experiment.reward.constants["EDGE_COST"]) == (lr, cost)
+    assert (experiment.algorithm.lr, experiment.reward.constants["STEP_COST"]) == (lr, cost)
     assert experiment.seed == 7
 
 
@@ -79,18 +79,18 @@ def test_a_key_of_a_searched_group_counts_only_for_the_options_that_have_it():
 
 
 def test_a_constant_counts_only_for_the_reward_functions_that_have_it():
-    constants = ("reward.constants.SPEED_WEIGHT=interval(1,2)", "reward.constants.EDGE_COST=interval(0,1)")
-    searched = space(*constants, "reward=racing_line,progress_gain")
+    constants = ("reward.constants.PROGRESS_WEIGHT=interval(1,2)", "reward.constants.STEP_COST=interval(0,1)")
+    searched = space(*constants, "reward=self_motivator,progress_delta")
     assert {one.key: one.options for one in searched.dimensions} == {
         "reward": None,
-        "reward.constants.SPEED_WEIGHT": None,
-        "reward.constants.EDGE_COST": ("progress_gain",),
+        "reward.constants.PROGRESS_WEIGHT": None,
+        "reward.constants.STEP_COST": ("progress_delta",),
     }
 
 
 def test_ready_made_keys_that_the_chosen_option_lacks_are_left_out():
-    searched = space("sweep=reward_weights", "reward=racing_line")
-    assert list(searched.as_text()) == ["reward.constants.SPEED_WEIGHT"]
+    searched = space("sweep=reward_weights", "reward=racing_line", "algorithm.lr=0.1,0.2")
+    assert list(searched.as_text()) == ["algorithm.lr"]
     assert "steering_levels" in refusal("action_space=discrete", "action_space.steering_levels=3,5")
 
 
@@ -106,7 +106,7 @@ def test_ready_made_keys_that_the_chosen_option_lacks_are_left_out():
             ("action_space=grid,discrete", "action_space.steering_level=3,5"),
             ["action_space.steering_level: no such key", "did you mean steering_levels?"],
         ),
-        (("reward.constants.SPEEDWEIGHT=1,2",), ["no such constant (did you mean SPEED_WEIGHT?)"]),
+        (("reward.constants.STEPCOST=1,2",), ["no such constant (did you mean STEP_COST?)"]),
         (("algorithm.lr=interval(-1,1)",), ["interval(-1,1): algorithm.lr=-1.0", "greater than 0"]),
         (("algorithm.discount=interval(0.9,1.1)",), ["algorithm.discount=1.1", "less than or equal to 1"]),
         (("algorithm.epochs=5,0",), ["algorithm.epochs=5,0: algorithm.epochs=0", "greater than or equal"]),

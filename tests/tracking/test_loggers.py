@@ -18,7 +18,7 @@ ROWS = [
 
 
 def record(tracker: Tracker, identity, rows, safe: int, status="FINISHED") -> None:
-    tracker.start("progress_gain s1", "tiny", {"seed": 1}, {"reward": "progress_gain"}, identity)
+    tracker.start("progress_delta s1", "tiny", {"seed": 1}, {"reward": "progress_delta"}, identity)
     for row in rows:
         tracker.log(row, step=row["env_steps"])
     tracker.safe_until(safe)

@@ -11,7 +11,7 @@ from deepracer_exp.training.stopping_replay import Replay, replay
 
 LENGTH = 200
 LEARNED_AT = 30
-NAME = "20260101-000000-reinvent_base-progress_gain-seed0"
+NAME = "20260101-000000-reinvent_base-progress_delta-seed0"
 
 
 def row(iteration: int) -> dict:

@@ -23,12 +23,12 @@ def write(folder: Path, pay: str, name: str = "mine.py") -> str:
 
 
 def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
-    ended = call("validate", "reward=progress_gain")
+    ended = call("validate", "reward=progress_delta")
     assert ended.code == 0
     assert "deepracer-on-aws: would accept it" in ended.stdout
     assert "AWS console: its documentation forbids nothing in it" in ended.stdout
     assert ended.stdout.splitlines()[-1].startswith("Verdict: can be trained here")
-    picture = tmp_path / "runs/validate/progress_gain-reinvent_base.png"
+    picture = tmp_path / "runs/validate/progress_delta-reinvent_base.png"
     assert picture.name in ended.stdout
     assert imread(picture).shape[1] > 400
 
@@ -94,7 +94,7 @@ TIMES = ("", "0s", "-5s", "20000steps", "inf", "1h")
     ("arguments", "words"),
     [
         (("reward.file=nowhere.py",), ("nowhere.py", "No such file")),
-        (("reward=progress_gian",), ("progress_gain",)),
+        (("reward=progress_dleta",), ("progress_delta",)),
         (("reward.file=no_function.py",), ("no function reward_function", "reward_functoin")),
         (("reward.file=two_arguments.py",), ("must take one argument",)),
         (("reward.file=syntax.py",), ("line 2", "not valid Python")),
