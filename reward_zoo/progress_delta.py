@@ -1,16 +1,16 @@
-"""Teaches fast laps by exact account: rewards the progress made since the last call, less a cost of each step.
+"""Teaches fast laps by exact account: rewards the metres made since the last call, less a cost of each step.
 
-The sum over an episode is the share of the lap done less the steps it took: of two laps the faster one returns more,
-and no detour is worth anything. It remembers the last call in a module global, as many race winners do; for many cars
-at once the progress before the step comes with the params. Fails where progress itself misleads: behind a hairpin
-that runs close beside, and on the service where a training is stopped and cloned in the middle of an episode.
+The sum over a lap is its length less the steps it took: of two laps the faster one returns more, by the same amount for
+each second on any track, and no detour is worth anything. It remembers the last call in a module global, as many race
+winners do; for many cars at once the progress before the step comes with the params. Fails where progress itself
+misleads: beside a road that runs close by, and on the service where a training is stopped in the middle of an episode.
 """
 
 import numpy as np
 
-PROGRESS_WEIGHT = 1.0  # reward for 1 per cent of the lap
-STEP_COST = 0.05
-OFF_ROAD_COST = 5.0  # cost of leaving the road
+PROGRESS_WEIGHT = 1.0  # reward for 1 m along the centre line
+STEP_COST = 0.05  # less than a step at 1 m/s makes, so that driving on is always worth more than giving up
+OFF_ROAD_COST = 2.0  # cost of leaving the road
 
 _last = {"progress": 0.0, "steps": 0.0}
 
@@ -23,7 +23,7 @@ def terms(params: dict) -> dict:
         gained = 0.0
     _last["progress"], _last["steps"] = params["progress"], params["steps"]
     return {
-        "progress": PROGRESS_WEIGHT * gained,
+        "progress": PROGRESS_WEIGHT * gained / 100.0 * params["track_length"],
         "time": -STEP_COST,
         "off_road": -OFF_ROAD_COST if params["is_offtrack"] else 0.0,
     }
@@ -38,4 +38,5 @@ def reward_function(params: dict) -> float:
 def reward_batch(params: dict) -> np.ndarray:
     """Apply the same formula to many cars."""
     gained = params["progress"] - params["previous_progress"]
-    return PROGRESS_WEIGHT * gained - (STEP_COST + OFF_ROAD_COST * params["is_offtrack"])
+    costs = STEP_COST + OFF_ROAD_COST * params["is_offtrack"]
+    return PROGRESS_WEIGHT * gained / 100.0 * params["track_length"] - costs

@@ -11,7 +11,7 @@ from deepracer_exp.rewards.reward import RewardFunction
 from .laps import DrivenLap
 from .probe import Probe
 from .reward_map import RewardGrid
-from .situations import Situations
+from .situations import Situations, sample, situations
 
 _HELD = 15
 """Steps without moving after which the service ends the episode."""

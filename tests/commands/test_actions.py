@@ -10,7 +10,7 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 
-LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_gain", "budget.env_steps=16384")
+LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
 
 
 @pytest.fixture

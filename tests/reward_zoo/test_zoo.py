@@ -273,9 +273,10 @@ def test_progress_delta_adds_up_to_the_lap_less_the_time(scalar: bool) -> None:
         total = 0.0
         for step, (before, done) in enumerate(zip(np.append(progress[:1], progress), progress, strict=False)):
             given = {"progress": done, "previous_progress": before, "steps": step + 2.0}
-            columns, track_params = drive("oval", np.array([5]), np.zeros(1), np.zeros(1), **given)
-            total += float(reward(columns, track_params, None)[0])
-        assert total == pytest.approx(progress[-1] - progress[0] - 0.05 * len(progress))
+            columns, roads = drive("oval", np.array([5]), np.zeros(1), np.zeros(1), **given)
+            total += float(reward(columns, roads, None)[0])
+        driven_m = (progress[-1] - progress[0]) / 100 * roads[0].track_length
+        assert total == pytest.approx(driven_m - 0.05 * len(progress))
 
 
 def test_look_ahead_pays_most_for_the_arc_of_the_road() -> None:
