@@ -28,9 +28,9 @@ PASS_M = 1.0
 class ZigZag:
     """What a car's zig-zag on straights adds up to; two of them add up to that of both.
 
-    A straight is a sector of the course without a bend (`sectors.sectors_of`), whatever line the car takes on it. A
-    racing line crosses a straight from one side to the other, which takes one or two changes of steering each time;
-    standing starts count like the rest of a lap.
+    A straight is a sector of the course without a bend (`sectors.sectors_of`), whatever line the car takes on it;
+    standing starts count like the rest of a lap. The first change of steering each time a straight is driven is not
+    counted: the way from a bend to the left into one to the right needs it, and many straights are short.
     """
 
     straight_m: float = 0.0
@@ -39,7 +39,7 @@ class ZigZag:
     """The same in laps: over the length of all straights of a lap."""
     changes: int = 0
     """Times the steering changed from at least `CENTRED_DEG` to one side to as much to the other, without leaving the
-    straight; in between it may be less for any time."""
+    straight and without the first of them; in between it may be less for any time."""
     swings_deg: float = 0.0
     """Sum over the changes of half the difference between the largest angles before and after, degrees."""
     detour_s: float = 0.0
@@ -158,7 +158,7 @@ def total(parts: Iterable[ZigZag]) -> ZigZag:
 
 
 def _changes(one_pass: NDArray[np.integer], steering_deg: Values) -> tuple[int, float]:
-    """Return how often the steering changes sides within a pass, and the sum of half the swings in degrees."""
+    """Return how often the steering changes sides again within a pass, and the sum of half the swings in degrees."""
     side = np.where(np.abs(steering_deg) >= CENTRED_DEG, np.sign(steering_deg), 0.0)
     steers = np.flatnonzero(side)
     if not len(steers):
@@ -168,9 +168,11 @@ def _changes(one_pass: NDArray[np.integer], steering_deg: Values) -> tuple[int, 
     begins[1:] = (np.diff(one_pass) != 0) | (np.diff(side) != 0)
     at = np.flatnonzero(begins)
     largest_deg = np.maximum.reduceat(np.abs(steering_deg[steers]), at)
-    same_pass = np.diff(one_pass[at]) == 0
+    again = np.diff(one_pass[at]) == 0
+    again[1:] &= again[:-1]
+    again[:1] = False
     swings_deg = (largest_deg[1:] + largest_deg[:-1]) / 2
-    return int(same_pass.sum()), float(swings_deg[same_pass].sum())
+    return int(again.sum()), float(swings_deg[again].sum())
 
 
 def _aside(one_pass: NDArray[np.integer], bearing_rad: Values) -> Values:

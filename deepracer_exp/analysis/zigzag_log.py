@@ -6,8 +6,8 @@ from .log_view import LogView
 from .zigzag import zigzag_in
 
 ZIGZAG_PER_M = 1.0
-"""Changes of steering a metre of straight from which on a car zig-zags: fast policies of the service's races change 0.4
-to 0.6 times, to get from one side of the road to the other; those of its first trainings 3 to 8 times."""
+"""Changes of steering a metre of straight from which on a car zig-zags: fast policies of the service's races change 0.2
+to 0.4 times, those of its first trainings 1 to 7 times."""
 ZIGZAG_DEG = 5.0
 """Angle to either side below which nobody would see it."""
 LEAST_M = 10.0

