@@ -146,6 +146,18 @@ def test_tracks_writes_the_racing_line_of_one_and_says_where_it_is(call, tmp_pat
     assert (tmp_path / "line.csv").read_text().startswith("x_m,y_m,progress\n")
 
 
+def test_tracks_finds_the_fastest_lap_and_writes_its_line(call, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    ended = call("tracks", "Straight_track", "--fastest", "--line", "line.csv", "-o", "lap.png")
+    assert ended.code == 0, ended.stderr
+    assert "fastest lap of deepracer_v6: 2." in ended.stdout
+    assert "commands between -30 and 30 degrees, 1 and 3 m/s" in ended.stdout
+    rows = (tmp_path / "line.csv").read_text().splitlines()
+    assert rows[0] == "x_m,y_m,speed_mps,progress"
+    assert rows[-1].endswith(",100.0")
+    assert (tmp_path / "lap.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
@@ -156,6 +168,10 @@ def test_tracks_writes_the_racing_line_of_one_and_says_where_it_is(call, tmp_pat
         (["tracks", "-o", "picture.png"], "picture.png"),
         (["tracks", "--line", "line.csv"], "line.csv"),
         (["tracks", "reinvent_base", "--line", "line.json"], "line.json"),
+        (["tracks", "--fastest"], "tracks NAME --fastest"),
+        (["tracks", "car=deepracer_v5"], "tracks NAME"),
+        (["tracks", "reinvent_base", "--video", "lap.mp4"], "--fastest"),
+        (["tracks", "reinvent_base", "--fastest", "car=fast"], "car=fast"),
     ],
 )
 def test_a_picture_that_cannot_be_drawn_is_bad_input(call, arguments, word):

@@ -122,8 +122,8 @@ def _evaluate(args: argparse.Namespace) -> int:
         return 0
     config, _ = _composed(args)
     if args.video is not None:
-        _check_film("--video", Path(args.video))
-        _choose_graphics()
+        check_film("--video", Path(args.video))
+        choose_graphics()
     run = _policy(config)
 
     from rich.console import Console
@@ -182,7 +182,7 @@ def _watch(args: argparse.Namespace) -> int:
     if args.replay is not None:
         return _replay_laps(args)
     if args.output is not None:
-        _check_film("--output", Path(args.output))
+        check_film("--output", Path(args.output))
     config, own_trials = _composed(args)
     if not args.live:
         run = _policy(config)
@@ -264,7 +264,7 @@ Every checkpoint drives the same trials, on the usual and on held-out conditions
 """
 
 
-def _check_film(flag: str, file: Path) -> None:
+def check_film(flag: str, file: Path) -> None:
     """Check where a film is to be written.
 
     Raises:
@@ -274,7 +274,7 @@ def _check_film(flag: str, file: Path) -> None:
         raise BadInput(f"{flag} {file}: accepted: an .mp4 in an existing folder")
 
 
-def _choose_graphics() -> None:
+def choose_graphics() -> None:
     """Set MUJOCO_GL, which MuJoCo reads when it is imported, to a library that this machine has, unless it is set.
 
     Raises:

@@ -1,21 +1,16 @@
-"""`deepracer-exp validate`, `import`, `export` and `tracks`: rewards, models and routes as files."""
+"""`deepracer-exp validate`, `import` and `export`: rewards and models as files."""
 
 import argparse
 import os
 import re
 import shlex
-import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, writing
+from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_overrides, add_run, run_and_overrides
-from .output import print_notes, table_console, warnings_on_stderr
+from .output import print_notes, warnings_on_stderr
 from .startup import check_files, check_policy, start_workers_early
-
-if TYPE_CHECKING:
-    from deepracer_exp.tracks.track import Track
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -34,7 +29,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
     parser.add_argument(
-        *("-o", "--output"), type=_picture, help="picture to write (default: runs/validate/REWARD-TRACK.png)"
+        *("-o", "--output"),
+        type=picture_file,
+        help="picture to write (default: runs/validate/REWARD-TRACK.png)",
     )
     parser.add_argument("--strict", action="store_true", help="refuse what deepracer-on-aws would refuse")
 
@@ -75,22 +72,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
 
-    parser = add_command(
-        commands,
-        "tracks",
-        _tracks,
-        help="list the tracks, or draw one",
-        description="List the tracks with length, width and variants; with a name, draw that track.",
-    )
-    name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
-    name.completer = _names  # type: ignore[attr-defined]
-    parser.add_argument("-o", "--output", type=_picture, metavar="FILE", help="also write a picture of it")
-    parser.add_argument(
-        "--line", metavar="FILE", help="also write its racing line (.csv, .npy, or .py: a Python list)"
-    )
 
-
-def _picture(output: str) -> str:
+def picture_file(output: str) -> str:
     """Return where a picture is written: without an ending, matplotlib appends this one."""
     return output if Path(output).suffix else f"{output}.png"
 
@@ -244,112 +227,3 @@ def _trial_overrides(given: str) -> list[str]:
         *("name=validate", "tracking=off", "stopping=none", "checkpoints.every=null"),
         *("budget=default", "budget.env_steps=null", "budget.alerts=[]", f"budget.minutes={seconds / 60!r}"),
     ]
-
-
-COLUMNS, ROWS = 100, 32
-"""Largest size of a drawing, in characters and lines."""
-
-
-def _names(**_: object) -> list[str]:
-    from deepracer_exp.config.options import options
-
-    return options("track")
-
-
-def _tracks(args: argparse.Namespace) -> int:
-    if args.name is not None:
-        _show_track(args.name, args.output, args.line)
-    elif args.output is not None or args.line is not None:
-        raise BadInput(f"tracks: no track to write {args.output or args.line} of; accepted: tracks NAME")
-    else:
-        _list_tracks()
-    return 0
-
-
-def _list_tracks() -> None:
-    """Print a line for each family of worlds, then the user's own tracks."""
-    from rich.table import Table
-
-    from deepracer_exp.config.options import options
-    from deepracer_exp.config.overrides import override_line
-    from deepracer_exp.deepracer.worlds import leaders, worlds
-
-    out = table_console(160)
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("track", no_wrap=True)
-    table.add_column("course", overflow="fold")
-    for name in ("length (m)", "width (m)", "waypoints"):
-        table.add_column(name, justify="right")
-    table.add_column("variants", overflow="fold")
-    for name in leaders():
-        world = worlds()[name]
-        others = [one for one in worlds().values() if one.family == world.family and one.name != name]
-        length_m, width_m = _measures(name)
-        table.add_row(
-            name,
-            world.title,
-            f"{length_m:.2f}",
-            f"{width_m:.2f}",
-            str(world.rows),
-            " ".join(one.name.replace(one.family, "…", 1) for one in others),
-        )
-    for name in options("track"):
-        if name not in worlds():
-            track = _track(override_line("track", name))
-            measures = f"{track.length_m:.2f}", f"{track.width_m:.2f}", str(len(track.waypoints))
-            table.add_row(name, track.title, *measures, "")
-    out.print(table)
-    out.print(
-        f"\ntrack=NAME accepts each of {len(options('track'))} tracks, also variants and official names "
-        "(track='Ace Speedway').\n`deepracer-exp tracks NAME` draws one.",
-        soft_wrap=True,
-    )
-
-
-def _show_track(name: str, output: str | None, line: str | None) -> None:
-    """Draw a track, or a route file (.npy, .yaml), in the terminal; write a picture and its racing line where asked."""
-    from deepracer_exp.analysis.line_file import check_line_file, racing_line_table, write_line
-    from deepracer_exp.config.overrides import override_line
-    from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
-
-    is_file = Path(name).suffix in (".npy", ".yaml", ".yml")
-    check_line_file(line)
-    track = _track(override_line("track.file" if is_file else "track", name))
-    if output is not None:
-        with writing(f"--output {output}", "", BadInput, ValueError):  # an unknown ending
-            draw_picture(track, output)
-    if line is not None:
-        with writing(f"--line {line}"):
-            write_line(Path(line), racing_line_table(track))
-    wide, high = shutil.get_terminal_size((COLUMNS, ROWS))
-    print(
-        f"{track.title} ({track.name}): {track.length_m:.2f} m, {track.width_m:.2f} m wide, "
-        f"{len(track.waypoints)} waypoints\n"
-    )
-    print(draw_terminal(track, columns=min(wide, COLUMNS), rows=max(12, min(high - 6, ROWS))))
-    if output is not None:
-        print(f"\npicture: {output}")
-    if line is not None:
-        print(f"\nracing line: {line}")
-
-
-def _track(override: str) -> "Track":
-    from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.tracks.track import Track
-
-    tracks = compose_experiment([override])[0].tracks
-    if len(tracks) > 1:
-        raise BadInput(f"{override}: {len(tracks)} tracks; accepted: one to draw")
-    (config,) = tracks.values()
-    return Track.from_config(config)
-
-
-def _measures(name: str) -> tuple[float, float]:
-    """Return a world's length and median width in metres."""
-    import numpy as np
-
-    from deepracer_exp.deepracer.routes import world_rows
-
-    center, inner, outer = np.split(world_rows(name), 3, axis=1)
-    length_m = np.linalg.norm(np.diff(center, axis=0), axis=1).sum()
-    return float(length_m), float(np.median(np.linalg.norm(outer - inner, axis=1)))

@@ -1,5 +1,6 @@
 """The car's dimensions, masses, drives and physics settings (`conf/car/`)."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -93,6 +94,11 @@ class CarConfig:
     def control_period_s(self) -> float:
         """Seconds between two actions."""
         return 1.0 / self.control_hz
+
+    @property
+    def reach_m(self) -> float:
+        """Distance of the farthest wheel centre from the origin: how far off the road this is with a wheel on it."""
+        return max(math.hypot(*wheel) for wheel in self.wheel_points_m)
 
     @property
     def wheel_points_m(self) -> tuple[tuple[float, float], ...]:

@@ -21,7 +21,7 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup, directed_tracks
 from deepracer_exp.errors import BadInput
-from deepracer_exp.rewards.source import RewardSource
+from deepracer_exp.rewards.source import NO_REWARD
 
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, Group
@@ -33,15 +33,6 @@ OnStep = Callable[[Race, RaceProtocol, TensorDict], None]
 """Gets the cars, the protocol, and what the policy read and wrote in this step, [trials]."""
 
 _DRIVEN = [PACKED[name] for name in ("X", "Y", "steer", "tstamp", "episode_status")]
-# An evaluation needs no reward; the run's own reward function may no longer exist.
-_NO_REWARD = RewardSource(
-    name="none",
-    path="none",
-    text="def reward_function(params):\n    return 0.0\n\n\ndef reward_batch(params):\n    return params['x'] * 0.0\n",
-    sha256="",
-    constants={},
-    overrides={},
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +80,7 @@ class Evaluator:
             for start in _starts(config, course.tracks[0].closed, condition)
         ]
         setup = replace(
-            build_setup(experiment, courses, _NO_REWARD),
+            build_setup(experiment, courses, NO_REWARD),
             randomization=conditions[USUAL],
             # The protocol limits the time.
             episode=replace(experiment.episode, max_steps=0),

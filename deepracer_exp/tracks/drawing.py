@@ -3,7 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
@@ -70,11 +72,16 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
     return "\n".join("".join(line).replace(BLANK, " ").rstrip() for line in text)
 
 
-def draw_picture(track: Track, path: str | Path) -> None:
+def draw_picture(track: Track, path: str | Path, driven: np.ndarray | None = None) -> None:
     """Write a picture of the course; the file's ending chooses the format (.png, .svg, .pdf).
 
     It shows the road in its floor's colours, borders, centre line, start line, driving direction and
     every tenth waypoint with its index.
+
+    Args:
+        track: The course.
+        path: To write.
+        driven: A lap to draw on it, x and y in m and speed in m/s, (n, 3), coloured by its speed; None: none.
     """
     low, high = _extent(track)
     margin_m = MARGIN * (high - low).max()
@@ -114,11 +121,30 @@ def draw_picture(track: Track, path: str | Path) -> None:
     for index, (x, y) in zip(tenth, labels, strict=True):
         axes.text(x, y, str(index), color=line, fontsize=8, ha="center", va="center")
 
+    if driven is not None:
+        _draw_lap(figure, axes, driven, border_pt, line)
     left = 0.35 / page_in[0]
     names = track.title if track.title == track.name else f"{track.title}  ({track.name})"
     figure.text(left, 1 - 0.38 / page_in[1], names, color=line, fontsize=17, fontweight="bold", va="center")
     figure.text(left, 1 - 0.72 / page_in[1], _facts(track), color=line, fontsize=11, va="center")
     figure.savefig(path)
+
+
+def _draw_lap(figure: Figure, axes: Axes, driven: np.ndarray, width_pt: float, text_color: str) -> None:
+    """Draw a line coloured by its speed, and the scale of the colours."""
+    points, speed = driven[:, :2], driven[:, 2]
+    parts = LineCollection(
+        np.stack([points[:-1], points[1:]], axis=1).tolist(),
+        array=0.5 * (speed[:-1] + speed[1:]),
+        cmap="turbo",
+        linewidth=2.0 * width_pt,
+        capstyle="round",
+        zorder=5,
+    )
+    axes.add_collection(parts)
+    scale = figure.colorbar(parts, cax=figure.add_axes((0.6, 0.965, 0.3, 0.012)), orientation="horizontal")
+    scale.set_label("speed (m/s)", color=text_color, fontsize=9)
+    scale.ax.tick_params(colors=text_color, labelsize=8)
 
 
 def _facts(track: Track) -> str:

@@ -152,6 +152,15 @@ class Bands(NamedTuple):
     """(entries, 4): lower y, upper y, x at the lower end, dx / dy."""
 
 
+class Geometry(NamedTuple):
+    """Centre line, borders and road of the same courses."""
+
+    center: Segments
+    inner: Segments
+    outer: Segments
+    road: Bands
+
+
 def build_bands(road: BaseGeometry) -> Bands:
     """Sort the edges of the road's polygons into y bands for the crossing-number test."""
     corners = [shapely.get_coordinates(ring) for ring in shapely.get_rings(shapely.get_parts(road))]

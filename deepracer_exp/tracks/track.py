@@ -204,6 +204,11 @@ class Track:
     def _alone(self) -> "Tracks":
         return Tracks([self])
 
+    @property
+    def geometry(self) -> segments.Geometry:
+        """Return the lines and the road as arrays for compiled code, with this course as number 0."""
+        return segments.Geometry(self._center_line, self._inner_line, self._outer_line, self._bands)
+
     def project(self, points: np.ndarray) -> Projection:
         """Project points (n, 2) on the centre line.
 

@@ -1,0 +1,266 @@
+"""The fastest lap of a car on a track: found once, driven in the environment, and kept on disk.
+
+The lap is of the kind that evaluations drive: it begins with the reset, from standstill on the centre line, and its
+time is that of `rules.lap_clock_s`. A list of actions counts with its largest and smallest steering and speed, between
+which the commands of the lap are free.
+"""
+
+import hashlib
+import json
+import math
+import os
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.compose import compose_option
+from deepracer_exp.config.driving import RandomizationConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.action_space import ContinuousActions, build_action_space
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.setup import Course, build_setup
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.files import atomic_write, read_json
+from deepracer_exp.rewards.source import NO_REWARD
+from deepracer_exp.sim.ability import ability_of
+from deepracer_exp.tracks.line_time import fastest_line
+from deepracer_exp.tracks.track import Track
+
+from .search import OnRound, Search, lap_time_s
+
+Floats = NDArray[np.float64]
+
+ALGORITHM = 1
+"""Laps that an earlier version found are searched again."""
+COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "progress", "steering_deg", "commanded_mps")
+"""Of a lap's steps: clock, front of the car, heading, speed, per cent of the lap, and the command given there."""
+_TRACED = ("tstamp", "X", "Y", "yaw", "speed_mps", "progress", "steer", "throttle")
+_LINE_M = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FastestLap:
+    """A lap, as it was driven in the environment."""
+
+    lap_time_s: float
+    """By the service's clock, from the reset on."""
+    bound_s: float
+    """No lap of this kind is faster, as far as a search over lines tells (`tracks.line_time`)."""
+    start_ndist: float
+    """Where it begins, as a share of the lap."""
+    steps: Floats
+    """Its control steps, the prepare step first, (n, `COLUMNS`)."""
+
+    def column(self, name: str) -> Floats:
+        """Return one of `COLUMNS`, (n,)."""
+        return self.steps[:, COLUMNS.index(name)]
+
+    @cached_property
+    def over_bound(self) -> float:
+        """Return by what share the lap is slower than its bound."""
+        return self.lap_time_s / self.bound_s - 1.0
+
+
+def command_limits(experiment: Experiment) -> tuple[Floats, Floats]:
+    """Return lowest and highest [steering_deg, speed_mps] of the actions, within the limits of the car, (2,) each."""
+    car, actions = experiment.car, build_action_space(experiment.action_space)
+    low = np.array([-car.max_steering_deg, car.min_speed_mps])
+    high = np.array([car.max_steering_deg, car.max_speed_mps])
+    return np.clip(actions.low, low, high), np.clip(actions.high, low, high)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Question:
+    """What a fastest lap depends on."""
+
+    experiment: Experiment
+    track: Track
+    low: Floats
+    """Lowest [steering_deg, speed_mps] that the car can be sent, (2,)."""
+    high: Floats
+    start_ndist: float = 0.0
+
+    @classmethod
+    def of(cls, experiment: Experiment, track: Track, start_ndist: float = 0.0) -> "Question":
+        """Return the question for an experiment's car and action space on a track.
+
+        Raises:
+            BadInput: the limits of the action space leave the car nothing to choose.
+        """
+        low, high = command_limits(experiment)
+        if (low == high).any():
+            name = "speed" if low[1] == high[1] else "steering_angle"
+            raise BadInput(
+                f"action_space: {name} is always {low[int(name == 'speed')]:g}; accepted for a fastest lap: two "
+                "different limits"
+            )
+        start = start_ndist if track.closed else 0.0
+        return cls(experiment=experiment, track=track, low=low, high=high, start_ndist=start)
+
+    @cached_property
+    def key(self) -> str:
+        """Return a hash of track, car, limits, start and algorithm."""
+        track = self.track
+        asked = {
+            "algorithm": ALGORITHM,
+            "car": asdict(self.experiment.car),
+            "low": self.low.tolist(),
+            "high": self.high.tolist(),
+            "start": self.start_ndist,
+            "closed": track.closed,
+            "friction": track.floor.friction,
+        }
+        digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode())
+        for line in (track.waypoints, track.inner, track.outer):
+            digest.update(np.ascontiguousarray(line, np.float64).tobytes())
+        return digest.hexdigest()[:32]
+
+    @property
+    def _limits(self) -> tuple[Floats, Floats]:
+        """Return lowest and highest [speed_mps, steering_rad], (2,) each."""
+        return np.array([self.low[1], math.radians(self.low[0])]), np.array(
+            [self.high[1], math.radians(self.high[0])]
+        )
+
+    def answer(self, on_round: OnRound = lambda share, lap_time_s: None) -> FastestLap:
+        """Search for the lap and drive it in the environment.
+
+        Raises:
+            RunFailed: no lap is possible within the limits.
+        """
+        car, track = self.experiment.car, self.track
+        low, high = self._limits
+        ability = ability_of(car, low, high, track.floor.friction)
+
+        def least(driven: Floats | None = None) -> tuple[float, Floats]:
+            return fastest_line(track, car.reach_m, ability, self.start_ndist, car.front_point_m, driven)
+
+        least_s, line = least()
+        places = self.start_ndist + np.linspace(0.0, 1.0, round(track.length_m / _LINE_M))
+        search = Search(car, track, low, high, self.start_ndist)
+        commands = search.run((track.points_at(places), line), on_round)
+        steps = self._drive(commands)
+        ahead = car.front_point_m * np.column_stack([np.cos(steps[:, 3]), np.sin(steps[:, 3])])
+        least_s = min(least_s, least(steps[1:, 1:3] - ahead[1:])[0], len(commands) * car.control_period_s)
+        # A lap ends with a control step.
+        periods = math.ceil(least_s * car.control_hz - 1e-9)
+        return FastestLap(
+            lap_time_s=float(steps[-1, 0]),
+            bound_s=lap_time_s(periods, car),
+            start_ndist=self.start_ndist,
+            steps=steps,
+        )
+
+    def _drive(self, commands: Floats) -> Floats:
+        """Drive commands [speed_mps, steering_rad], (n, 2), in the environment and return its steps.
+
+        Raises:
+            RunFailed: they are no lap there.
+        """
+        experiment, track = self.experiment, self.track
+        plain = replace(
+            experiment,
+            observation=replace(experiment.observation, camera=None, lidar=None),
+            randomization=compose_option("randomization", "none", RandomizationConfig),
+            episode=replace(experiment.episode, max_steps=0),
+        )
+        course = Course(name=track.name, weight=1.0, tracks=(track,))
+        actions = ContinuousActions(self.low, self.high)
+        race = Race(replace(build_setup(plain, (course,), NO_REWARD), actions=actions), 1)
+        race.reset(None, None, np.array([self.start_ndist]))
+        wanted = np.column_stack([np.degrees(commands[:, 1]), commands[:, 0]])
+        # The car stands while the prepare step is taken, and at the last step its command no longer counts.
+        wanted = np.concatenate([wanted[:1], wanted, wanted[-1:]])
+        steps = []
+        for action in 2.0 * (wanted - self.low) / (self.high - self.low) - 1.0:
+            race.step(action[None])
+            steps.append(race.trace[0, [PACKED[name] for name in _TRACED]])
+            if race.terminated[0]:
+                break
+        status = int(race.trace[0, PACKED["episode_status"]])
+        if status != STATUS_CODE["lap_complete"]:
+            raise RunFailed(
+                f"{track.name}: the lap that was found is not complete when the environment drives it"
+            )
+        driven = np.array(steps)
+        yaw = COLUMNS.index("yaw_rad")
+        driven[:, yaw] = np.radians(driven[:, yaw])
+        return driven
+
+
+def fastest_lap(question: Question, on_round: OnRound | None = None) -> FastestLap:
+    """Return the fastest lap from the cache, or search for it and keep it.
+
+    Raises:
+        RunFailed: no lap is possible within the limits.
+    """
+    kept = kept_lap(question)
+    if kept is not None:
+        return kept
+    lap = question.answer(on_round or (lambda share, lap_time_s: None))
+    _keep(question, lap)
+    return lap
+
+
+def kept_lap(question: Question) -> FastestLap | None:
+    """Return the fastest lap if an earlier search has kept it; a file that holds no lap counts as none."""
+    file = _file(question)
+    if file is None or not file.is_file():
+        return None
+    try:
+        content = read_json(file, "a fastest lap")
+        return FastestLap(
+            lap_time_s=float(content["lap_time_s"]),
+            bound_s=float(content["bound_s"]),
+            start_ndist=float(content["start_ndist"]),
+            steps=_table(content["steps"]),
+        )
+    except (BadInput, KeyError, TypeError, ValueError):
+        return None
+
+
+def _table(rows: Any) -> Floats:
+    """Return the steps of a file.
+
+    Raises:
+        ValueError: they are none.
+    """
+    steps = np.array(rows, np.float64)
+    if steps.ndim != 2 or steps.shape[1] != len(COLUMNS) or not len(steps) or not np.isfinite(steps).all():
+        raise ValueError("not the steps of a lap")
+    return steps
+
+
+def _keep(question: Question, lap: FastestLap) -> None:
+    """Write a lap to the cache; on a disk that refuses it, it is searched again next time."""
+    file = _file(question)
+    if file is None:
+        return
+    content = {
+        "track": question.track.name,
+        "car": question.experiment.car.name,
+        "lap_time_s": lap.lap_time_s,
+        "bound_s": lap.bound_s,
+        "start_ndist": lap.start_ndist,
+        "columns": COLUMNS,
+        "steps": lap.steps.tolist(),
+    }
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(file, json.dumps(content) + "\n")
+    except OSError:
+        return
+
+
+def _file(question: Question) -> Path | None:
+    """Return where a lap is kept; None where this account has no home."""
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return Path(base) / "deepracer_exp" / "fastest_laps" / f"{question.key}.json"

@@ -1,0 +1,285 @@
+"""The search for the fastest lap: a slow lap along the centre line, made faster until nothing more is gained.
+
+Commands are held for a control period and the road counts at the end of each, as in the environment. The search asks
+for the longest way in a given number of periods; where the car gets over the line with a period to spare, it goes on
+with one period less.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.env.rules import lap_clock_s
+from deepracer_exp.errors import RunFailed
+from deepracer_exp.sim.rollout import advance, drive_record, one_car, standing
+from deepracer_exp.tracks.line_time import evenly
+from deepracer_exp.tracks.segments import Geometry
+from deepracer_exp.tracks.track import Track
+
+from .optimal_control import clearance_m, driven_m, improve, origin
+
+Floats = NDArray[np.float64]
+OnRound = Callable[[float, float | None], None]
+"""Gets the share of the search that is done, and the lap time so far in s, None before a lap is found."""
+
+MARGIN_M = 0.002
+"""How far inside the road the car's best placed wheel is kept, for the rounding of the optimisation."""
+_WINDOW, _TRUSTED, _DRIVEN = 45, 30, 10
+"""Control periods that are planned at a time, that are kept of a plan, and that are driven before the next plan."""
+_TAIL_MPS = 1.8
+"""Speed along the line where there is no plan yet."""
+_LOOK_AHEAD_M, _APART_M = 0.35, 0.05
+_SLOWEST_LAP_MPS = 0.2
+_CALM = np.array([1e-4, 1e-3])
+"""Cost of a changed command, per (m/s)**2 and rad**2, in metres; it fades away."""
+_FADE = 0.96
+_STEPS = 5
+_GAIN_M = 2e-3
+_STIFFENING = 1.1
+_MOST_DAMPING = 100.0
+_FIRST_SHARE = 0.5
+"""Of a search until a lap is found; the rest improves it."""
+
+
+class Problem(NamedTuple):
+    """What compiled code needs to know of a lap."""
+
+    course: Geometry
+    front_point_m: float
+    com_x_m: float
+    wheels_m: Floats
+    begin_m: float
+    closed: bool
+    margin_m: float
+
+
+class Search:
+    """Searches for the fastest lap of one car on one track, from standstill at one place."""
+
+    def __init__(self, car: CarConfig, track: Track, low: Floats, high: Floats, start_ndist: float) -> None:
+        """Put the car at its start.
+
+        Args:
+            car: the simulated car.
+            track: with its floor.
+            low: lowest [speed_mps, steering_rad] that is commanded, within the limits of the car, (2,).
+            high: highest, likewise.
+            start_ndist: where the lap begins, as a share of the lap.
+        """
+        self._car, self._track, self._limits = car, track, np.array([low, high])
+        self._cars, self._drive = one_car(car, track.floor.friction), drive_record()
+        self._dt_s = car.control_period_s / car.substeps
+        self._begin_m = start_ndist * track.length_m
+        pose = track.start_pose(np.array([start_ndist]))
+        self._start = standing(car, pose.x[0], pose.y[0], pose.yaw_rad[0])
+
+    def run(self, lines: Sequence[Floats], on_round: OnRound) -> Floats:
+        """Return the commands of the fastest lap that was found, [speed_mps, steering_rad] of each period, (n, 2).
+
+        Args:
+            lines: along which the car is sent where it has no better plan yet, (n, 2) each, from the start on.
+            on_round: called after each round.
+
+        Raises:
+            RunFailed: no lap is possible within the limits.
+        """
+        found: list[_Plan] = []
+        for number, line in enumerate(lines):
+            best_s = lap_time_s(min(len(plan.commands) for plan in found), self._car) if found else None
+
+            def progressed(share: float, number: int = number, best_s: float | None = best_s) -> None:
+                on_round((number + share) / len(lines), best_s)
+
+            plan = self._lap(evenly(line, _APART_M)[0], progressed)
+            if plan is not None and plan.complete:
+                found.append(plan)
+        if not found:
+            low, high = self._limits
+            raise RunFailed(
+                f"{self._track.name}: no lap was found that stays on the road with {low[0]:g} to {high[0]:g} m/s and "
+                f"steering of {np.degrees(low[1]):g} to {np.degrees(high[1]):g} degrees"
+            )
+        best = min(found, key=lambda plan: plan.score)
+        on_round(1.0, lap_time_s(len(best.commands), self._car))
+        return best.commands
+
+    def _lap(self, line: Floats, progressed: Callable[[float], None]) -> "_Plan | None":
+        """Return a lap that begins as one along a line, None if the car does not get around."""
+        commands = self._window_by_window(line, lambda share: progressed(_FIRST_SHARE * share))
+        if commands is None:
+            return None
+        return self._improved(
+            self._start, commands, self._begin_m, self._track.length_m, _LAP,
+            lambda share: progressed(_FIRST_SHARE + (1.0 - _FIRST_SHARE) * share),
+        )  # fmt: skip
+
+    def _window_by_window(self, line: Floats, progressed: Callable[[float], None]) -> Floats | None:
+        """Return the commands of a fast lap, None if the car does not get around.
+
+        A window of the next seconds is planned as if only the way in it counted; its first part is driven, and the next
+        window begins there with what is left of the plan.
+        """
+        state, driven_m_, plan = self._start, 0.0, np.empty((0, 2))
+        commands: list[Floats] = []
+        length_m = self._track.length_m
+        for _ in range(math.ceil(length_m / _SLOWEST_LAP_MPS * self._car.control_hz / _DRIVEN)):
+            plan = np.concatenate(
+                [plan, self._along(line, self._states(state, plan)[-1], _WINDOW - len(plan))]
+            )
+            begin_m = self._begin_m + driven_m_
+            planned = self._improved(state, plan, begin_m, length_m - driven_m_, _AHEAD)
+            plan = planned.commands
+            if planned.complete:
+                return np.concatenate([*commands, plan])
+            states = self._states(state, plan[:_DRIVEN])
+            moved_m = float(self._driven_m(states, begin_m)[-1])
+            if moved_m < _SLOWEST_LAP_MPS * _DRIVEN / self._car.control_hz:
+                return None
+            commands.append(plan[:_DRIVEN])
+            state, plan, driven_m_ = states[-1], plan[_DRIVEN:_TRUSTED], driven_m_ + moved_m
+            progressed(min(driven_m_ / length_m, 1.0))
+        return None
+
+    def _states(self, start: Floats, commands: Floats) -> Floats:
+        """Return the states from `start` on that commands (n, 2) lead to, (n + 1, 15)."""
+        states = np.empty((len(commands) + 1, len(start)))
+        states[0] = start
+        for n, command in enumerate(commands):
+            advance(
+                self._cars, self._drive, states[n], command, self._car.substeps, self._dt_s, states[n + 1]
+            )
+        return states
+
+    def _driven_m(self, states: Floats, begin_m: float) -> Floats:
+        problem = self._problem(begin_m)
+        return driven_m(
+            problem.course, problem.front_point_m, problem.com_x_m, states, begin_m, problem.closed
+        )
+
+    def _along(self, line: Floats, state: Floats, periods: int) -> Floats:
+        """Return commands that send the car along a line, (periods, 2); it steers to a point ahead (pure pursuit)."""
+        commands = np.empty((periods, 2))
+        x, y, _, _ = origin(state, self._car.com_x_m)
+        place = int(np.hypot(line[:, 0] - x, line[:, 1] - y).argmin())
+        ahead = round(_LOOK_AHEAD_M / _APART_M)
+        for n in range(periods):
+            x, y, _, _ = origin(state, self._car.com_x_m)
+            near = line[place : place + 2 * ahead]
+            place += int(np.hypot(near[:, 0] - x, near[:, 1] - y).argmin())
+            aim = self._point(line, place + ahead)
+            away_m = math.hypot(aim[0] - x, aim[1] - y)
+            bearing = math.remainder(math.atan2(aim[1] - y, aim[0] - x) - state[2], 2 * math.pi)
+            steering = math.atan(2 * self._car.wheelbase_m * math.sin(bearing) / max(away_m, 1e-3))
+            commands[n] = np.clip([_TAIL_MPS, steering], *self._limits)
+            state = self._states(state, commands[n : n + 1])[-1]
+        return commands
+
+    def _point(self, line: Floats, place: int) -> Floats:
+        """Return a point of a line; beyond its end it continues, around a closed course or straight ahead."""
+        last = len(line) - 1
+        if place <= last:
+            return line[place]
+        if self._track.closed:
+            return line[min(place - last, last)]
+        return line[-1] + (place - last) * (line[-1] - line[-2])
+
+    def _improved(
+        self,
+        start: Floats,
+        commands: Floats,
+        begin_m: float,
+        goal_m: float,
+        effort: "_Effort",
+        progressed: Callable[[float], None] = lambda share: None,
+    ) -> "_Plan":
+        """Return commands (n, 2) that get a car farther than those given, or past `goal_m` in fewer periods."""
+        problem = self._problem(begin_m)
+        states = self._states(start, commands)
+        commands = commands.copy()
+        pull, damping, firm = np.zeros(len(states)), 1.0, effort.soft
+        best, since = _Plan(commands, False, False, 0.0), 0
+        for number in range(effort.rounds):
+            damping, _ = improve(
+                self._cars, self._drive, problem, states, commands, self._limits, pull, firm,
+                _CALM * _FADE**number, min(damping, _MOST_DAMPING), _STEPS, self._car.substeps, self._dt_s,
+            )  # fmt: skip
+            driven = self._driven_m(states, begin_m)
+            room_m = np.array(
+                [clearance_m(problem.course, problem.wheels_m, problem.com_x_m, state) for state in states]
+            )
+            pull = np.maximum(0.0, pull + firm * (MARGIN_M - room_m))
+            pull[0] = 0.0
+            firm = min(firm * _STIFFENING, effort.firm)
+            over = np.flatnonzero(driven >= goal_m)
+            end = int(over[0]) if len(over) else len(commands)
+            on_road = bool((room_m[: end + problem.closed] > 0.0).all())
+            plan = _Plan(commands[:end].copy(), bool(len(over)) and on_road, on_road, float(driven[end]))
+            gained = plan.score < (*best.score[:-1], best.score[-1] - _GAIN_M)
+            # Off the road there is nothing to be content with.
+            since = 0 if gained or not best.on_road else since + 1
+            best = min(best, plan, key=lambda one: one.score)
+            if plan.complete:  # now in fewer periods
+                states, commands, pull = (
+                    states[: end + 1].copy(),
+                    commands[:end].copy(),
+                    pull[: end + 1].copy(),
+                )
+            progressed((number + 1) / effort.rounds)
+            if since >= effort.patience:
+                break
+        return best
+
+    def _problem(self, begin_m: float) -> Problem:
+        """Return the lap as seen from a place on the centre line."""
+        return Problem(
+            course=self._track.geometry,
+            front_point_m=self._car.front_point_m,
+            com_x_m=self._car.com_x_m,
+            wheels_m=np.array(self._car.wheel_points_m),
+            begin_m=begin_m,
+            closed=self._track.closed,
+            margin_m=MARGIN_M,
+        )
+
+
+class _Effort(NamedTuple):
+    """How long commands are improved."""
+
+    rounds: int
+    patience: int
+    """Rounds without a gain of `_GAIN_M` after which it ends."""
+    soft: float
+    """Stiffness of the borders to begin with."""
+    firm: float
+    """The most it becomes."""
+
+
+_AHEAD = _Effort(rounds=12, patience=3, soft=100.0, firm=300.0)
+_LAP = _Effort(rounds=80, patience=8, soft=200.0, firm=500.0)
+
+
+class _Plan(NamedTuple):
+    """Commands and where they lead to."""
+
+    commands: Floats
+    complete: bool
+    """Whether the goal is passed, on the road all the way."""
+    on_road: bool
+    driven_m: float
+
+    @property
+    def score(self) -> tuple[bool, bool, int, float]:
+        """Return what is smaller for a better plan."""
+        return not self.complete, not self.on_road, len(self.commands), -self.driven_m
+
+
+def lap_time_s(periods: int, car: CarConfig) -> float:
+    """Return the time of a lap that takes so many control periods from its first command to the line, in s.
+
+    Before that the clock counts the prepare step and the step that gives the command.
+    """
+    return float(lap_clock_s(periods + 2, car.control_period_s))

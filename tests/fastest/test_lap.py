@@ -1,0 +1,121 @@
+import json
+
+import numpy as np
+import pytest
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.rules import lap_clock_s
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.fastest import lap as fastest
+from deepracer_exp.fastest.lap import FastestLap, Question, fastest_lap, kept_lap
+from deepracer_exp.tracks.track import Track
+
+FAST = ("action_space=continuous", "action_space.speed.low=0.1", "action_space.speed.high=4")
+
+
+def ring(radius_m=1.2, width_m=0.7):
+    angle = np.linspace(0, 2 * np.pi, 61)
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    unit[-1] = unit[0]  # closed
+    radii = (radius_m, radius_m - 0.5 * width_m, radius_m + 0.5 * width_m)
+    return Track.from_route(np.concatenate([unit * radius for radius in radii], axis=1), "ring")
+
+
+def question(*overrides, track=None, start=0.0):
+    return Question.of(compose_experiment([*FAST, *overrides])[0], track or ring(), start)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def lap(cache) -> FastestLap:
+    return fastest_lap(question())
+
+
+def test_the_environment_times_the_lap_by_the_services_clock(lap):
+    assert lap.lap_time_s == pytest.approx(float(lap_clock_s(len(lap.steps), 1 / 15)))
+    assert lap.column("progress")[-1] == 100.0
+    assert lap.column("speed_mps")[0] == 0.0
+
+
+def test_no_lap_is_below_its_bound_and_the_bound_is_near(lap):
+    assert lap.over_bound >= 0.0
+    # A lap of two seconds has 30 control periods.
+    assert lap.lap_time_s - lap.bound_s < 4.5 / 15
+
+
+def test_the_lap_is_faster_than_the_inner_border_at_a_steady_speed(lap):
+    # 0.85 m inside, held at 2.6 m/s, and a start that takes 0.3 s.
+    assert lap.lap_time_s < 2 * np.pi * 0.85 / 2.6 + 0.3
+
+
+def test_commands_stay_within_the_limits(lap):
+    assert np.abs(lap.column("steering_deg")).max() <= 30.0 + 1e-9
+    assert lap.column("commanded_mps").max() <= 4.0 + 1e-9
+
+
+def test_a_lap_is_searched_once(lap, cache, monkeypatch):
+    monkeypatch.setattr(Question, "answer", lambda *_: pytest.fail("searched again"))
+    again = fastest_lap(question())
+    assert again.lap_time_s == lap.lap_time_s
+    assert (again.steps == lap.steps).all()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", '{"lap_time_s": 1, "bound_s": 1, "start_ndist": 0, "steps": [[1]]}', "[1]"]
+)
+def test_a_corrupt_file_counts_as_none(lap, cache, text):
+    (file,) = cache.rglob(f"{question().key}.json")
+    content = file.read_text()
+    file.write_text(text)
+    assert kept_lap(question()) is None
+    file.write_text(content)
+    kept = kept_lap(question())
+    assert kept is not None
+    assert json.loads(content)["columns"] == list(fastest.COLUMNS)
+
+
+def test_the_lap_depends_on_track_car_limits_and_start():
+    others = (
+        question("car=deepracer_v5"),
+        question("action_space.speed.high=3"),
+        question(track=ring(1.3)),
+        question(start=0.5),
+    )
+    assert len({question().key, *(other.key for other in others)}) == 5
+
+
+def test_a_list_of_actions_counts_with_the_box_of_its_limits():
+    listed = Question.of(compose_experiment(["action_space=discrete"])[0], ring())
+    box = ("action_space.speed.low=1", "action_space.speed.high=3")
+    assert listed.key == question(*box).key
+
+
+def test_slower_commands_are_slower(lap, cache):
+    slow = fastest_lap(question("action_space.speed.high=2"))
+    assert slow.lap_time_s > lap.lap_time_s + 0.3
+    assert slow.column("speed_mps").max() < 2.05
+
+
+def test_an_open_course_is_driven_to_its_end(cache):
+    x = np.linspace(0.0, 4.0, 21)
+    rows = np.column_stack([x, 0 * x, x, 0 * x + 0.4, x, 0 * x - 0.4])
+    found = fastest_lap(question(track=Track.from_route(rows, "open")))
+    assert 1.2 < found.lap_time_s < 1.8
+    assert found.column("progress")[-1] == 100.0
+
+
+def test_limits_that_no_lap_fits_into_are_said_in_one_line(cache):
+    with pytest.raises(RunFailed, match="ring: no lap was found that stays on the road with"):
+        fastest_lap(question("action_space.steering_angle.low=-3", "action_space.steering_angle.high=3"))
+
+
+def test_a_command_that_cannot_be_chosen_is_refused():
+    with pytest.raises(BadInput, match="speed is always 2"):
+        question("action_space.speed.low=2", "action_space.speed.high=2")
