@@ -16,8 +16,9 @@ policy completes no lap is slower than any. JSON has for each track and recipe, 
   no lap; `lap_share`, complete laps of those tried, mean over seeds;
 - `worst_rise`: how far any evaluation after the first lap is above the fastest one before it, as a share; null where
   there is no lap at all, or none any more later;
-- `bound_s`: the lap of a perfect driver of this car (`benchmarks.lap_bounds`), and how far laps are above it as a
-  share: `over_bound` after 1.5 million steps, `over_bound_end` after all; null without a lap there.
+- `bound_s`: the bound of a lap of this car from standstill at the start line (`deepracer-exp tracks NAME --fastest`),
+  and how far laps are above it as a share: `over_bound` after 1.5 million steps, `over_bound_end` after all; null
+  without a lap there.
 
 `--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
 continues.
@@ -28,7 +29,7 @@ import math
 import sys
 import tempfile
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,12 @@ import numpy as np
 
 from deepracer_exp.analysis.evidence import Interval, iqm_band
 from deepracer_exp.analysis.statistics import Values
-from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import build_courses
+from deepracer_exp.fastest.lap import Question, car_limits
 
 from .command import at_once, read_metrics, trained
-from .lap_bounds import Cornering, bound_s, cornering
 from .report import benchmark_parser, percent, table, with_exit_code, write_json
 
 TRACKS = ("reinvent_base", "reInvent2019_track", "Spain_track", "Oval_track", "Monaco")
@@ -60,16 +60,12 @@ def training_overrides(track: str, recipe: str, steps: int | None, overrides: Se
     return [*experiment, f"track={track}", *_ALWAYS, *budget, *overrides]
 
 
-@cache
-def _turns(car: CarConfig) -> Cornering:
-    return cornering(car)
-
-
 def lap_bound_s(experiment: Experiment) -> float:
     """Return the lap of a perfect driver of an experiment's car on its track."""
     (course,) = build_courses(experiment)
-    (track,) = course.tracks
-    return bound_s(track, experiment.car, _turns(experiment.car))
+    low, high = car_limits(experiment.car)
+    bound_s, _ = Question(experiment=experiment, track=course.tracks[0], low=low, high=high).bound()
+    return bound_s
 
 
 def evaluations(runs: Sequence[Path]) -> tuple[list[int], Values, Values]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.experiment import Experiment
@@ -28,7 +29,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write, read_json
 from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.sim.ability import ability_of
-from deepracer_exp.tracks.line_time import fastest_line
+from deepracer_exp.tracks.line_time import Ability, fastest_line
 from deepracer_exp.tracks.track import Track
 
 from .search import OnRound, Search, lap_time_s
@@ -66,11 +67,16 @@ class FastestLap:
         return self.lap_time_s / self.bound_s - 1.0
 
 
+def car_limits(car: CarConfig) -> tuple[Floats, Floats]:
+    """Return lowest and highest [steering_deg, speed_mps] that a car obeys, (2,) each."""
+    return np.array([-car.max_steering_deg, car.min_speed_mps]), np.array(
+        [car.max_steering_deg, car.max_speed_mps]
+    )
+
+
 def command_limits(experiment: Experiment) -> tuple[Floats, Floats]:
     """Return lowest and highest [steering_deg, speed_mps] of the actions, within the limits of the car, (2,) each."""
-    car, actions = experiment.car, build_action_space(experiment.action_space)
-    low = np.array([-car.max_steering_deg, car.min_speed_mps])
-    high = np.array([car.max_steering_deg, car.max_speed_mps])
+    actions, (low, high) = build_action_space(experiment.action_space), car_limits(experiment.car)
     return np.clip(actions.low, low, high), np.clip(actions.high, low, high)
 
 
@@ -134,27 +140,33 @@ class Question:
             RunFailed: no lap is possible within the limits.
         """
         car, track = self.experiment.car, self.track
-        low, high = self._limits
-        ability = ability_of(car, low, high, track.floor.friction)
-
-        def least(driven: Floats | None = None) -> tuple[float, Floats]:
-            return fastest_line(track, car.reach_m, ability, self.start_ndist, car.front_point_m, driven)
-
-        least_s, line = least()
+        bound_s, line = self.bound()
         places = self.start_ndist + np.linspace(0.0, 1.0, round(track.length_m / _LINE_M))
-        search = Search(car, track, low, high, self.start_ndist)
+        search = Search(car, track, *self._limits, self.start_ndist)
         commands = search.run((track.points_at(places), line), on_round)
         steps = self._drive(commands)
         ahead = car.front_point_m * np.column_stack([np.cos(steps[:, 3]), np.sin(steps[:, 3])])
-        least_s = min(least_s, least(steps[1:, 1:3] - ahead[1:])[0], len(commands) * car.control_period_s)
-        # A lap ends with a control step.
-        periods = math.ceil(least_s * car.control_hz - 1e-9)
-        return FastestLap(
-            lap_time_s=float(steps[-1, 0]),
-            bound_s=lap_time_s(periods, car),
-            start_ndist=self.start_ndist,
-            steps=steps,
+        time_s = float(steps[-1, 0])
+        # The search for the line of the bound is local, too.
+        bound_s = min(bound_s, self.bound(steps[1:, 1:3] - ahead[1:])[0], time_s)
+        return FastestLap(lap_time_s=time_s, bound_s=bound_s, start_ndist=self.start_ndist, steps=steps)
+
+    @cached_property
+    def _ability(self) -> Ability:
+        return ability_of(self.experiment.car, *self._limits, self.track.floor.friction)
+
+    def bound(self, driven: Floats | None = None) -> tuple[float, Floats]:
+        """Return the bound from below of the lap time in s, and its line, (n, 2).
+
+        Args:
+            driven: chassis origins of a lap (n, 2), from whose line the search for the least time begins as well.
+        """
+        car = self.experiment.car
+        least_s, line = fastest_line(
+            self.track, car.reach_m, self._ability, self.start_ndist, car.front_point_m, driven
         )
+        # A lap ends with a control step.
+        return lap_time_s(math.ceil(least_s * car.control_hz - 1e-9), car), line
 
     def _drive(self, commands: Floats) -> Floats:
         """Drive commands [speed_mps, steering_rad], (n, 2), in the environment and return its steps.
