@@ -189,6 +189,10 @@ class PPO(Algorithm):
         lr = self.config.lr * self.schedule.factor(iteration, fraction)
         for group in self._optimizer.param_groups:
             group["lr"] = lr
+        config = self.config
+        self._loss.entropy_coeff.fill_(
+            config.entropy_coeff * (1 + (config.entropy_end_factor - 1) * fraction)
+        )
         if self._learner is not self.networks:
             self._learner.load_state_dict(self.networks.state_dict())
             batch = batch.to(self._device, non_blocking_pin=self._device.type == "cuda")

@@ -100,6 +100,8 @@ class AlgorithmConfig:
     clip_epsilon: Positive
     entropy_coeff: NonNegative
     """`beta_entropy`."""
+    entropy_end_factor: NonNegative = 1.0
+    """Factor of `entropy_coeff` at the end of the budget, reached along a straight line from 1 at its start."""
     critic_coeff: Positive
     loss_type: Literal["huber", "mean squared error"]
     """Loss of the value network."""

@@ -446,6 +446,10 @@ def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> l
     by_clock = [name for name in clocks if getattr(experiment.budget, name) is not None]
     if by_clock and getattr(experiment.lr_schedule, "by", "fraction") == "fraction":
         why.append(f"the learning rate follows the clock (budget.{by_clock[0]}, lr_schedule.by=fraction)")
+    if by_clock and experiment.algorithm.entropy_end_factor != 1:
+        why.append(
+            f"the entropy bonus follows the clock (budget.{by_clock[0]}, algorithm.entropy_end_factor)"
+        )
     if any(isinstance(node, ast.Global) for node in ast.walk(ast.parse(setup.reward.text))):
         why.append(
             f"the reward function {setup.reward.name} keeps something in a global variable, which is lost"

@@ -202,6 +202,16 @@ def test_the_kl_is_near_the_exact_one():
     assert metrics.kl == pytest.approx(exact, rel=0.3)
 
 
+@pytest.mark.parametrize(("fraction", "coeff"), [(0.0, 0.4), (0.5, 0.3), (1.0, 0.2)])
+def test_the_entropy_bonus_falls_along_a_straight_line_to_its_share(fraction, coeff):
+    networks, ppo = make(entropy_coeff=0.4, entropy_end_factor=0.5)
+    ppo.update(drive(networks), 0, fraction)
+    same, constant = make(entropy_coeff=coeff)
+    constant.update(drive(same), 0, fraction)
+    torch.testing.assert_close(parameters(networks), parameters(same))
+    assert not torch.equal(parameters(networks), parameters(make()[0]))
+
+
 def test_no_limit_on_the_gradient_lets_it_through_whole():
     def first_step(max_grad_norm: float) -> torch.Tensor:
         networks, ppo = make(max_grad_norm=max_grad_norm, epochs=1, batch_size=256)
