@@ -6,6 +6,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import kendalltau
 
+from deepracer_exp.runs.result import RELIABLE
+
 from .statistics import Values
 
 LEAST_TIMES = 8
@@ -60,11 +62,13 @@ def slower_laps(iterations: pd.DataFrame) -> SlowerLaps | None:
     rose if the same test says so of the returns of the same iterations.
 
     Args:
-        iterations: a row each, with `iteration`, `reward_mean` and the columns SERIES; the first of them with
-            `LEAST_TIMES` lap times counts.
+        iterations: a row each, with `iteration`, `reward_mean`, `eval_completion` and the columns SERIES; the first of
+            them with `LEAST_TIMES` lap times counts. Evaluations with less than `RELIABLE` of the way driven do not.
     """
     for column, name in SERIES.items():
         known = iterations[column].notna()
+        if column.startswith("eval_"):  # the few laps that an unreliable policy completes may be fast ones
+            known &= iterations["eval_completion"] >= 100 * RELIABLE
         if known.sum() >= LEAST_TIMES:
             # The return of an evaluated policy is that of the iterations since the evaluation before.
             block = known.cumsum() - known
