@@ -177,7 +177,10 @@ def test_iterations_of_one_episode_are_judged_together() -> None:
     assert one.judged["completion_mean"].tolist() == pytest.approx(many.judged["completion_mean"].tolist())
     assert one.judged["iteration"].tolist() == [LEAST_EPISODES * k + 4 for k in range(len(LEARNED))]
     assert of(one, "converged").values["completion"] == of(many, "converged").values["completion"]
-    assert "drove the last of iterations 75 to 79: a quarter of their laps" in of(one, "submit").sentence
+    assert (
+        "drove the last of iterations 75 to 79: a quarter of their exploring laps"
+        in of(one, "submit").sentence
+    )
     assert many.judged is many.iterations
     # A block of steps that have no episode yet ends with the last iteration.
     assert one.judged["steps"].sum() == one.iterations["steps"].sum()
@@ -200,7 +203,7 @@ def test_laps_with_resets_are_no_laps_of_the_driving_line() -> None:
     assert view.episodes["resets"].tolist() == [0, 0, 0, 0, 0, 1]
     assert view.episodes["lap_time_s"].notna().tolist() == [True] * 5 + [False]
     assert view.episodes["reset_lap_time_s"].notna().tolist() == [False] * 5 + [True]
-    assert "5 complete exploring laps, the fastest in 9.9" in headline(view)
+    assert "5 complete laps, the fastest in 9.9" in headline(view)
     assert headline(view).endswith("; 1 more lap with resets.")
     found = of(view, "chance")
     assert (found.values["laps"], found.values["complete"]) == (5, pytest.approx(5 / 6))
