@@ -19,7 +19,7 @@ from .charts.runs import generalisation_matrix, generations, run_folder, runs_co
 from .findings import Finding, findings
 from .log_tables import best_laps, candidate_rows, facts, headline, iteration_rows, problem_rows
 from .log_view import LogView, prepare
-from .next_steps import next_steps, outcome
+from .next_steps import next_steps, official_place, outcome
 from .page import Glimpse, Plot, plot_of, render
 from .reward_replay import ReplayedRewards
 
@@ -134,18 +134,15 @@ def html(page: LogPage) -> str:
     shown = {"The most important figures": [name for name in first if name != _PICTURE]}
     for title, some in sections.items():
         shown[title] = [chart.name for chart in some if chart.name not in first]
-    title, outcome_rows, steps = _first_screen(page)
     files = [readable(str(file)) for file in recording.files]
     settings = sorted((recording.hyperparameters or {}).items())
     return render(
         __package__,
         "log_report.html.j2",
         list(plots.values()),
-        title=title,
+        **_first_screen(page),
         name=view.name,
         headline=headline(view),
-        outcome=outcome_rows,
-        steps=steps,
         picture=plots[_PICTURE] if _PICTURE in first else None,
         findings=[_finding(one, plots) for one in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
@@ -168,8 +165,10 @@ def html(page: LogPage) -> str:
     )
 
 
-def _first_screen(page: LogPage) -> tuple[str, list[tuple[str, str]], list[tuple[str, str]]]:
-    """Return the title, the result in names and values, and the next steps: commands, each with what it does.
+def _first_screen(page: LogPage) -> dict[str, Any]:
+    """Return the title, the result in names and values, the place on the official board, and the next steps.
+
+    Steps are commands, each with what it does.
 
     The title is the experiment's name, of a log that of its file. Our commands do not take checkpoints of the service:
     the next step with those is to submit one of them.
@@ -179,11 +178,21 @@ def _first_screen(page: LogPage) -> tuple[str, list[tuple[str, str]], list[tuple
         run = read_head(folder) if folder is not None else None
         if run is not None:
             steps = next_steps(run.path, run.summary) if run.summary else []
-            return str(run.config.get("name") or page.view.name), outcome(run), steps
+            return {
+                "title": str(run.config.get("name") or page.view.name),
+                "outcome": outcome(run),
+                "official_place": official_place(run),
+                "steps": steps,
+            }
     except BadInput:
         pass  # the page lists which files could not be read
     submit = [("", one.sentence) for one in page.findings if one.rule == "submit"]
-    return page.view.name, facts(page.view), submit
+    return {
+        "title": page.view.name,
+        "outcome": facts(page.view),
+        "official_place": None,
+        "steps": submit,
+    }
 
 
 def _finding(one: Finding, plots: Mapping[str, Plot]) -> dict[str, Any]:

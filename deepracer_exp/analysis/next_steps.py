@@ -52,19 +52,21 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
         found.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
         if (lap := fastest_reliable(run.rows)) is not None:
             found.append(("Fastest reliable lap", str(lap)))
-        place = official_place(run.config, result.lap_time_s)
-        if place is not None:
-            found.append(("Official board", place))
     elif run.summary:
         found.append(("Evaluated", "never"))
     return [*found, ("State", state(run))]
 
 
-def official_place(config: Mapping[str, Any], mean_lap_s: float | None) -> str | None:
+def official_place(run: RunRecord) -> str | None:
     """Return where the mean of the evaluated laps would stand on the official board of a run's track, in words.
 
     None: there is no complete lap, the run has several tracks, or its track has no board or is driven the other way.
+
+    Raises:
+        BadInput: as for `outcome`.
     """
+    config, result = run.config, read_result(run.path)
+    mean_lap_s = result.lap_time_s if result is not None and result.evaluated else None
     track, protocol = config.get("track") or {}, config.get("evaluation") or {}
     alone = track.get("direction") == "forward" and track.get("file") is None and track.get("knots") is None
     if mean_lap_s is None or not alone or protocol.get("tracks") is not None:

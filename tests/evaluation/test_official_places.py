@@ -9,6 +9,7 @@ from deepracer_exp.analysis.next_steps import official_place
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluate import official_places
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
+from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.tracks import boards
 from tests.page_html import Html
 
@@ -73,14 +74,22 @@ def test_the_report_of_a_training_names_the_place(copied, call, board_of_the_str
     run = copied(*LAPS)
     assert call("analyze", str(run)).code == 0
     assert (
-        "Official board Drag Race (1,728 racers, total of 3 laps): "
+        "On the official board: Drag Race (1,728 racers, total of 3 laps): "
         in Html((run / "report.html").read_text()).text
     )
 
 
-def test_a_run_of_several_tracks_has_no_place():
-    config = {"track": {"A": {"direction": "forward"}}, "car": {"name": "deepracer_v5"}}
-    assert official_place(config, 14.0) is None
-    config["track"] = {"name": "Albert", "direction": "forward", "file": None, "knots": None}
-    assert "May 2024 Qualifier" in (official_place(config, 14.0) or "")
-    assert official_place(config, None) is None
+def test_a_run_of_several_tracks_or_without_a_lap_has_no_place(tmp_path):
+    best = {"metric": "race_score", "rank": [1.0, -14.0], "iteration": 3, "eval_completion": 100.0}
+    (tmp_path / "summary.json").write_text(json.dumps({"best": best | {"eval_lap_time_s": 14.0}}))
+    albert = {"name": "Albert", "direction": "forward", "file": None, "knots": None}
+
+    def place(track: dict) -> str | None:
+        return official_place(RunRecord(tmp_path, {"track": track}, [], {}, {}))
+
+    assert "May 2024 Qualifier" in (place(albert) or "")
+    assert place({"A": albert}) is None
+    assert place(albert | {"direction": "reversed"}) is None
+    assert place(albert | {"file": "mine.npy"}) is None
+    (tmp_path / "summary.json").write_text(json.dumps({"best": best | {"eval_lap_time_s": None}}))
+    assert place(albert) is None
