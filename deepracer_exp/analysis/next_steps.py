@@ -8,7 +8,15 @@ from typing import Any
 
 from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import BEST, RunRecord, read_config, run_folders, sees_pictures
+from deepracer_exp.runs.files import (
+    BEST,
+    METRICS,
+    RunRecord,
+    read_config,
+    read_metrics,
+    run_folders,
+    sees_pictures,
+)
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.resolve import best_of
 from deepracer_exp.runs.result import (
@@ -50,8 +58,9 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
             if value is not None
         ]
         found.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
-        if (lap := fastest_reliable(run.rows)) is not None:
-            found.append(("Fastest reliable lap", str(lap)))
+        with contextlib.suppress(BadInput):  # a page is written of a run whose metrics are damaged, too
+            if (lap := fastest_reliable(run.rows or read_metrics(run.path / METRICS))) is not None:
+                found.append(("Fastest reliable lap", str(lap)))
     elif run.summary:
         found.append(("Evaluated", "never"))
     return [*found, ("State", state(run))]

@@ -159,7 +159,7 @@ def _print_table(rows: "Sequence[Row]") -> None:
 
     table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
     table.columns[0].overflow = "fold"
-    for name in ("lap (s)", "race score (s)", "exploring laps", "fastest (s)", "age"):
+    for name in ("lap (s)", "race score (s)", "exploring laps", "fastest of them (s)", "age"):
         table.add_column(name, justify="right")
     several = len({row["user"] for row in rows}) > 1
     labelled = [key for key in _columns(rows) if key in ("name", "note") or key.startswith(USER_TAG)]
