@@ -139,7 +139,8 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     places = [(track, recipe) for track in tracks for recipe in recipes]
     overrides = {at: training_overrides(*at, options.steps, options.overrides) for at in places}
     # All of them before the first training: one that cannot be composed costs nothing.
-    bounds = {at: lap_bound_s(compose_experiment(words)[0]) for at, words in overrides.items()}
+    experiments = {at: compose_experiment(words)[0] for at, words in overrides.items()}
+    bounds = {at: lap_bound_s(experiment) for at, experiment in experiments.items()}
     asked = [
         partial(trained, folder / f"{track}-{recipe}-{seed}", [*words, f"seed={seed}"])
         for (track, recipe), words in overrides.items()
