@@ -15,13 +15,13 @@ from typing import NoReturn
 
 from deepracer_exp import __version__
 from deepracer_exp.addresses import redact, without_passwords
-from deepracer_exp.commands import actions, analyze, evaluate, files, runs, tracks, train
+from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
 from deepracer_exp.commands.arguments import refuse_old_spellings
 from deepracer_exp.errors import BadInput, RunFailed, nearest
 from deepracer_exp.lifeline import die_with_parent, guard_imports
 from deepracer_exp.scratch import own_scratch
 
-_COMMANDS = (train, runs, evaluate, analyze, files, tracks, actions)
+_COMMANDS = (train, runs, evaluate, analyze, compare, files, tracks, actions)
 """In the order of `--help`."""
 _EPILOG = """\
 `deepracer-exp COMMAND --help` explains a command. Results are written to runs/ in the current folder.

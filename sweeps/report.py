@@ -21,6 +21,7 @@ from .best import best_line, best_run, best_shown, best_trial, complete_trials, 
 from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
 from .labels import OUTCOMES, duration, outcome_of, outcome_words, parameter, short_keys, steps
 from .objectives import MEASURES, NONE, objectives_of, shown, shown_or_dash, shown_values
+from .seeds import over_seeds
 
 _MOST_ROWS = 300
 _MOST_FAILURES = 20
@@ -61,6 +62,8 @@ def study_page(study: optuna.Study) -> str:
         picture=_picture(study) if complete else None,
         best=best_trial(study).number if complete else None,
         winners=_winners(study, objectives, keys),
+        seeds=over_seeds(study, keys),
+        objective=MEASURES[objectives[0]].words,
         too_few=FEWEST_COMPLETE if len(complete) < FEWEST_COMPLETE else None,
         trials=_table(study, objectives, keys),
         failures=_failures(trials),

@@ -1,4 +1,5 @@
 import json
+import shlex
 import subprocess
 import sys
 
@@ -100,16 +101,29 @@ def test_without_a_command_the_help_is_printed(call):
     assert "train" in alone.stdout
 
 
-def test_a_grid_runs_every_combination_and_prints_a_table(train_here):
+def test_a_grid_ends_with_a_table_of_its_runs_and_of_their_groups(train_here, call):
     ended = train_here("-m", "budget.iterations=1", "seed=1,2")
     assert ended.code == 0, ended.stderr
     assert len(ended.folders) == 2
     seeds = [json.loads((folder / "summary.json").read_text())["seed"] for folder in ended.folders]
     assert sorted(seeds) == [1, 2]
-    table = ended.stdout.split("\n2 runs:\n")[1]
+    table, groups = ended.stdout.split("\n2 runs:\n")[1].split("\nGroups\n")
     assert table.count("\n") == 2
     for folder in ended.folders:
         assert folder.name in table
+    (named,) = [line.split() for line in groups.splitlines() if line.startswith("tiny ")]
+    assert named[:2] == ["tiny", "2"]
+    # The command that is printed draws their curves.
+    line = next(line for line in ended.stdout.splitlines() if " compare " in line)
+    words = shlex.split(line, comments=True)
+    assert call("compare", *words[2:]).code == 0
+    assert list(ended.cwd.glob("*-comparison.html"))
+
+
+def test_a_grid_of_single_runs_has_no_groups(train_here):
+    ended = train_here("-m", "budget.iterations=1", "algorithm.lr=1e-4,1e-3")
+    assert "2 runs:" in ended.stdout
+    assert "Groups" not in ended.stdout
 
 
 def test_tracks_lists_each_family_once_with_its_variants(call):

@@ -387,13 +387,17 @@ def actions_compared(both: AgainstLog) -> Chart | None:
     )
 
 
-def write_against_log(path: Path, run: str, both: AgainstLog, view: LogView) -> Path:
+def write_against_log(
+    path: Path, run: str, both: AgainstLog, view: LogView, learned: Chart | None = None
+) -> Path:
     """Write the page of simulated laps, driven by the policy of `run`, beside those of a log atomically.
+
+    `learned` is a figure of how both were trained.
 
     Raises:
         OSError: it cannot be written.
     """
-    drawn = (lines_compared(both), along_the_track(both), actions_compared(both))
+    drawn = (lines_compared(both), along_the_track(both), actions_compared(both), learned)
     charts = [chart for chart in drawn if chart is not None]
     page = render(
         __package__,

@@ -20,6 +20,8 @@ from .statistics import CONFIDENCE, Values
 RESAMPLES = 2000
 LEAST_FOR_INTERVAL = 3
 """Seeds of a group below which it has no interval."""
+SAME = "no difference that seeds do not explain"
+TOO_FEW = "too few runs to tell"
 _TRIMMED = 0.25
 
 Strata = Sequence[Values]
@@ -107,6 +109,14 @@ class Difference:
         low, high = self.probability_interval
         same = low <= 0.5 <= high
         return same or (self.interval is not None and self.interval[0] <= 0.0 <= self.interval[1])
+
+    def verdict(self, better: str = "better", worse: str = "worse") -> str:
+        """Return in words whether the groups differ, `better` or `worse` where they do."""
+        if not self.enough:
+            return TOO_FEW
+        if self.explained_by_seeds:
+            return SAME
+        return better if self.probability > 0.5 else worse
 
     def reversed(self) -> "Difference":
         """Return the difference of the other group from this one."""

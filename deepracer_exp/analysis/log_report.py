@@ -15,7 +15,7 @@ from deepracer_exp.runs.files import read_head
 
 from .charts import actions, driving_line, laps, mistakes, rewards, training, zigzag
 from .charts.figure import Chart
-from .charts.runs import generalisation_matrix, generations, run_folder, runs_compared
+from .charts.runs import generalisation_matrix, generations, policy_of, run_folder
 from .findings import Finding, findings
 from .log_tables import best_laps, candidate_rows, facts, headline, iteration_rows, problem_rows
 from .log_view import LogView, prepare
@@ -24,7 +24,7 @@ from .page import Glimpse, Plot, plot_of, render
 from .reward_replay import ReplayedRewards
 
 MOST_FILES = 400
-_BESIDE, _PAID = "Generations, runs and tracks", "What the reward pays for"
+_BESIDE, _PAID = "Generations and tracks", "What the reward pays for"
 _PICTURE = "lap_line"
 """The figure beside the outcome."""
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
@@ -64,7 +64,7 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
 }
 """The figures of a recording without a training."""
 FIRST = (
-    *("replayed_laps", "runs_compared", "lap_line", "training_progress", "evaluations", "lap_time_histogram"),
+    *("replayed_laps", "lap_line", "training_progress", "evaluations", "lap_time_histogram"),
     *("sector_times", "speed_steering_by_waypoint", "off_track_risk", "racing_line", "reward_by_waypoint"),
 )
 """Names of the figures that matter most: those that were asked for, then the result, then where time is lost."""
@@ -79,8 +79,6 @@ class LogPage:
     view: LogView
     findings: Sequence[Finding]
     """The most important first."""
-    others: Sequence[LogView] = ()
-    """Recordings that it is compared with."""
     replay: ReplayedRewards | None = None
     """The same driving, paid by another reward function."""
     terms: pd.DataFrame | None = None
@@ -111,13 +109,13 @@ def write_page(path: Path, page: LogPage) -> Path:
 
 def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     """Return all figures for which there is data by their section, in the order of the page."""
-    view, views = page.view, [page.view, *page.others]
+    view = page.view
     drawn: dict[str, list[Chart | None]] = {}
     if page.replay is not None:
         drawn["Another reward function"] = [*page.replay.charts]
     sections = SECTIONS if view.trained else RACES
     drawn |= {title: [draw_one(view) for draw_one in some] for title, some in sections.items()}
-    drawn[_BESIDE] += [runs_compared(views), generations(views), generalisation_matrix(views)]
+    drawn[_BESIDE] += [generations([view]), generalisation_matrix([policy_of(view)])]
     if page.terms is not None:
         drawn[_PAID].append(rewards.reward_terms(view, page.terms))
     known = {title: [chart for chart in some if chart is not None] for title, some in drawn.items()}

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 Values = NDArray[np.float64]
 MOST_ROWS = 200_000
 """Rows beyond which quantiles are those of an evenly spaced part of them."""
-RESAMPLES = 2000
 CONFIDENCE = 0.95
 
 
@@ -46,30 +45,6 @@ def _grain(values: Values) -> float:
         return 0.0
     grain = float(apart.min())
     return grain if np.abs(apart / grain - (apart / grain).round()).max() < 0.01 else 0.0
-
-
-def median_band(curves: Values) -> tuple[Values, Values, Values]:
-    """Return the median of curves and its bootstrap interval (95 per cent, percentile method, Efron 1979).
-
-    Args:
-        curves: one a row, (n, m); NaN where a curve has no value. With a single known value the interval is NaN, and
-            where less than half of the curves have one so is the median.
-
-    Returns:
-        median, low and high, each (m,).
-    """
-    median, low, high = np.full((3, curves.shape[1]), np.nan)
-    rng = np.random.default_rng(0)
-    for column, values in enumerate(curves.T):
-        known = values[np.isfinite(values)]
-        if len(known) < max(1.0, len(values) / 2):
-            continue
-        median[column] = np.median(known)
-        if len(known) > 1:
-            medians = np.median(rng.choice(known, (RESAMPLES, len(known))), axis=1)
-            tail = (1 - CONFIDENCE) / 2
-            low[column], high[column] = np.quantile(medians, [tail, 1 - tail])
-    return median, low, high
 
 
 def subsample(count: int, most: int) -> NDArray[np.intp]:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from deepracer_exp.errors import BadInput, writing
 
-from .analyze import existing_logs
 from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
 from .output import table_console, warnings_on_stderr
+from .pages import existing_logs
 from .startup import check_policy
 
 if TYPE_CHECKING:

@@ -35,6 +35,10 @@ def refuse_old_spellings(arguments: Sequence[str]) -> None:
     """
     if arguments and arguments[0] in _OLD_COMMANDS:
         raise BadInput(f"{arguments[0]}: write deepracer-exp runs {shlex.join(arguments)}")
+    if list(arguments[:2]) == ["runs", "compare"]:
+        raise BadInput(f"runs compare: write deepracer-exp {shlex.join(arguments[1:])}")
+    if "--compare" in arguments:
+        raise BadInput("--compare: write deepracer-exp compare, with all runs and logs that are compared")
     for argument, following in itertools.pairwise([*arguments, ""]):
         flag, _, value = argument.partition("=")
         if flag in _OLD_FLAGS:

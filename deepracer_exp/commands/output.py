@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import count
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, read_metrics
-from deepracer_exp.runs.result import RELIABLE, fastest_reliable
+from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.config.running import TrackingConfig
     from deepracer_exp.training.trainer import TrainResult
 
@@ -31,6 +32,21 @@ def table_console(piped_width: int = 200) -> "Console":
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else piped_width, highlight=False, markup=False)
+
+
+def print_table(console: "Console", title: str | None, table: "Table") -> None:
+    """Print a table of a page, with a title before and an empty line after it."""
+    from rich.table import Table as RichTable
+
+    drawn = RichTable(box=None, pad_edge=False, header_style="dim")
+    for number, head in enumerate(table.heads):
+        drawn.add_column(head, justify="left" if number < max(table.words, 1) else "right", overflow="fold")
+    for row in table.rows:
+        drawn.add_row(*row)
+    if title is not None:
+        console.print(title, style="bold")
+    console.print(drawn)
+    console.print()
 
 
 @contextmanager
@@ -70,7 +86,7 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     from deepracer_exp.runs.result import result_of
 
     summary = outcome.summary
-    if outcome.status == "failed":
+    if outcome.status == FAILED:
         print(f"deepracer-exp: run failed: {outcome.reason}", file=sys.stderr)
         print(f"  details: {outcome.folder}", file=sys.stderr)
         _print_unrecorded([outcome], tracking)
@@ -123,11 +139,33 @@ def print_steps(steps: Sequence[tuple[str, str]]) -> None:
 
 
 def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
-    """Print one line per run."""
+    """Print one line per run, and what groups of runs that differ only in their seed and track scored."""
     print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
         print(f"  {outcome.folder.name}  {outcome.status}  {_lap(outcome)}  {outcome.reason}")
+    _print_groups([outcome.folder for outcome in outcomes if outcome.status != FAILED])
     _print_unrecorded(outcomes, tracking)
+
+
+def _print_groups(runs: "Sequence[Path]") -> None:
+    """Print the tables of groups, where one of them has several runs."""
+    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences
+    from deepracer_exp.analysis.groups import compared, group_runs
+    from deepracer_exp.analysis.next_steps import own_word
+    from deepracer_exp.runs.files import read_head
+
+    groups = group_runs((None, read_head(run)) for run in runs) if len(runs) > 1 else []
+    if len(groups) in (0, len(runs)):
+        return
+    console, found = table_console(), compared(groups)
+    console.print()
+    print_table(console, "Groups", scored(groups))
+    if found:
+        print_table(console, f"Against {groups[0].name}", differences_table(found))
+    for sentence in sentences(groups, found):
+        console.print(sentence, soft_wrap=True)
+    words = shlex.join(own_word(run) for run in runs)
+    print_steps([(f"{_command()} compare {words}", "learning curves over seeds")])
 
 
 def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:

@@ -1,4 +1,4 @@
-"""`--replay PAGE.html` of `analyze`, `runs compare` and `watch`: two laps that drive beside each other."""
+"""`--replay PAGE.html` of `analyze`, `compare` and `watch`: two laps that drive beside each other."""
 
 import argparse
 from collections.abc import Sequence

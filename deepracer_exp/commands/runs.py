@@ -1,14 +1,12 @@
-"""`deepracer-exp runs`: list runs, compare them, show their lineage, promote and clean them; and `ui`."""
+"""`deepracer-exp runs`: list runs, show their lineage, promote and clean them; and `ui`."""
 
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from string import ascii_uppercase
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, count, writing
-from deepracer_exp.runs.files import METRICS
+from deepracer_exp.errors import BadInput, count
 
 from .arguments import (
     STORES,
@@ -19,31 +17,22 @@ from .arguments import (
     port,
     read_stores,
     run_and_overrides,
-    runs_and_overrides,
 )
 from .output import table_console
-from .replay import add_replay, check_replay, write_laps
 from .runs_edit import add_edits
 from .runs_list import LIST, add_list
-from .startup import check_policy
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
-    from deepracer_exp.analysis.log_tables import Table as PageTable
     from deepracer_exp.runs.clean import Removable, StoreOverview
-    from deepracer_exp.runs.files import RunRecord
     from deepracer_exp.runs.lineage import Member
 
 _MOST_CHANGES = 6
 """Changes of a clone that its lineage shows."""
 _EPILOG = """\
   deepracer-exp runs                                        list the runs, newest first
-  deepracer-exp runs compare runs/default/*                 all runs of an experiment
-  deepracer-exp runs compare RUN RUN -o better.html         draw their learning curves and lap times, too
-  deepracer-exp runs compare RUN RUN --replay laps.html     their fastest laps, driven beside each other
   deepracer-exp runs lineage RUN
   deepracer-exp runs promote RUN                            its best checkpoint, as EXPERIMENT@champion
   deepracer-exp runs promote best:default --alias rain      the best run of an experiment
@@ -76,9 +65,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     """Add the family of commands, and `ui`."""
     family = commands.add_parser(
         "runs",
-        help="list, compare, label, promote and clean runs",
-        description="List runs with their state, score, laps and age; compare them, show their lineage, register and "
-        "clean them.",
+        help="list, label, promote and clean runs",
+        description="List runs with their state, score, laps and age; show their lineage, register and clean them. "
+        "`deepracer-exp compare` compares them.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -86,23 +75,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     where = " | ".join(f"{key}=..." for key in STORES)
 
     add_list(actions)
-
-    compare = add_command(
-        actions,
-        "compare",
-        _compare,
-        help="show runs side by side",
-        description="Show how runs differ and what they achieved; with --output, draw their learning curves and lap "
-        "times.",
-    )
-    add_run(compare, where, many=True)
-    compare.add_argument(
-        "-o",
-        "--output",
-        metavar="PAGE.html",
-        help="page to write: these tables, learning curves and lap times",
-    )
-    add_replay(compare, "the fastest usual lap of each run's best checkpoint")
 
     lineage = add_command(
         actions,
@@ -164,106 +136,6 @@ def with_default_action(arguments: list[str]) -> list[str]:
     if arguments[:1] == ["runs"] and (len(arguments) == 1 or is_override(arguments[1])):
         return ["runs", LIST, *arguments[1:]]
     return arguments
-
-
-def _compare(args: argparse.Namespace) -> int:
-    from deepracer_exp.runs.files import read_record
-    from deepracer_exp.runs.resolve import resolve
-
-    if args.output is not None and Path(args.output).suffix != ".html":
-        raise BadInput(f"--output {args.output}: accepted: the name of a page (.html)")
-    check_replay(args.replay)
-    runs, overrides = runs_and_overrides(args)
-    stores = read_stores(overrides)
-    folders: dict[Path, None] = {}
-    for run in runs:
-        try:
-            folders[resolve(run, stores.runs_dir, stores.uri).path] = None
-        except BadInput:
-            if not Path(run).exists():
-                raise
-            others = "deepracer-exp compare RUN LOGS compares a run with logs of the service"
-            raise BadInput(f"{run}: is no run; accepted: runs; {others}") from None
-    if not 2 <= len(folders) <= len(ascii_uppercase):
-        raise BadInput(
-            f"{count(len(folders), 'run')} given; accepted: 2 to {len(ascii_uppercase)} different ones"
-        )
-    if args.replay is not None and len(folders) > 2:
-        raise BadInput(f"--replay {args.replay}: {len(folders)} runs given; accepted: two")
-    records = [read_record(folder) for folder in folders]
-    for record in records:
-        if not record.rows:
-            raise BadInput(f"{record.path / METRICS}: has no iteration; there is nothing to compare")
-
-    if args.output is not None:
-        from deepracer_exp.analysis.charts.runs import learning_curves_compared
-        from deepracer_exp.analysis.comparison_page import write_comparison
-
-        chart = learning_curves_compared(dict(zip(ascii_uppercase, records, strict=False)))
-        names = sorted({str(record.config.get("name")) for record in records})
-        with writing(f"--output {args.output}"):
-            write_comparison(
-                Path(args.output), f"Runs of {', '.join(names)} compared", [], _page_tables(records), [chart]
-            )
-    console = table_console()
-    for letter, record in zip(ascii_uppercase, records, strict=False):
-        console.print(f"{letter}  {record.path}", soft_wrap=True)
-    for table in _tables(records):
-        console.print()
-        console.print(table)
-    if args.output is not None:
-        console.print(f"\n{args.output}: these tables, learning curves and lap times", soft_wrap=True)
-    if args.replay is not None:
-        stored = [check_policy(str(folder), str(stores.runs_dir), stores.uri, None) for folder in folders]
-        from deepracer_exp.evaluation.driven_laps import laps_to_replay
-
-        protocol = stored[0].experiment.evaluation
-        (first,) = laps_to_replay(stored[0], None, protocol)
-        write_laps(args.replay, [first, *laps_to_replay(stored[1], None, protocol, beside=first)])
-        console.print(f"\n{args.replay}: the fastest usual laps of their best checkpoints", soft_wrap=True)
-    return 0
-
-
-def _page_tables(records: "Sequence[RunRecord]") -> "list[tuple[str, PageTable, str]]":
-    """Return what the terminal shows as tables of a page, each with a title and a note."""
-    from deepracer_exp.analysis.comparison import results, value_text
-    from deepracer_exp.analysis.log_tables import Table
-    from deepracer_exp.runs.lineage import run_differences
-
-    heads = ("", *ascii_uppercase[: len(records)])
-    runs = [(letter, record.name) for letter, record in zip(heads[1:], records, strict=True)]
-    achieved = [(name, *texts) for name, texts, _ in results(records)]
-    chosen = [(key, *map(value_text, values)) for key, values in run_differences(records).items()]
-    note = "Usual and held-out laps are those of the best checkpoint, evaluated; exploring laps those of the training."
-    return [
-        ("Runs", Table(("", "run"), tuple(runs), 2), ""),
-        ("Results", Table(heads, tuple(achieved), 1), note),
-        ("Configuration", Table(heads, tuple(chosen), 1), "" if chosen else "No difference."),
-    ]
-
-
-def _tables(records: "Sequence[RunRecord]") -> "list[Table]":
-    from rich.table import Table
-    from rich.text import Text
-
-    from deepracer_exp.analysis.comparison import results, value_text
-    from deepracer_exp.runs.lineage import run_differences
-
-    letters = ascii_uppercase[: len(records)]
-    found = run_differences(records)
-    chosen = Table("configuration" if found else "configuration: no difference", box=None, pad_edge=False)
-    achieved = Table("result", box=None, pad_edge=False)
-    for letter in letters:
-        if found:
-            chosen.add_column(letter, overflow="fold")
-        achieved.add_column(letter, overflow="fold", justify="right")
-    for key, values in found.items():
-        chosen.add_row(key, *map(value_text, values))
-    for name, texts, best in results(records):
-        achieved.add_row(
-            name, *(Text(text, style="bold green" if n == best else "") for n, text in enumerate(texts))
-        )
-    return [chosen, achieved]
 
 
 def _lineage(args: argparse.Namespace) -> int:

@@ -46,8 +46,9 @@ An experiment is one option of each group, and any value in it can be set:
   deepracer-exp train reward.file=my_reward.py              your own reward function
   deepracer-exp train custom_files=DIR                      reward_function.py, model_metadata.json and
                                                             hyperparameters.json as DeepRacer has them
-  deepracer-exp train reward.constants.STEP_COST=0.1       an UPPERCASE constant of the reward function
-  deepracer-exp train -m seed=0,1,2 network=mlp_small,mlp   every combination, one run after the other
+  deepracer-exp train reward.constants.STEP_COST=0.1        an UPPERCASE constant of the reward function
+  deepracer-exp train -m seed=0,1,2 network=mlp_small,mlp   every combination, one run after the other; ends with
+                                                            what each group of seeds scored, and what is chance
   deepracer-exp train track=Oval_track --cfg                print the experiment and stop
 
 groups: track car action_space observation randomization episode reward network algorithm lr_schedule

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from deepracer_exp.analysis.charts.runs import (
-    evaluation_results,
     generalisation_matrix,
     generations,
     group_name,
-    runs_compared,
+    policy_of,
+    recordings_compared,
 )
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.deepracer.recording import Round
@@ -42,19 +42,22 @@ def test_names_that_differ_in_time_and_seed_are_one_group() -> None:
     assert group_name("seed0") == "seed0"
 
 
-def test_seeds_become_a_median_with_a_band_and_single_runs_lines_without() -> None:
-    views = [run(f"a-seed{k}", 1.3 + 0.1 * k) for k in range(3)]
-    chart = runs_compared(views)
+def test_recordings_of_seeds_become_a_mean_with_a_band_and_single_ones_lines_without() -> None:
+    views = [(None, run(f"a-seed{k}", 1.3 + 0.1 * k)) for k in range(3)]
+    chart = recordings_compared(views)
     assert len(layers(chart, "band")) == 4
     assert {line.name for line in layers(chart, "line")} == {"a", ""}
     laps = layers(next(p for row in chart.rows for p in row if p.title.startswith("Lap time")), "line")[0]
     # The slower a run, the more steps it has driven: at both ends some have no value.
     middle = laps.y[(laps.x > 0.5 * laps.x.max()) & (laps.x < 0.8 * laps.x.max())]
-    np.testing.assert_allclose(middle, views[1].episodes["lap_time_s"].min(), rtol=1e-6)
-    alone = runs_compared([run("a-seed0"), run("b-seed0")])
+    times_s = [view.episodes["lap_time_s"].min() for _, view in views]
+    np.testing.assert_allclose(middle, np.mean(times_s), rtol=1e-6)
+    alone = recordings_compared([(None, run("a-seed0")), (None, run("b-seed0"))])
     assert not layers(alone, "band")
     assert "nothing says how much" in alone.caption
-    assert runs_compared([run("a")]) is None
+    assert recordings_compared([(None, run("a"))]) is None
+    named = recordings_compared([("ours", run("x")), ("ours", run("y")), ("theirs", run("z"))])
+    assert {line.name for line in layers(named, "line")} == {"ours", "theirs", ""}
 
 
 def test_rounds_of_a_recording_are_generations() -> None:
@@ -97,12 +100,12 @@ def test_the_matrix_has_every_policy_on_every_track(tmp_path: Path) -> None:
             held_out = {**group, "condition": "held_out", "completion": {"mean": 1.0}}
             (folder / f"{time}.json").write_text(json.dumps({"groups": [group, held_out]}))
         (folder / "20260104.json").write_text("no evaluation")
-    chart = generalisation_matrix(views)
+    chart = generalisation_matrix(list(map(policy_of, views)))
     np.testing.assert_array_equal(layers(chart, "cells")[0].z, [[90.0, 50.0], [np.nan, 70.0]])
     assert "mean is 60 per cent" in chart.caption
-    assert generalisation_matrix(views[1:]) is None
+    assert generalisation_matrix([policy_of(views[1])]) is None
 
 
 def test_recorded_races_are_results_as_well() -> None:
     view = run("a", evaluations={"race": [Drive(), Drive(until=0.5)]})
-    assert evaluation_results(view) == {"reinvent_base": pytest.approx(75.0)}
+    assert policy_of(view)[2] == {"reinvent_base": pytest.approx(75.0)}

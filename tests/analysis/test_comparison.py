@@ -1,20 +1,13 @@
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from deepracer_exp.analysis.charts.layout import draw
-from deepracer_exp.analysis.charts.runs import learning_curves_compared
 from deepracer_exp.analysis.comparison import NOTHING, last_value, results, value_text
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.runs.lineage import run_differences
-from tests.page_html import Html
-
-from .chart_layers import layers
 
 
 def row(iteration: int, lap_s: float | None = None, **more: object) -> dict:
@@ -109,72 +102,3 @@ def test_long_values_are_shortened_in_their_middle():
     assert text.startswith('{"knots": [0, 1')
     assert text.endswith("98, 99]}")
     assert [value_text(value) for value in (None, True, "reinvent_base")] == ["null", "true", "reinvent_base"]
-
-
-def test_runs_of_any_kind_are_drawn_over_each_other(record):
-    tracks = {"best_lap_time_s/A": 8.0, "best_lap_time_s/B": 9.0, "mean_lap_time_s/A": 8.5}
-    records = {"A": record("one"), "B": record("without a lap", lap_s=None), "C": record("tracks", **tracks)}
-    chart = learning_curves_compared(records)
-    assert len(layers(chart, "line")) == 9
-    assert [line.name for line in layers(chart.rows[0][0], "line")] == [
-        "A  one",
-        "B  without a lap",
-        "C  tracks",
-    ]
-    assert draw(chart).data
-    evaluated = {"eval_completion": 100.0, "eval_lap_time_s": 8.2}
-    best = {"metric": "race_score", "iteration": 10, "rank": [1.0, -9.0], **evaluated}
-    raced = dataclasses.replace(record("raced", eval_lap_time_s=8.4), summary={"best": best})
-    panels = [p for row in learning_curves_compared({"A": raced, "B": record("not")}).rows for p in row]
-    assert [panel.title for panel in panels][-2:] == ["Evaluated usual laps, mean", "Lap times"]
-    (star,) = (one for one in layers(panels[-1], "points") if one.marker.symbol == "star")
-    np.testing.assert_allclose(star.y, [8.2, np.nan], rtol=1e-6)
-    none = learning_curves_compared({"A": record("x", lap_s=None), "B": record("y", lap_s=None)})
-    assert draw(none).data
-    assert [panel.title for row in none.rows for panel in row] == [
-        "Completion, mean",
-        "Return of an episode, mean",
-    ]
-
-
-def write(record: RunRecord) -> None:
-    record.path.mkdir(parents=True)
-    (record.path / "config.yaml").write_text(json.dumps(record.config))
-    (record.path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in record.rows))
-
-
-@pytest.mark.parametrize("output", [[], ["-o", "out.html"]])
-def test_the_command_shows_differences_and_results_and_writes_the_page_it_is_asked_for(
-    record, call, tmp_path, output
-):
-    write(record("runs/e/first", "seed=1"))
-    write(record("runs/e/second", "seed=2", lap_s=9.25))
-    ended = call("runs", "compare", "first", "second", *output)
-    assert ended.code == 0, ended.stderr
-    words = [line.split() for line in ended.stdout.splitlines()]
-    assert ["A", "runs/e/first"] in words
-    assert ["seed", "1", "2"] in words
-    assert ["fastest", "exploring", "lap,", "s", "10.00", "9.25"] in words
-    assert [page.name for page in tmp_path.rglob("*.html")] == output[1:]
-    for page in tmp_path.rglob("*.html"):
-        text = Html(page.read_text()).text
-        assert "Runs of default compared" in text
-        for row in ("A first B second", "seed 1 2", "fastest exploring lap, s 10.00 9.25"):
-            assert row in text
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["first"], "1 run given; accepted: 2 to 26"),
-        (["first", "runs/e/first"], "1 run given"),
-        (["first", "third"], "third: no such run"),
-        (["first", "second", "-o", "nowhere/out.html"], "--output nowhere/out.html: cannot be written"),
-    ],
-)
-def test_what_cannot_be_compared_is_refused(record, call, arguments, words):
-    write(record("runs/e/first"))
-    write(record("runs/e/second"))
-    ended = call("runs", "compare", *arguments)
-    assert ended.code == 2
-    assert words in ended.complaint

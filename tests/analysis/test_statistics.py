@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.analysis.statistics import histogram, means, median_band, quantiles, totals, wilson
+from deepracer_exp.analysis.statistics import histogram, means, quantiles, totals, wilson
 from deepracer_exp.runs.convergence import moving_average
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3).map(lambda v: round(v, 3)), min_size=1, max_size=200)
@@ -30,20 +30,6 @@ def test_bins_of_times_in_steps_hold_equally_many_steps() -> None:
     # All steps are equally likely: whole bins are alike, which bins of unequal numbers of steps would not be.
     whole = found.counts[1:-1]
     assert whole.max() < 1.5 * whole.min()
-
-
-def test_a_bootstrap_interval_holds_the_true_median_about_as_often_as_it_says() -> None:
-    dice = np.random.default_rng(2)
-    _, low, high = median_band(dice.normal(size=(15, 400)))
-    assert 0.88 <= float(((low <= 0) & (high >= 0)).mean()) <= 0.995
-
-
-def test_a_median_needs_half_of_the_curves_and_an_interval_two() -> None:
-    curves = np.array([[1.0, 1.0, 1.0], [2.0, np.nan, 2.0], [3.0, np.nan, np.nan]])
-    median, low, high = median_band(curves)
-    np.testing.assert_array_equal(median, [2.0, np.nan, 1.5])
-    assert np.isfinite([low, high]).all(axis=0).tolist() == [True, False, True]
-    assert np.isnan(median_band(curves[:1])[1:]).all()
 
 
 def test_means_and_quantiles_are_those_of_pandas() -> None:

@@ -1,4 +1,4 @@
-"""`deepracer-exp analyze` and `compare`, and the page at the end of a training."""
+"""`deepracer-exp analyze`, and the page at the end of a training."""
 
 import re
 import shutil
@@ -43,19 +43,6 @@ def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_
     assert f"<title>tiny: {run_dir.name}</title>" in page
 
 
-def test_simulated_laps_stand_beside_those_of_logs(run_dir, call, tmp_path):
-    assert call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws")).code == 0
-    ended = call("compare", str(run_dir), "from aws", "checkpoint=last")
-    assert ended.code == 0, ended.stderr
-    page = Html((tmp_path / "from-aws-comparison.html").read_text(encoding="utf-8"))
-    assert {"figure-lines_compared", "figure-along_the_track", "figure-actions_compared"} <= set(page.ids)
-    assert "of the training, which explores" in ended.stdout
-    text, lines = page.text, ended.stdout.splitlines()
-    for line in (*lines[4:8], lines[-3]):
-        assert " ".join(line.split()) in text
-    assert not page.loads
-
-
 @pytest.mark.parametrize("what", ["{name}", "tiny/{name}", "{begin}", "best:tiny"])
 def test_runs_are_found_as_by_other_commands(run_dir, call, monkeypatch, what):
     found: list[Path] = []
@@ -92,13 +79,10 @@ def test_several_trainings_in_a_folder_are_named(call, tmp_path):
     assert "trainings in it" not in call("analyze", "both").stdout
 
 
-def test_a_target_has_its_chance_and_others_stand_beside_it(run_dir, call):
-    ended = call(
-        "analyze", str(run_dir), "--target", "1000", "--compare", str(run_dir), "--output", "page.html"
-    )
+def test_a_target_has_its_chance(run_dir, call):
+    ended = call("analyze", str(run_dir), "--target", "1000", "--output", "page.html")
     assert ended.code == 0, ended.stderr
     assert "1000.00 s" in ended.stdout
-    assert 'id="figure-runs_compared"' in (ended.cwd / "page.html").read_text()
 
 
 def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, tmp_path, monkeypatch):
@@ -146,7 +130,8 @@ def test_the_lap_whose_line_is_written_is_named_and_can_be_asked_for(run_dir, ca
         (["RUN", "--target", "nan"], ["--target nan", "accepted"]),
         (["RUN", "--reward", "racing_lime"], ["racing_lime"]),
         (["RUN", "--track", "Atlantis"], ["Atlantis"]),
-        (["RUN", "--compare", "nowhere"], ["nowhere"]),
+        (["RUN", "--compare", "other"], ["--compare: write deepracer-exp compare"]),
+        (["RUN", "other"], ["2 runs or logs given", "deepracer-exp compare takes several"]),
         (["RUN", "--line", "line.txt"], ["--line line.txt", "accepted", ".csv, .npy, .py"]),
         (["RUN", "--line", "nowhere/line.csv"], ["--line nowhere/line.csv", "accepted"]),
         (["RUN", "--line", "line.csv", "--lap", "99999"], ["--lap 99999", "accepted", "fastest"]),

@@ -306,7 +306,7 @@ def test_the_laps_of_two_runs_drive_beside_each_other(run_dir, call):
     quick = ("evaluation.trials=2", "evaluation.time_s=2")
     for arguments in (
         ("watch", str(run_dir), str(other), "--replay", "laps.html", *quick),
-        ("runs", "compare", str(run_dir), str(other), "--replay", "compared.html"),
+        ("compare", str(run_dir), str(other), "--replay", "compared.html"),
     ):
         ended = call(*arguments)
         assert ended.code == 0, ended.stderr

@@ -3,8 +3,11 @@ import re
 import pytest
 from optuna.distributions import FloatDistribution
 
+from deepracer_exp.analysis.evidence import SAME
 from deepracer_exp.errors import BadInput
+from sweeps.labels import short_keys
 from sweeps.report import study_page, study_summary, write_study_page
+from sweeps.seeds import over_seeds
 from tests.browser import needs_chromium
 from tests.page_html import Html
 
@@ -148,3 +151,31 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(study, tmp_path):
     with pytest.raises(BadInput, match="no objectives"):
         write_study_page(study, path)
     assert path.read_text() == "old"
+
+
+def with_seeds(study, values, **more):
+    runs = [
+        {"seed": seed, "run_dir": None, "status": "finished", "value": [value]}
+        for seed, value in enumerate(values)
+    ]
+    return add(study, [sum(values) / len(values)], runs=runs, **more)
+
+
+def test_trials_over_seeds_are_held_against_the_best_and_chance_is_called_that(tmp_path):
+    study = new_study(tmp_path, seeds=5)
+    with_seeds(study, [9.0, 9.1, 9.2, 9.3, 9.4])
+    with_seeds(study, [9.1, 9.2, 9.3, 9.4, 9.5])
+    with_seeds(study, [12.0, 12.1, 12.2, 12.3, 12.4])
+    add(study, [11.0])  # one seed says nothing of the others
+    rows = {
+        row["trial"]: row
+        for row in over_seeds(study, short_keys(["algorithm.lr", "algorithm.entropy_coeff"]))
+    }
+    assert {number: row["verdict"] for number, row in rows.items()} == {0: "the best", 1: SAME, 2: "worse"}
+    assert (rows[0]["seeds"], rows[0]["iqm"], rows[2]["difference"]) == (5, "9.20 s", "3.00 s")
+    page = Html(study_page(study))
+    assert "Trials over seeds" in page.text
+    assert SAME in page.text
+    alone = new_study(tmp_path / "alone")
+    add(alone, [9.0])
+    assert "Trials over seeds" not in Html(study_page(alone)).text

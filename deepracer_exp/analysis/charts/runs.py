@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.analysis.comparison import last_value
+from deepracer_exp.analysis.evidence import iqm_band
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.analysis.statistics import Values, median_band
+from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.convergence import moving_average
-from deepracer_exp.runs.files import EVALUATIONS, METRICS, RunRecord
+from deepracer_exp.runs.files import EVALUATIONS, METRICS
 from deepracer_exp.runs.lineage import read_lineage
-from deepracer_exp.runs.result import result_of
 
-from .figure import Chart, Layer, Panel, band, bars, heatmap, in_rows, line, mark, note, points
-from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE, VERMILION
+from .figure import Chart, Layer, Panel, band, heatmap, in_rows, line, mark, note, points
+from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE
 from .training import ITERATION
 
 _CURVES = {
@@ -44,15 +43,21 @@ def group_name(name: str) -> str:
     return _SEED.sub("", _TIME.sub("", name)) or name
 
 
-def runs_compared(views: Sequence[LogView]) -> Chart | None:
-    """Draw runs beside each other; those that differ only in their seed as a median with its bootstrap interval."""
-    if len(views) < 2:
+def recordings_compared(named: Sequence[tuple[str | None, LogView]]) -> Chart | None:
+    """Draw the training of runs and logs beside each other.
+
+    Args:
+        named: recordings, each with the name of the group that it was given to; None: those whose names differ only in
+            time and seed are a group, drawn as its interquartile mean with its interval.
+    """
+    if len(named) < 2:
         return None
+    views = [view for _, view in named]
     several = len({view.track_name for view in views}) > 1
     groups: dict[str, list[LogView]] = {}
-    for view in views:
+    for name, view in named:
         course = f" on {view.track_name or 'an unknown track'}" if several else ""
-        groups.setdefault(group_name(view.name) + course, []).append(view)
+        groups.setdefault((name or group_name(view.name)) + course, []).append(view)
     longest = max(float(view.iterations["steps"].sum()) for view in views)
     grid = np.linspace(0.0, longest, _PLACES)
     factor, unit = (1e-6, "million control steps") if longest >= 2e6 else (1e-3, "thousand control steps")
@@ -64,10 +69,10 @@ def runs_compared(views: Sequence[LogView]) -> Chart | None:
             curves = np.stack([_on_grid(view.iterations, column, grid) for view in some])
             if not np.isfinite(curves).any():
                 continue
-            median, low, high = median_band(curves)
-            if len(some) > 1:
+            middle, low, high = iqm_band(curves)
+            if np.isfinite(low).any():
                 layers.append(band(factor * grid, low, high, color))
-            layers.append(line(factor * grid, median, color, None if panels else name, width=2.5))
+            layers.append(line(factor * grid, middle, color, None if panels else name, width=2.5))
         if layers:
             x_range = (0.0, factor * longest)
             panels.append(Panel(title=title, x_label=unit, y_label=label, layers=layers, x_range=x_range))
@@ -76,15 +81,15 @@ def runs_compared(views: Sequence[LogView]) -> Chart | None:
     panels += _best_laps(groups)
     counts = sorted({len(some) for some in groups.values()})
     words = (
-        f"Lines are medians over {' or '.join(map(str, counts))} runs whose names differ only in their seed, bands "
-        "the medians' bootstrap intervals (95 per cent)"
+        f"Lines are interquartile means over {' or '.join(map(str, counts))} recordings, bands their bootstrap "
+        "intervals (95 per cent; from three recordings on)"
         if counts[-1] > 1
-        else "Each line is one run, so that nothing says how much of a difference is chance"
+        else "Each line is one recording, so that nothing says how much of a difference is chance"
     )
     return Chart(
-        name="runs_compared",
-        title="Runs compared",
-        caption=f"{words}. Where bands of two colours overlap, more seeds are needed to distinguish them.",
+        name="recordings_compared",
+        title="Recordings compared",
+        caption=f"{words}. Episodes are those of the training, which explores.",
         rows=in_rows(panels),
     )
 
@@ -108,10 +113,10 @@ def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> list[Panel]:
     layers = [
         # Below the points, which it may coincide with.
         points(np.arange(n), list(map(np.median, best_s)), ORANGE, "median", symbol="diamond", size=16),
-        points(np.concatenate(places), np.concatenate(best_s), BLUE, "a run", size=8),
+        points(np.concatenate(places), np.concatenate(best_s), BLUE, "a recording", size=8),
     ]
     axis: dict[str, Any] = {"x_names": list(groups), "x_range": (-0.5, n - 0.5), "y_label": "lap time, s"}
-    return [Panel(title="Fastest exploring lap of each run", layers=layers, **axis)]
+    return [Panel(title="Fastest exploring lap of each recording", layers=layers, **axis)]
 
 
 def generations(views: Sequence[LogView]) -> Chart | None:
@@ -169,18 +174,24 @@ def _clone_chain(views: Sequence[LogView]) -> list[LogView]:
     return sorted(related, key=lambda view: number[view.name])
 
 
-def generalisation_matrix(views: Sequence[LogView]) -> Chart | None:
-    """Draw how far each policy drives on each track, as it was evaluated or raced."""
-    driven = [(view, results) for view in views if (results := evaluation_results(view))]
-    tracks = list(dict.fromkeys(track for _, results in driven for track in results))
+def generalisation_matrix(driven: Sequence[tuple[str, str | None, Mapping[str, float]]]) -> Chart | None:
+    """Draw how far each policy drives on each track, as it was evaluated or raced.
+
+    Args:
+        driven: of each policy its name, the track it was trained on, and its mean completion, per cent, by track.
+    """
+    driven = [one for one in driven if one[2]]
+    tracks = list(dict.fromkeys(track for _, _, results in driven for track in results))
     if len(tracks) < 2:
         return None
-    labels = [f"{group_name(v.name)}, trained on {v.track_name or 'an unknown track'}" for v, _ in driven]
+    labels = [
+        f"{group_name(name)}, trained on {trained or 'an unknown track'}" for name, trained, _ in driven
+    ]
     names = [label if labels.count(label) == 1 else f"{label} ({at + 1})" for at, label in enumerate(labels)]
-    matrix = np.array([[results.get(track, np.nan) for track in tracks] for _, results in driven])
+    matrix = np.array([[results.get(track, np.nan) for track in tracks] for _, _, results in driven])
     scale, at = "completion, per cent", (np.arange(len(tracks)), np.arange(len(names)))
     cells = heatmap(*at, matrix, scale, written=True, value_range=(0.0, 100.0))
-    foreign = np.array([[track != view.track_name for track in tracks] for view, _ in driven])
+    foreign = np.array([[track != trained for track in tracks] for _, trained, _ in driven])
     away = matrix[foreign & np.isfinite(matrix)]
     words = (
         f"On tracks that a policy was not trained on, the mean is {away.mean():.0f} per cent."
@@ -195,18 +206,26 @@ def generalisation_matrix(views: Sequence[LogView]) -> Chart | None:
     )
 
 
-def evaluation_results(view: LogView) -> dict[str, float]:
-    """Return the mean completion of a policy in per cent by track.
+def policy_of(view: LogView) -> tuple[str, str | None, dict[str, float]]:
+    """Return a recording's name, track, and mean completion in per cent by track: of its evaluations and races.
 
-    Of the recorded evaluations and races; of a run of ours the newest stored evaluation of each track on usual
-    conditions. Files that are no evaluation are left out.
+    Of a run of ours those are the stored evaluations.
     """
     steps = view.recording.steps
     raced = steps[steps["stream"].astype(str) != "training"].astype({"track": str, "stream": str})
     episodes = raced.groupby(["track", "stream", "episode"])["progress"].max()
     found: dict[str, float] = episodes.groupby("track").mean().to_dict()
     folder = run_folder(view)
-    for file in sorted((folder / EVALUATIONS).glob("*.json")) if folder is not None else ():
+    return view.name, view.track_name, found | (stored_completion(folder) if folder is not None else {})
+
+
+def stored_completion(run: Path) -> dict[str, float]:
+    """Return the mean completion in per cent by track: of its newest stored evaluation there, usual conditions.
+
+    Files that are no evaluation are left out.
+    """
+    found: dict[str, float] = {}
+    for file in sorted((run / EVALUATIONS).glob("*.json")):
         try:
             groups: list[dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["groups"]
             usual = [group for group in groups if group["condition"] == "usual"]
@@ -214,70 +233,6 @@ def evaluation_results(view: LogView) -> dict[str, float]:
         except (OSError, ValueError, TypeError, KeyError):
             continue
     return found
-
-
-def learning_curves_compared(records: Mapping[str, RunRecord]) -> Chart:
-    """Draw the learning curves of our own runs, by a short label, over each other, and their lap times."""
-    best_s, mean_s = (
-        np.array([last_value(record, name) for record in records.values()], np.float64)
-        for name in ("best_lap_time_s", "mean_lap_time_s")
-    )
-    results = [result_of(record.summary) for record in records.values()]
-    evaluated_s = np.array(
-        [one.lap_time_s if one is not None and one.evaluated else None for one in results], np.float64
-    )
-    has_laps, was_evaluated = np.isfinite(best_s).any(), np.isfinite(evaluated_s).any()
-    panels: list[Panel] = []
-    for column, title, unit in (
-        ("completion", "Completion, mean", "per cent of the lap"),
-        ("mean_return", "Return of an episode, mean", "return"),
-        *([("mean_lap_time_s", "Exploring laps, mean", "lap time, s")] if has_laps else []),
-        *([("eval_lap_time_s", "Evaluated usual laps, mean", "lap time, s")] if was_evaluated else []),
-    ):
-        layers: list[Layer] = []
-        for number, (label, record) in enumerate(records.items()):
-            rows = pd.DataFrame(record.rows)
-            if column == "eval_lap_time_s":
-                rows = rows[rows[column].notna()] if column in rows else rows.iloc[:0].assign(**{column: []})
-            columns = [one for one in rows if one.startswith(f"{column}/")] or [column]
-            # Not every iteration ends an episode on every track.
-            values = rows[columns].astype(float).ffill().mean(axis=1, skipna=False)
-            curve = values.to_numpy() if column == "eval_lap_time_s" else moving_average(values.to_numpy())
-            color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
-            name = None if panels else f"{label}  {record.name}"
-            layers.append(line(rows["env_steps"] / 1000, curve, color, name, dashed=dashed))
-        panels.append(Panel(title=title, x_label="thousand control steps", y_label=unit, layers=layers))
-    if has_laps:
-        at = np.arange(len(records))
-        laps: list[Layer] = [
-            bars(at, best_s, BLUE, "fastest exploring lap"),
-            points(
-                at, mean_s, ORANGE, "exploring laps of the last iteration, mean", size=11, symbol="diamond"
-            ),
-            *(
-                [
-                    points(
-                        at,
-                        evaluated_s,
-                        VERMILION,
-                        "usual laps of the best checkpoint, mean",
-                        size=14,
-                        symbol="star",
-                    )
-                ]
-                if was_evaluated
-                else []
-            ),
-            *(note((float(k), 0.0), "no lap") for k in at[np.isnan(best_s)]),
-        ]
-        panels.append(Panel(title="Lap times", y_label="lap time, s", layers=laps, x_names=list(records)))
-    return Chart(
-        name="learning_curves_compared",
-        title="Learning curves and lap times" if has_laps else "Learning curves",
-        caption="Lines are moving averages of three iterations; the line of the evaluations connects them without "
-        "averaging. An exploring policy draws its actions and is slower.",
-        rows=in_rows(panels),
-    )
 
 
 def evaluated_laps(checkpoints: pd.DataFrame) -> Chart | None:

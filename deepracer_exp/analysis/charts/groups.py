@@ -1,0 +1,109 @@
+"""Groups of runs in figures: learning curves with bands over seeds, and the scores of the best checkpoints."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from deepracer_exp.analysis.group_curves import CURVES, curve
+from deepracer_exp.analysis.groups import COMPARED, FORMS, Group, courses_of
+
+from .figure import Chart, Layer, Panel, band, in_rows, line, points
+from .style import BLUE, CATEGORIES, ORANGE
+
+_TITLES = {
+    "eval_lap_time_s": ("Lap of the evaluated policy, usual conditions", "mean complete lap, s"),
+    "eval_completion": ("Completion of the evaluated policy", "per cent of the lap"),
+    "eval_race_score_s": ("Race score, usual and held-out conditions", "seconds per complete lap"),
+    "completion": ("Completion in training", "per cent of the lap"),
+    "mean_return": ("Return of an episode", "return"),
+    "mean_lap_time_s": ("Lap in training, exploring", "mean complete lap, s"),
+}
+"""Titles and axes of `CURVES`."""
+
+
+def learning_curves(groups: Sequence[Group]) -> list[Chart]:
+    """Draw the learning curves of groups, a chart a track: a group of several seeds as its mean with a band."""
+    courses = courses_of(groups)
+    charts = [_learning_curves(groups, course, len(courses) > 1) for course in courses]
+    return [chart for chart in charts if chart is not None]
+
+
+def _learning_curves(groups: Sequence[Group], course: str, several: bool) -> Chart | None:
+    here = [(number, own) for number, group in enumerate(groups) if (own := group.on(course)).records]
+    longest = max(
+        (float(record.rows[-1]["env_steps"]) for _, own in here for record in own.records if record.rows),
+        default=0,
+    )
+    factor, unit = (1e-6, "million control steps") if longest >= 2e6 else (1e-3, "thousand control steps")
+    panels: list[Panel] = []
+    for column in CURVES:
+        layers: list[Layer] = []
+        for number, group in here:
+            table = curve(group, column).replace([np.inf], np.nan)
+            if not table["iqm"].notna().any():
+                continue
+            color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
+            steps, name = factor * table["env_steps"], None if panels else group.name
+            if table["low"].notna().any():
+                layers.append(band(steps, table["low"], table["high"], color))
+            layers.append(line(steps, table["iqm"], color, name, width=2.5, dashed=dashed))
+        if layers:
+            title, label = _TITLES[column]
+            panels.append(Panel(title=title, x_label=unit, y_label=label, layers=layers))
+    if not panels:
+        return None
+    seeds = sorted({len(own.records) for _, own in here})
+    words = (
+        f"Lines are interquartile means over {' or '.join(map(str, seeds))} runs, bands their bootstrap intervals "
+        "(95 per cent; from three runs on)"
+        if seeds[-1] > 1
+        else "Each line is one run, so that nothing says how much of a difference is chance"
+    )
+    return Chart(
+        name=f"learning_curves_{courses_name(course)}" if several else "learning_curves",
+        title=f"Learning curves on {course}" if several else "Learning curves",
+        caption=f"{words}. An evaluation takes the most probable actions; a run whose policy completes no lap "
+        "counts as slower than any, and where more than a quarter of the runs completes none, the line has a gap. "
+        "Curves of the training are moving averages of three iterations.",
+        rows=in_rows(panels),
+    )
+
+
+def courses_name(course: str) -> str:
+    """Return the name of a track, or of several, as part of a figure's name."""
+    return "".join(letter if letter.isalnum() else "_" for letter in course)
+
+
+def best_checkpoints(groups: Sequence[Group]) -> Chart | None:
+    """Draw the figures of each run's best checkpoint by group and track, with their interquartile mean and interval."""
+    places = [(group, course) for group in groups for course in group.courses]
+    several = len(courses_of(groups)) > 1
+    names = [group.name + f" on {course}" * several for group, course in places]
+    panels = []
+    for figure in COMPARED:
+        layers: list[Layer] = []
+        for at, (group, course) in enumerate(places):
+            own = group.on(course)
+            scores = own.scores(figure)
+            finite, found = np.sort(scores[np.isfinite(scores)]), own.estimate(figure)
+            if not len(finite) or found is None:
+                continue
+            spread = at + 0.4 * ((np.arange(len(finite)) + 0.5) / len(finite) - 0.5)
+            layers.append(points(spread, finite, BLUE, None if layers else "a run", size=8))
+            if found.interval is not None and np.isfinite([found.iqm, *found.interval]).all():
+                low, high = found.interval
+                layers.append(line([at, at, at], [low, found.iqm, high], ORANGE))
+                layers.append(points([at], [found.iqm], ORANGE, size=13, symbol="diamond"))
+        if layers:
+            name, x_range = FORMS[figure][0], (-0.5, len(places) - 0.5)
+            title = name.partition(",")[0].capitalize()
+            panels.append(Panel(title=title, y_label=name, layers=layers, x_names=names, x_range=x_range))
+    if not panels:
+        return None
+    return Chart(
+        name="best_checkpoints",
+        title="Best checkpoints",
+        caption="Points are runs, by the evaluation of their best checkpoint; diamonds are interquartile means with "
+        "their intervals (95 per cent). Runs without a complete lap have no point in seconds.",
+        rows=in_rows(panels, 3 if len(places) <= 4 else 1),
+    )

@@ -1,0 +1,129 @@
+"""What groups of runs scored and how they differ, as tables, sentences and JSON."""
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from deepracer_exp.errors import count
+from deepracer_exp.runs.result import result_of
+
+from .evidence import Estimate, Interval
+from .group_curves import curves_table
+from .groups import COMPARED, FORMS, Comparison, Group, courses_of
+from .log_tables import NONE, Table
+
+
+def scored(groups: Sequence[Group]) -> Table:
+    """Return what each group scored: interquartile means over its runs, with their intervals, on each track."""
+    several = len(courses_of(groups)) > 1
+    rows = []
+    for group in groups:
+        for course in group.courses:
+            own = group.on(course)
+            figures = [figure_text(figure, own.estimate(figure)) for figure in FORMS]
+            rows.append((group.name, *[course] * several, str(len(own.records)), *figures))
+    heads = ("group", *["track"] * several, "runs", *(name for name, _, _ in FORMS.values()))
+    return Table(heads, tuple(rows), 1 + several)
+
+
+def figure_text(figure: str, found: Estimate | None) -> str:
+    """Return an estimate as text: ``8.02 (7.91 to 8.20)``."""
+    if found is None:
+        return NONE
+    form = FORMS[figure][1]
+    middle = form.format(found.iqm) if math.isfinite(found.iqm) else "no lap"
+    return middle if found.interval is None else f"{middle} ({_ends(form, found.interval)})"
+
+
+def _ends(form: str, interval: Interval) -> str:
+    return " to ".join(form.format(end) if math.isfinite(end) else "no lap" for end in interval)
+
+
+def differences_table(found: Sequence[Comparison]) -> Table:
+    """Return comparisons as texts."""
+    several = len({one.course for one in found}) > 1
+    rows = []
+    for one in found:
+        name, form, _ = FORMS[one.figure]
+        if one.course is None:
+            name, form = f"{name.partition(',')[0]}, % of the track's mean", "{:.1f}"
+        apart, chance = one.difference, one.difference.probability_interval
+        signed = form.replace(":", ":+")
+        change = NONE if apart.iqm is None else signed.format(apart.iqm)
+        if apart.interval is not None:
+            change += f" ({_ends(signed, apart.interval)})"
+        better = f"{apart.probability:.0%}" + (
+            "" if chance is None else f" ({chance[0]:.0%} to {chance[1]:.0%})"
+        )
+        track = [one.course or "all tracks"] * several
+        rows.append((one.group, *track, name, one.verdict, change, better))
+    heads = ("group", *["track"] * several, "figure", "verdict", "difference", "probability of improvement")
+    return Table(heads, tuple(rows), 3 + several)
+
+
+def sentences(groups: Sequence[Group], found: Sequence[Comparison]) -> list[str]:
+    """Return what the tables say, in sentences: the verdict on the lap first."""
+    alone = len(courses_of(groups)) == 1
+    told = [
+        f"{one.group} against {one.other}, lap of the evaluated policy: {one.verdict}."
+        for one in found
+        if one.figure == COMPARED[0] and (one.course is None or alone)
+    ]
+    results = [result_of(record.summary) for group in groups for record in group.records]
+    lacking = sum(result is None or not result.evaluated for result in results)
+    if lacking:
+        told.append(f"{count(lacking, 'run')} without an evaluation, or not ended: left out of the figures.")
+    tests = {
+        json.dumps({**(one.config.get("evaluation") or {}), "tracks": None})
+        for group in groups
+        for one in group.records
+    }
+    if len(tests) > 1:
+        told.append("The runs were evaluated under different conditions: their figures do not compare.")
+    return told
+
+
+def as_json(groups: Sequence[Group], found: Sequence[Comparison]) -> dict[str, Any]:
+    """Return everything that is compared, JSON types; infinite seconds, of laps never completed, are null."""
+    curves = curves_table(groups)
+    return {
+        "groups": [
+            {
+                "name": group.name,
+                "track": course,
+                "runs": [str(record.path) for record in group.on(course).records],
+                "figures": {figure: _estimate_json(group.on(course).estimate(figure)) for figure in FORMS},
+            }
+            for group in groups
+            for course in group.courses
+        ],
+        "differences": [
+            {
+                "group": one.group,
+                "other": one.other,
+                "track": one.course,
+                "figure": one.figure,
+                "difference": one.difference.iqm,
+                "interval": one.difference.interval,
+                "probability_of_improvement": one.difference.probability,
+                "probability_interval": one.difference.probability_interval,
+                "verdict": one.verdict,
+            }
+            for one in found
+        ],
+        "curves": [
+            {
+                key: None if isinstance(value, float) and not math.isfinite(value) else value
+                for key, value in row.items()
+            }
+            for row in curves.to_dict("records")
+        ],
+    }
+
+
+def _estimate_json(found: Estimate | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    ends = None if found.interval is None else [end if math.isfinite(end) else None for end in found.interval]
+    return {"iqm": found.iqm if math.isfinite(found.iqm) else None, "interval": ends, "runs": found.seeds}

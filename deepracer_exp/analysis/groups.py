@@ -1,0 +1,206 @@
+"""Groups of runs that differ in their seeds: which there are, what they scored, and whether they differ."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepracer_exp.analysis.comparison import value_text
+from deepracer_exp.files import read_yaml
+from deepracer_exp.runs.files import OVERRIDES, RunRecord
+from deepracer_exp.runs.lineage import course_names, run_differences
+from deepracer_exp.runs.result import FIGURES, result_of
+
+from .evidence import Difference, Estimate, difference, estimate, interquartile_mean
+from .statistics import Values
+
+COMPARED = ("lap_time_s", "completion", "race_score_s")
+"""The figures in which groups are held against each other: attributes of RunResult."""
+FORMS = {attribute: (name, form, better) for name, attribute, form, better in FIGURES}
+"""Name and unit, format and direction of each figure."""
+_NOT_OF_GROUP = ("seed", "name", "code")
+_UNNAMED = ("seed", "name", "runs_dir", "tracking", "report", "debug", "track")
+"""Keys of overrides that are no part of a group's name."""
+_MOST_WORDS = 3
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that are alike but for their seed, and for their track if they have several."""
+
+    name: str
+    records: tuple[RunRecord, ...]
+
+    @property
+    def courses(self) -> list[str]:
+        """Return the tracks on which its policies are evaluated, in the order of the runs."""
+        return list(dict.fromkeys(map(course_of, self.records)))
+
+    def on(self, course: str) -> "Group":
+        """Return its runs on one track."""
+        return Group(self.name, tuple(one for one in self.records if course_of(one) == course))
+
+    def scores(self, figure: str) -> Values:
+        """Return a figure of the best checkpoints, one of FIGURES; infinity where a lap was never completed.
+
+        Runs that have no evaluation are left out.
+        """
+        lacking = math.inf if FORMS[figure][2] < 0 else math.nan
+        results = [result_of(record.summary) for record in self.records]
+        values = [
+            lacking if (value := getattr(result, figure)) is None else value
+            for result in results
+            if result is not None and result.evaluated
+        ]
+        known = np.array(values, np.float64)
+        return known[~np.isnan(known)]
+
+    def estimate(self, figure: str) -> Estimate | None:
+        """Return the interquartile mean of a figure on the tracks of the group together; None without a score."""
+        scores = self.scores(figure)
+        return estimate([scores]) if len(scores) else None
+
+
+def course_of(record: RunRecord) -> str:
+    """Return the name of the track, or of several, on which a run's policies are evaluated."""
+    evaluated = (record.config.get("evaluation") or {}).get("tracks")
+    if evaluated:
+        return ", ".join(evaluated)
+    track = record.config.get("track")
+    direction = track.get("direction", "forward") if isinstance(track, Mapping) else "forward"
+    return course_names(track) + f", {direction}" * (direction != "forward")
+
+
+def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[Group]:
+    """Put runs into groups.
+
+    Args:
+        named: runs, each with the name of the group that it was given to; None: it belongs to the runs of the same
+            settings but for seed, track, experiment and version of the code.
+    """
+    pairs = list(named)
+    records = [record for _, record in pairs]
+    found = run_differences(records)
+    evaluated_alike = len({course_of(record) for record in records}) == 1
+    deciding = [
+        key
+        for key in found
+        if key not in _NOT_OF_GROUP and (evaluated_alike or key.partition(".")[0] != "track")
+    ]
+    members: dict[str, list[int]] = {}
+    for number, (name, _) in enumerate(pairs):
+        settings = json.dumps([found[key][number] for key in deciding])
+        members.setdefault(f"={name}" if name is not None else settings, []).append(number)
+    names = {key: pairs[numbers[0]][0] for key, numbers in members.items()}
+    open_groups = {key: numbers[0] for key, numbers in members.items() if names[key] is None}
+    labels = _labels([records[number] for number in open_groups.values()])
+    if len(set(labels)) < len(labels):
+        labels = [
+            ", ".join(f"{key}={value_text(found[key][number], 24)}" for key in deciding[:_MOST_WORDS])
+            for number in open_groups.values()
+        ]
+    for number, (key, label) in enumerate(zip(open_groups, labels, strict=True), 1):
+        names[key] = label if labels.count(label) == 1 else f"{label} ({number})"
+    return [
+        Group(str(names[key]), tuple(records[number] for number in numbers))
+        for key, numbers in members.items()
+    ]
+
+
+def _labels(records: Sequence[RunRecord]) -> list[str]:
+    """Return a name for each run: the overrides in which it differs from the others."""
+    chosen = [_overrides(record.path) for record in records]
+    keys = dict.fromkeys(key for words in chosen for key in words)
+    differing = [key for key in keys if len({words.get(key) for words in chosen}) > 1]
+    if not differing:
+        return [str(record.config.get("name") or record.name) for record in records]
+    labels = []
+    for record, words in zip(records, chosen, strict=True):
+        own = [f"{key}={words[key] if key in words else _default(record.config, key)}" for key in differing]
+        more = [f"and {len(own) - _MOST_WORDS} more"] * (len(own) > _MOST_WORDS)
+        labels.append(" ".join([*own[:_MOST_WORDS], *more]))
+    return labels
+
+
+def _overrides(run: Path) -> dict[str, str]:
+    """Return the overrides of a run by key, without those that say nothing of its group."""
+    file = run / OVERRIDES
+    words = read_yaml(file, "what a run writes there") if file.is_file() else []
+    pairs = [str(word).partition("=") for word in words or ()]
+    return {
+        key.lstrip("+~"): value
+        for key, _, value in pairs
+        if key.partition(".")[0].lstrip("+~") not in _UNNAMED
+    }
+
+
+def _default(config: Mapping[str, Any], key: str) -> str:
+    """Return the value of a key that was not overridden, of a group its name."""
+    value: Any = config
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    if isinstance(value, Mapping):
+        value = value.get("name", "default")
+    return value_text(value, 24)
+
+
+def courses_of(groups: Sequence[Group]) -> list[str]:
+    """Return all tracks of groups."""
+    return list(dict.fromkeys(course for group in groups for course in group.courses))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A figure of a group held against that of the first group."""
+
+    group: str
+    other: str
+    course: str | None
+    """None: all tracks that both have, each in shares of its own mean."""
+    figure: str
+    difference: Difference
+
+    @property
+    def verdict(self) -> str:
+        """Return in words whether the groups differ."""
+        words = ("faster", "slower") if self.figure == "lap_time_s" else ("better", "worse")
+        return self.difference.verdict(*words)
+
+
+def compared(groups: Sequence[Group]) -> list[Comparison]:
+    """Hold each group against the first: on each track that both have, and on all of these together."""
+    found: list[Comparison] = []
+    first, *others = groups
+    for other in others:
+        common = [course for course in first.courses if course in other.courses]
+        for figure in COMPARED:
+            cells = []
+            for course in common:
+                pair = other.on(course).scores(figure), first.on(course).scores(figure)
+                if len(pair[0]) and len(pair[1]):
+                    cells.append((course, pair))
+            for course, pair in cells:
+                found.append(_comparison(other, first, course, figure, [pair]))
+            if len(cells) > 1:
+                found.append(_comparison(other, first, None, figure, [_relative(pair) for _, pair in cells]))
+    return found
+
+
+def _comparison(
+    group: Group, other: Group, course: str | None, figure: str, pairs: Sequence[tuple[Values, Values]]
+) -> Comparison:
+    ours, theirs = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    lower_is_better = FORMS[figure][2] < 0
+    return Comparison(group.name, other.name, course, figure, difference(ours, theirs, lower_is_better))
+
+
+def _relative(pair: tuple[Values, Values]) -> tuple[Values, Values]:
+    """Return scores as shares, per cent, of the interquartile mean of both: those of different tracks then compare."""
+    together = np.concatenate(pair)
+    finite = together[np.isfinite(together)]
+    scale = float(interquartile_mean(finite)) if len(finite) else 0.0
+    return (pair[0] / scale * 100, pair[1] / scale * 100) if scale else pair

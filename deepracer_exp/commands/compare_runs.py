@@ -1,0 +1,207 @@
+"""`deepracer-exp compare` of runs, and of groups of runs over seeds."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from string import ascii_uppercase
+from typing import TYPE_CHECKING
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.files import METRICS
+
+from .arguments import Stores
+from .compared import Item, light, write_page
+from .output import print_table, table_console
+from .pages import end_with_page
+from .replay import write_laps
+from .startup import check_policy
+
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.charts.figure import Chart
+    from deepracer_exp.analysis.groups import Group
+    from deepracer_exp.analysis.log_tables import Table
+    from deepracer_exp.runs.files import RunRecord
+
+_RUNS = "Runs"
+_MOST_GROUPS = 12
+"""Groups that are shown; of more those with the best race score."""
+_SCORED = (
+    "Interquartile means over the runs, with 95% intervals: of the evaluation of each run's best checkpoint, which "
+    "takes the most probable actions."
+)
+_DIFFERENCES = (
+    "The probability of improvement is that a run of the group is better than one of the other on the same track. A "
+    "difference counts if neither interval holds what there would be without one, zero and 50%. On all tracks together "
+    "a figure is a share of its mean on each track."
+)
+
+
+def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores) -> int:
+    """Compare runs, and groups of them."""
+    from deepracer_exp.analysis.group_curves import curves_table
+    from deepracer_exp.analysis.group_tables import as_json
+    from deepracer_exp.analysis.groups import compared
+
+    groups = _groups(items)
+    records = [record for group in groups for record in group.records]
+    if args.format == "csv":
+        curves_table(groups).to_csv(sys.stdout, index=False)
+    elif args.format == "json":
+        print(json.dumps(as_json(groups, compared(groups)), indent=1))
+    if args.format == "table" or args.output is not None:
+        _show(args, items, _best(groups), len(groups), records)
+    if args.replay is not None:
+        stored = [
+            check_policy(str(record.path), str(stores.runs_dir), stores.uri, None) for record in records
+        ]
+        from deepracer_exp.evaluation.driven_laps import laps_to_replay
+
+        protocol = stored[0].experiment.evaluation
+        (first,) = laps_to_replay(stored[0], None, protocol)
+        write_laps(args.replay, [first, *laps_to_replay(stored[1], None, protocol, beside=first)])
+        if args.format == "table":
+            print(f"  laps  {args.replay}: the fastest laps of their best checkpoints")
+    return 0
+
+
+def _groups(items: Sequence[Item]) -> "list[Group]":
+    """Return the groups of runs; an experiment among several keeps its name."""
+    from deepracer_exp.analysis.groups import Group, group_runs
+    from deepracer_exp.runs.files import read_record
+
+    known: dict[Path, RunRecord] = {}
+
+    def read(path: Path) -> "RunRecord":
+        key = path.resolve()
+        if key not in known:
+            known[key] = read_record(path)
+            if not known[key].rows:
+                raise BadInput(f"{path / METRICS}: has no iteration; there is nothing to compare")
+        return known[key]
+
+    several = len({item.word for item in items if item.is_experiment and item.group is None}) > 1
+    pools: dict[str, list[tuple[str | None, RunRecord]]] = {}
+    for item in items:
+        pool = item.word if several and item.is_experiment and item.group is None else ""
+        pairs = pools.setdefault(pool, [])
+        for path in item.paths:
+            # Runs that have only begun are no reason to refuse an experiment.
+            if item.is_experiment and not (path / METRICS).is_file():
+                continue
+            pair = item.group, read(path)
+            if pair not in pairs:
+                pairs.append(pair)
+    groups: list[Group] = []
+    for pool, pairs in pools.items():
+        own = group_runs(pairs)
+        if pool:
+            own = [Group(pool if len(own) == 1 else f"{pool}: {group.name}", group.records) for group in own]
+        groups += own
+    return groups
+
+
+def _best(groups: "list[Group]") -> "list[Group]":
+    """Return the groups that are shown."""
+    if len(groups) <= _MOST_GROUPS:
+        return groups
+
+    def score_s(group: "Group") -> float:
+        found = group.estimate("race_score_s")
+        return float("inf") if found is None else found.iqm
+
+    return sorted(groups, key=score_s)[:_MOST_GROUPS]
+
+
+def _show(
+    args: argparse.Namespace,
+    items: Sequence[Item],
+    groups: "list[Group]",
+    of_all: int,
+    records: "list[RunRecord]",
+) -> None:
+    """Print what is compared and write the page."""
+    from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curves
+    from deepracer_exp.analysis.charts.runs import generalisation_matrix, stored_completion
+    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences
+    from deepracer_exp.analysis.groups import Group, compared, course_of
+
+    single = all(len(group.records) == 1 for group in groups)
+    tables: list[tuple[str, Table, str]] = []
+    if single:
+        letters = dict(zip(ascii_uppercase, groups, strict=False))
+        groups = [Group(f"{letter}  {group.name}", group.records) for letter, group in letters.items()]
+        told = ["Each run is alone: nothing says how much of a difference is chance. Train more seeds."]
+    else:
+        found = compared(groups)
+        told = sentences(groups, found)
+        tables.append(("Groups", scored(groups), _SCORED))
+        if found:
+            tables.append((f"Against {groups[0].name}", differences_table(found), _DIFFERENCES))
+    if of_all > len(groups):
+        told.append(f"{of_all} groups: shown are the {len(groups)} with the best race score.")
+    shown = [record for group in groups for record in group.records]
+    tables += _run_tables(groups)
+    charts = [
+        *learning_curves(groups),
+        best_checkpoints(groups),
+        _generations(shown),
+        generalisation_matrix([(one.name, course_of(one), stored_completion(one.path)) for one in shown]),
+    ]
+    out = write_page(args.output, items, told, tables, charts)
+    if args.format == "table":
+        console = table_console()
+        for title, table, _ in tables:
+            if single or title != _RUNS:  # the page lists the runs of groups
+                print_table(console, title, table)
+        for sentence in told:
+            console.print(sentence, soft_wrap=not console.is_terminal)
+        end_with_page(out, args.open)
+
+
+def _run_tables(groups: "Sequence[Group]") -> "list[tuple[str, Table, str]]":
+    """Return which runs there are, what each achieved, and in which settings they differ.
+
+    Of several groups with several runs, settings are those of the groups, and the results of each run are left out.
+    """
+    from deepracer_exp.analysis.comparison import results, value_text
+    from deepracer_exp.analysis.log_tables import Table
+    from deepracer_exp.runs.lineage import run_differences
+
+    records = [record for group in groups for record in group.records]
+    if len(groups) > 1 and len(records) > len(groups):
+        named = [(group.name, str(record.path)) for group in groups for record in group.records]
+        tables = [(_RUNS, Table(("group", "run"), tuple(named), 2), "")]
+        heads, records = [group.name for group in groups], [group.records[0] for group in groups]
+        ignored = ["seed", "name"]
+    else:
+        heads, ignored = [*ascii_uppercase[: len(records)]], []
+        named = list(zip(heads, (str(record.path) for record in records), strict=False))
+        achieved = [(name, *texts) for name, texts, _ in results(records[: len(heads)])]
+        tables = [
+            (_RUNS, Table(("", "run"), tuple(named), 2), ""),
+            ("Results", Table(("", *heads), tuple(achieved), 1), ""),
+        ]
+    found = run_differences(records[: len(heads)]).items()
+    chosen = [(key, *map(value_text, values)) for key, values in found if key not in ignored]
+    table = Table(("", *heads), tuple(chosen), 1 + len(heads))
+    return [*tables, ("Configuration", table, "" if chosen else "No difference.")]
+
+
+def _generations(records: "Sequence[RunRecord]") -> "Chart | None":
+    """Draw a run and the clones of it on one axis of iterations; None where there are none, or without their traces."""
+    from deepracer_exp.analysis.charts.runs import generations
+    from deepracer_exp.analysis.log_view import prepare
+    from deepracer_exp.runs.lineage import read_lineage
+    from deepracer_exp.runs.own_recording import read_log
+
+    parents = {record.name: lineage.parent for record in records if (lineage := read_lineage(record.path))}
+    names = {record.name for record in records}
+    family = {name for child, parent in parents.items() if parent in names for name in (child, parent)}
+    if not family:
+        return None
+    try:
+        return generations([light(prepare(read_log(one.path))) for one in records if one.name in family])
+    except BadInput:  # a trace was removed
+        return None
