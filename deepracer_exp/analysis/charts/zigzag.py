@@ -42,7 +42,9 @@ def zigzag(view: LogView) -> Chart | None:
         title="Steering along the fastest lap, and the straights",
         caption=f"Commanded steering at each control step, without smoothing; the straights of the centre line are "
         f"shaded. On these: {in_words(*figures)} ({where}). A line that jumps from one side of zero to the other "
-        "within a shaded part is zig-zag; one change is what it takes to get from one side of the road to the other.",
+        "within a shaded part is zig-zag, but for the first time: that is the way from one bend into the next."
+        + " The lap of a training is one of drawn actions; the policy that races swerves less."
+        * view.trained,
         rows=[
             [
                 Panel(
