@@ -33,7 +33,7 @@ def test_runs_are_listed_newest_first_with_state_and_results(call, tmp_path):
         "status": "finished",
         "laps": 1234,
         "best_lap_time_s": 7.654,
-        "best": {"eval_race_score_s": 8.02, "eval_completion": 100.0},
+        "best": {"eval_race_score_s": 8.02, "eval_lap_time_s": 7.98, "eval_completion": 100.0},
     }
     write_run(tmp_path / "runs" / "a" / names[0], finished)
     write_run(
@@ -50,11 +50,11 @@ def test_runs_are_listed_newest_first_with_state_and_results(call, tmp_path):
     assert ended.code == 0, ended.stderr
     rows = [line.split() for line in ended.stdout.splitlines()[1:]]
     assert rows == [
-        [f"a/{names[2]}", "running", NONE, NONE, NONE, "1", "min"],
-        [f"b/{names[1]}", "failed", NONE, "0", NONE, "2", "h"],
-        [f"a/{names[0]}", "finished", "8.02", "1,234", "7.65", "2", "d"],
-        [rows[3][0], "killed", NONE, NONE, NONE, "3", "d"],
-        [rows[4][0], "unreadable", NONE, NONE, NONE, "4", "d"],
+        [f"a/{names[2]}", "running", NONE, NONE, NONE, NONE, "1", "min"],
+        [f"b/{names[1]}", "failed", NONE, NONE, "0", NONE, "2", "h"],
+        [f"a/{names[0]}", "finished", "7.98", "8.02", "1,234", "7.65", "2", "d"],
+        [rows[3][0], "killed", NONE, NONE, NONE, NONE, "3", "d"],
+        [rows[4][0], "unreadable", NONE, NONE, NONE, NONE, "4", "d"],
     ]
 
 

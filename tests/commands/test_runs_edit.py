@@ -70,13 +70,21 @@ def test_conditions_and_an_order_hold_of_what_is_listed_in_every_format(season, 
         season.result(run, best={"eval_race_score_s": score}, laps=number)
     rows = listed(call, "--where", "score_s<9", "--sort", "score_s")
     assert [row["score_s"] for row in rows] == [7.5, 8.0]
-    assert [row["laps"] for row in listed(call, "--sort", "laps", "--reverse")] == [3, 2, 1, 0]
-    assert [row["laps"] for row in listed(call, "--where", "began>=2026-11-03", "--where", "laps!=3")] == [2]
+    assert [row["exploring_laps"] for row in listed(call, "--sort", "exploring_laps", "--reverse")] == [
+        3,
+        2,
+        1,
+        0,
+    ]
+    assert [
+        row["exploring_laps"]
+        for row in listed(call, "--where", "began>=2026-11-03", "--where", "exploring_laps!=3")
+    ] == [2]
     assert listed(call, "--where", "run~NOTHING") == []
     table = call("runs", "list", "--where", "state=finished", "--format", "csv").stdout
-    assert [row["laps"] for row in csv.DictReader(io.StringIO(table))] == ["3", "2", "1", "0"]
-    call("runs", "list", "--where", "lap=3").assert_refused("no such column", "laps")
-    call("runs", "list", "--where", "laps<many").assert_refused("'many' is no number")
+    assert [row["exploring_laps"] for row in csv.DictReader(io.StringIO(table))] == ["3", "2", "1", "0"]
+    call("runs", "list", "--where", "exploring_lap=3").assert_refused("no such column", "exploring_laps")
+    call("runs", "list", "--where", "exploring_laps<many").assert_refused("'many' is no number")
 
 
 def test_a_run_is_deleted_here_and_in_mlflow_only_with_yes(recorded, client, call):
