@@ -12,6 +12,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.deepracer.model_metadata import Action
 from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.fastest.lap import FastestLap
 
 from .against_log import prepare_races
 from .log_view import prepare
@@ -136,6 +137,15 @@ def commands_of_log(recording: Recording, track: str | None = None) -> Commands:
         laps=f"{words} ({', '.join(sources)})",
         steering_deg=rows["steer"].to_numpy(np.float64),
         speed_mps=rows["throttle"].to_numpy(np.float64),
+    )
+
+
+def commands_of_fastest(lap: FastestLap, car: str, track: str) -> Commands:
+    """Return the commands of the fastest lap of a car on a track, without those of the prepare step."""
+    return Commands(
+        laps=f"the fastest lap of {car} on {track}, {lap.lap_time_s:.2f} s",
+        steering_deg=lap.column("steering_deg")[1:],
+        speed_mps=lap.column("commanded_mps")[1:],
     )
 
 

@@ -5,7 +5,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from deepracer_exp.errors import BadInput, writing
 
@@ -13,6 +13,7 @@ from .arguments import Stores, add_command, add_overrides, complete_runs, is_ove
 from .output import table_console, warnings_on_stderr
 from .pages import existing_logs
 from .startup import check_policy
+from .tracks import ROUTES, experiment_on, search_fastest
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.proposed_actions import ActionProposal, Commands
@@ -23,6 +24,7 @@ _EPILOG = """\
   deepracer-exp actions RUN                                 from the fast laps of its best checkpoint, driven now
   deepracer-exp actions ~/Downloads/training.tar.gz --count 20 --name season
                                                             from the fast laps of a log
+  deepracer-exp actions Oval_track car=deepracer_v5         from the fastest lap of a car on a track
   deepracer-exp train action_space=season                   train with them
 
 Laps that count are complete, without a reset, and at most 5 % slower than the fastest of their track. Actions are the
@@ -31,6 +33,8 @@ nothing like it is among them, there are also: full lock to either side and stra
 laps (at most 1.3 m/s), and 10 degrees to either side at their median speed.
 """
 METADATA, PICTURE = "model_metadata.json", "actions.png"
+FREE = ["action_space=continuous", "action_space.speed.high=4"]
+"""What the fastest lap of a track may command: as `tracks NAME --fastest` is told in its help."""
 
 
 class _Source(NamedTuple):
@@ -50,14 +54,16 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "actions",
         _actions,
         help="propose an action space from driven laps",
-        description="Propose a list of actions from the commands of fast laps: of a log, or of a run's best policy. "
-        "Write it as an option of your own, as model_metadata.json and as a picture.",
+        description="Propose a list of actions from the commands of fast laps: of a log, of a run's best policy, or of "
+        "the fastest lap of a car on a track. Write it as an option of your own, as model_metadata.json and as a "
+        "picture.",
         epilog=_EPILOG,
-        entry="evaluate",
     )
-    what = parser.add_argument("what", nargs="?", metavar="RUN | LOGS", help="a run, or logs of the service")
-    what.completer = complete_runs  # type: ignore[attr-defined]
-    add_overrides(parser, "checkpoint=NAME | runs_dir=DIR | tracking.uri=URI")
+    what = parser.add_argument(
+        "what", nargs="?", metavar="RUN | LOGS | TRACK", help="a run, logs of the service, or a track"
+    )
+    what.completer = _complete  # type: ignore[attr-defined]
+    add_overrides(parser, "checkpoint=NAME | KEY=VALUE")
     parser.add_argument("--count", type=_whole, default=12, metavar="N", help="actions in all (default: 12)")
     parser.add_argument(
         "--name", help="name of the option, ./conf/action_space/NAME.yaml (default: actions-SOURCE)"
@@ -87,16 +93,16 @@ def _actions(args: argparse.Namespace) -> int:
     from deepracer_exp.files import atomic_write
 
     words = [word for word in (args.what, *args.overrides) if word is not None]
-    stores = read_stores((word for word in words if is_override(word)), ["checkpoint"])
+    overrides = [word for word in words if is_override(word)]
     given = [word for word in words if not is_override(word)]
     if len(given) != 1:
-        raise BadInput(f"{' '.join(given) or 'RUN'}: {len(given)} given; accepted: one run, or logs")
+        raise BadInput(f"{' '.join(given) or 'RUN'}: {len(given)} given; accepted: one run, logs or a track")
     check_count(args.count)
     if args.name is not None:
         check_action_space_name(args.name)
         _check_folder(args.output or args.name)
 
-    source = _source(given[0], stores, args.track)
+    source = _source(given[0], overrides, args.track)
     name = args.name or _default_name(source.name)
     folder = _check_folder(args.output or name)
     check_action_space_name(name)
@@ -138,10 +144,22 @@ def _default_name(source: str) -> str:
     return f"actions-{re.sub(r'[^A-Za-z0-9_]+', '-', source).strip('-')[:60] or 'log'}"
 
 
-def _source(what: str, stores: Stores, track: str | None) -> _Source:
+def _complete(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Return the names of runs and of tracks."""
+    from deepracer_exp.config.options import options
+
+    return [*complete_runs(prefix, parsed_args), *options("track")]
+
+
+def _source(what: str, overrides: list[str], track: str | None) -> _Source:
+    from deepracer_exp.config.options import options
     from deepracer_exp.runs.files import is_run
 
     place = existing_logs(what)
+    is_route = place is not None and place.suffix in ROUTES
+    if is_route or (place is None and what in options("track")):
+        return _of_track(what, is_route, overrides, track)
+    stores = read_stores(overrides, ["checkpoint"])
     if place is None or is_run(place):
         return _of_run(what, stores, track)
     if stores.values:
@@ -157,6 +175,23 @@ def _source(what: str, stores: Stores, track: str | None) -> _Source:
     # All cars have the service's limits.
     car = compose_experiment([])[0].car
     return _Source(recording.name, commands, car, recording.metadata or ModelMetadata())
+
+
+def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None) -> _Source:
+    """Return the fastest lap of a car between its own limits, unless an action space is given."""
+    if track is not None:
+        raise BadInput(f"--track {track}: {what} is a track itself; accepted for a log of several tracks")
+
+    from deepracer_exp.analysis.proposed_actions import commands_of_fastest
+    from deepracer_exp.config.overrides import group_of, override_line
+    from deepracer_exp.export.aws_files import services_metadata
+
+    free = [] if any(group_of(one) == "action_space" for one in overrides) else FREE
+    named = override_line("track.file" if is_route else "track", what)
+    experiment, course = experiment_on([named, *free, *overrides])
+    lap = search_fastest(experiment, course)
+    commands = commands_of_fastest(lap, experiment.car.name, course.name)
+    return _Source(course.name, commands, experiment.car, services_metadata(experiment))
 
 
 def _of_run(what: str, stores: Stores, track: str | None) -> _Source:

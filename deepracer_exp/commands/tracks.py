@@ -60,6 +60,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
 
 
+ROUTES = (".npy", ".yaml", ".yml")
+"""Endings of files with a track."""
 COLUMNS, ROWS = 100, 32
 """Largest size of a drawing, in characters and lines."""
 
@@ -117,7 +119,7 @@ def _list_tracks() -> None:
         )
     for name in options("track"):
         if name not in worlds():
-            _, track = _experiment([override_line("track", name)])
+            _, track = experiment_on([override_line("track", name)])
             measures = f"{track.length_m:.2f}", f"{track.width_m:.2f}", str(len(track.waypoints))
             table.add_row(name, track.title, *measures, "")
     out.print(table)
@@ -134,15 +136,15 @@ def _show_track(args: argparse.Namespace) -> None:
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
 
-    is_file = Path(args.name).suffix in (".npy", ".yaml", ".yml")
+    is_file = Path(args.name).suffix in ROUTES
     check_line_file(args.line)
     if args.video is not None:
         check_film("--video", Path(args.video))
         choose_graphics()
-    experiment, track = _experiment(
+    experiment, track = experiment_on(
         [override_line("track.file" if is_file else "track", args.name), *args.overrides]
     )
-    lap = _fastest(experiment, track) if args.fastest else None
+    lap = search_fastest(experiment, track) if args.fastest else None
     if args.output is not None:
         driven = None if lap is None else _line_table(lap)[["x_m", "y_m", "speed_mps"]].to_numpy()
         with writing(f"--output {args.output}", "", BadInput, ValueError):  # an unknown ending
@@ -165,7 +167,7 @@ def _show_track(args: argparse.Namespace) -> None:
             print(f"\n{what}: {path}")
 
 
-def _experiment(overrides: list[str]) -> "tuple[Experiment, Track]":
+def experiment_on(overrides: list[str]) -> "tuple[Experiment, Track]":
     """Return an experiment on one track, and that track in the direction of its first episode."""
     from deepracer_exp.config.compose import compose_experiment
     from deepracer_exp.tracks.track import Track
@@ -178,8 +180,13 @@ def _experiment(overrides: list[str]) -> "tuple[Experiment, Track]":
     return experiment, Track.from_config(config)
 
 
-def _fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
-    """Return the fastest lap; a search shows how far it is."""
+def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
+    """Return the fastest lap; a search shows how far it is.
+
+    Raises:
+        BadInput: as for `Question.of`.
+        RunFailed: no lap is possible within the limits.
+    """
     from rich.console import Console
     from rich.progress import Progress, TimeRemainingColumn
 

@@ -5,10 +5,14 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from deepracer_exp.commands.actions import FREE
+from deepracer_exp.commands.tracks import experiment_on
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
+from deepracer_exp.fastest.lap import COLUMNS, FastestLap, Question, _keep
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
 
@@ -55,6 +59,27 @@ def test_the_table_has_the_actions_of_the_file(logs, call, tmp_path):
     assert (tmp_path / "conf" / "action_space" / "actions-from-aws.yaml").is_file()
 
 
+def test_the_fastest_lap_of_a_track_has_actions(call, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    # A lap that a search has kept, of known commands.
+    experiment, course = experiment_on(["track=Oval_track", "car=deepracer_v5", *FREE])
+    steps = np.zeros((91, len(COLUMNS)))
+    steps[1:, COLUMNS.index("steering_deg")] = np.repeat([4.0, 12.0, 20.0], 30)
+    steps[1:, COLUMNS.index("commanded_mps")] = np.repeat([4.0, 3.0, 2.0], 30)
+    lap = FastestLap(lap_time_s=6.0, bound_s=5.9, start_ndist=0.0, steps=steps)
+    _keep(Question.of(experiment, course), lap)
+    ended = call("actions", "Oval_track", "--name", "mine", "car=deepracer_v5")
+    assert ended.code == 0, ended.stderr
+    assert "Oval_track: the fastest lap of deepracer_v5 on Oval_track, 6.00 s" in ended.stdout
+    metadata = json.loads((tmp_path / "mine" / "model_metadata.json").read_text())
+    listed = {(action["steering_angle"], action["speed"]) for action in metadata["action_space"]}
+    assert {(4.0, 4.0), (12.0, 3.0), (20.0, 2.0)} <= listed
+    # The prepare step commands nothing; to the right the car goes to recover only.
+    assert {speed for _, speed in listed} == {1.3, 2.0, 3.0, 4.0}
+    assert {angle for angle, _ in listed if angle <= 0} == {-30.0, -10.0, 0.0}
+    assert metadata["version"] == "5"
+
+
 def test_a_training_takes_them(run_dir, call, train_here):
     assert call("actions", str(run_dir), "--name", "mine").code == 0
     ended = train_here("action_space=mine", "budget.iterations=1", "name=next")
@@ -75,7 +100,7 @@ def test_nothing_that_is_there_is_overwritten(run_dir, call, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], ["accepted: one run, or logs"]),
+        ([], ["accepted: one run, logs or a track"]),
         (["RUN", "nowhere"], ["2 given"]),
         (["nowhere"], ["nowhere"]),
         (["empty"], ["empty"]),
@@ -85,6 +110,8 @@ def test_nothing_that_is_there_is_overwritten(run_dir, call, tmp_path):
         (["RUN", "--name", "discrete"], ["--name discrete", "exists already"]),
         (["RUN", "--track", "Oval_track"], ["--track Oval_track", "is no log"]),
         (["empty", "checkpoint=last"], ["checkpoint=last", "is a log"]),
+        (["Oval_track", "--track", "Oval_track"], ["--track Oval_track", "is a track itself"]),
+        (["Oval_track", "action_space.speed.high=100"], ["action_space"]),
         (["RUN", "seed=3"], ["seed=3", "no such key"]),
     ],
 )
