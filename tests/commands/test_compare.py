@@ -72,7 +72,7 @@ def test_experiments_and_groups_of_ones_own_keep_their_names(study, call, tmp_pa
 
 def test_single_runs_stand_side_by_side(call, tmp_path):
     made_up_run(tmp_path / "runs" / "e" / "first", ["seed=1", "algorithm.lr=1e-4"], 10.0)
-    made_up_run(tmp_path / "runs" / "e" / "second", ["seed=2"], 9.25)
+    made_up_run(tmp_path / "runs" / "e" / "second", ["seed=2", "algorithm.lr=1e-3"], 9.25)
     ended = call("compare", "first", "second", "-o", "out.html")
     assert ended.code == 0, ended.stderr
     said = lines(ended.stdout)
@@ -82,7 +82,7 @@ def test_single_runs_stand_side_by_side(call, tmp_path):
         assert row in text
     assert "nothing says how much of a difference is chance" in ended.stdout
     # Alike but for their seed, they are one group.
-    made_up_run(tmp_path / "runs" / "e" / "third", ["seed=3"], 9.0)
+    made_up_run(tmp_path / "runs" / "e" / "third", ["seed=3", "algorithm.lr=1e-3"], 9.0)
     said = lines(call("compare", "second", "third").stdout)
     assert "best checkpoint 000010 000010" in said
     assert any(line.startswith("default 2") for line in said)
