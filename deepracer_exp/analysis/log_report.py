@@ -13,7 +13,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head
 
-from .charts import actions, driving_line, laps, mistakes, rewards, training, zigzag
+from .charts import actions, against_fastest, driving_line, laps, mistakes, rewards, training, zigzag
 from .charts.figure import Chart
 from .charts.runs import generalisation_matrix, generations, policy_of, run_folder
 from .findings import Finding, findings
@@ -35,6 +35,7 @@ SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     _BESIDE: (),
     "Lap times": (
         *(laps.lap_time_percentile, laps.lap_time_histogram, laps.lap_delta),
+        against_fastest.against_fastest,
         *(laps.correlations, laps.start_position),
     ),
     "The line it drives": (

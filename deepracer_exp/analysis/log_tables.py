@@ -8,6 +8,8 @@ import pandas as pd
 
 from deepracer_exp.errors import count
 
+from .against_fastest import loss_in_words
+from .charts.runs import run_folder
 from .log_view import LogView
 from .zigzag import in_words
 from .zigzag_log import zigzag_now
@@ -152,6 +154,9 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     figures, where = zigzag_now(view)
     if figures is not None:
         found.append(("Zig-zag on straights", f"{in_words(*figures)} ({where})"))
+    folder = run_folder(view)
+    if folder is not None and view.episodes["lap_time_s"].notna().any():
+        found.append(("Against the fastest lap", loss_in_words(view, folder)))
     if len(driven):
         streams = count(driven["stream"].nunique(), "evaluation")
         found.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))

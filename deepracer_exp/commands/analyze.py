@@ -12,6 +12,7 @@ from .pages import add_page, check_output, end_with_page, page_name, run_or_logs
 from .replay import add_replay, check_replay, write_laps
 
 if TYPE_CHECKING:
+    from deepracer_exp.analysis.log_view import LogView
     from deepracer_exp.analysis.page import Glimpse
     from deepracer_exp.config.car import CarConfig
 
@@ -57,6 +58,11 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="write the line of its fastest exploring lap (.csv, .npy, or .py: a Python list)",
     )
     parser.add_argument("--lap", metavar="EPISODE", help="the lap of --line: a complete episode of the log")
+    parser.add_argument(
+        "--fastest",
+        action="store_true",
+        help="of a run: find the fastest lap of its car first, so that the page shows what is lost to it",
+    )
     add_page(parser, "report.html of a run, else NAME-analysis.html")
 
 
@@ -105,6 +111,8 @@ def _analyze(args: argparse.Namespace) -> int:
         from deepracer_exp.evaluation.sight import run_glimpses
 
         view, strip = run_glimpses(view, place)
+    if args.fastest:
+        _find_fastest(view, place)
     laps = None if args.replay is None else laps_of_log(view, None)
     replay = None if reward is None else replay_reward(view, reward, car)
     default = place / REPORT if is_own_run(place) else page_name("analysis", recording.name)
@@ -167,3 +175,22 @@ def _seconds(text: str) -> float:
     if not 0 < seconds < math.inf:
         raise BadInput(f"--target {text}: accepted: seconds above 0, such as 9.5")
     return seconds
+
+
+def _find_fastest(view: "LogView", place: Path) -> None:
+    """Search for the fastest lap of a run's car, unless an earlier search has kept it.
+
+    Raises:
+        BadInput: it is no run of ours, or its car and track are unknown.
+    """
+    from deepracer_exp.analysis.against_fastest import question_of
+    from deepracer_exp.runs.own_recording import is_own_run
+
+    from .tracks import search_fastest
+
+    question = question_of(view, place) if is_own_run(place) else None
+    if question is None:
+        raise BadInput(
+            f"--fastest: {place}: car and track are not known; accepted: a run of ours on one track"
+        )
+    search_fastest(question.experiment, question.track)

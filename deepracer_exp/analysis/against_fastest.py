@@ -1,0 +1,144 @@
+"""A lap of a run of ours against the fastest lap of its car: the seconds lost in each sector, and by what."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.fastest.lap import FastestLap, Question, kept_lap
+from deepracer_exp.runs.resolve import StoredRun
+from deepracer_exp.tracks.track import Track
+
+from .log_view import LogView
+from .sectors import Sector, sectors_of
+from .statistics import Values
+
+CAUSES = ("line", "speed", "steering")
+"""A longer line; less speed on it; and the way that steering to and fro adds to a line that is smooth."""
+_SMOOTH_M, _APART_M = 0.6, 0.05
+"""Length over which a driven line is averaged to be smooth, and that between its points."""
+_SAME_START_M = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Loss:
+    """What a lap loses."""
+
+    fastest: FastestLap
+    lap_time_s: float
+    by_sector: pd.DataFrame
+    """Seconds, a column for each of `CAUSES`, index: names of sectors."""
+
+
+def question_of(view: LogView, folder: Path) -> Question | None:
+    """Return what the fastest lap of a run's car on the view's course depends on; None where it cannot be told."""
+    try:
+        experiment = StoredRun(folder).experiment
+        tracks = experiment.tracks
+        config = tracks.get(view.track_name) or (next(iter(tracks.values())) if len(tracks) == 1 else None)
+        if config is None or view.course is None:
+            return None
+        return Question.of(experiment, Track.from_config(config, view.course.reversed))
+    except BadInput:  # the page lists which files of the run could not be read
+        return None
+
+
+def loss(view: LogView, folder: Path) -> Loss | None:
+    """Compare the run's fastest exploring lap from the start line; None without one, or without a fastest lap."""
+    question = question_of(view, folder)
+    fastest = None if question is None else kept_lap(question)
+    lap = None if fastest is None else _lap_from_the_line(view, fastest)
+    if question is None or fastest is None or lap is None:
+        return None
+    own = pd.DataFrame({name: fastest.column(name) for name in ("time_s", "x_m", "y_m")})
+    sectors = sectors_of(question.track)
+    return Loss(
+        fastest=fastest,
+        lap_time_s=float(lap["time_s"].iloc[-1]),
+        by_sector=by_cause(
+            _in_sectors(lap, sectors, question.track), _in_sectors(own, sectors, question.track)
+        ),
+    )
+
+
+def by_cause(lap: pd.DataFrame, fastest: pd.DataFrame) -> pd.DataFrame:
+    """Divide the time that a lap loses.
+
+    Args:
+        lap: of each sector `time_s`, `way_m` and `smooth_m`, the way without what steering to and fro adds.
+        fastest: likewise.
+
+    Returns:
+        Seconds by `CAUSES`, whose sum is the difference of `time_s`. A longer line costs its length at the speed of the
+        fastest lap; what is left is speed.
+    """
+    per_m = fastest["time_s"] / fastest["way_m"]
+    steering = ((lap["way_m"] - lap["smooth_m"]) - (fastest["way_m"] - fastest["smooth_m"])) * per_m
+    line = (lap["smooth_m"] - fastest["smooth_m"]) * per_m
+    speed = lap["time_s"] - fastest["time_s"] - line - steering
+    return pd.DataFrame({"line": line, "speed": speed, "steering": steering})[list(CAUSES)]
+
+
+def _lap_from_the_line(view: LogView, fastest: FastestLap) -> pd.DataFrame | None:
+    """Return time and place at each step of the fastest lap that begins where the fastest of the car begins."""
+    laps = view.episodes[view.episodes["lap_time_s"].notna()].sort_values("lap_time_s", kind="stable")
+    start = np.array([fastest.column("x_m")[0], fastest.column("y_m")[0]])
+    columns = ("X", "Y", "lap_clock_s")
+    for episode in laps["episode"]:
+        rows = view.of_episodes((view.episodes["episode"] == episode).to_numpy(), *columns)
+        if np.hypot(*(rows[["X", "Y"]].to_numpy()[0] - start)) < _SAME_START_M:
+            return rows.rename(columns={"X": "x_m", "Y": "y_m", "lap_clock_s": "time_s"})
+    return None
+
+
+def _in_sectors(lap: pd.DataFrame, sectors: list[Sector], track: Track) -> pd.DataFrame:
+    """Return time and ways of a lap in each sector, from the start line on."""
+    points = lap[["x_m", "y_m"]].to_numpy(np.float64)
+    way_m = _way_m(points)
+    even_m = np.arange(0.0, way_m[-1] + _APART_M, _APART_M)
+    even = pd.DataFrame({axis: np.interp(even_m, way_m, points[:, axis]) for axis in (0, 1)})
+    smooth = even.rolling(2 * round(0.5 * _SMOOTH_M / _APART_M) + 1, center=True, min_periods=1).mean()
+    along = np.unwrap(track.project(points).ndist, period=1.0)
+    # The last step is at the line or just beyond it.
+    along = np.maximum.accumulate(along)
+    bounds = np.array([0.0, *(sector.end for sector in sectors)])
+    bounds[0], bounds[-1] = min(along[0], bounds[1]), max(along[-1], bounds[-2])
+
+    def spent(values: Values) -> Values:
+        return np.diff(np.interp(bounds, along, values))
+
+    return pd.DataFrame(
+        {
+            "time_s": spent(np.r_[0.0, lap["time_s"].to_numpy()[1:]]),
+            "way_m": spent(way_m),
+            "smooth_m": spent(np.interp(way_m, even_m, _way_m(smooth.to_numpy()))),
+        },
+        index=[sector.name for sector in sectors],
+    )
+
+
+def _way_m(points: Values) -> Values:
+    return np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
+
+
+def loss_in_words(view: LogView, folder: Path) -> str:
+    """Return what a run's lap loses to the fastest lap of its car, or how that is found out."""
+    question = question_of(view, folder)
+    if question is None or kept_lap(question) is None:
+        return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
+    found = loss(view, folder)
+    return f"no complete {view.lap_word} from the start line" if found is None else in_words(found)
+
+
+def in_words(found: Loss) -> str:
+    """Return in a sentence what is lost, and where most."""
+    total, causes = found.lap_time_s - found.fastest.lap_time_s, found.by_sector.sum()
+    by_sector = found.by_sector.sum(axis=1)
+    parts = ", ".join(f"{causes[name]:+.2f} s {name}" for name in CAUSES)
+    of_car = f"{found.fastest.lap_time_s:.2f} s; bound {found.fastest.bound_s:.2f} s"
+    return (
+        f"{found.lap_time_s:.2f} s, {total:.2f} s more than the fastest lap of this car ({of_car}): {parts}; most in "
+        f"{by_sector.idxmax()} ({by_sector.max():+.2f} s)"
+    )
