@@ -8,7 +8,9 @@ import pytest
 MODES = pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
 DEATHS_ALONE = ("collector.hang_timeout_s=600",)
 """The watchdog would end a worker later than the tests wait: what ends the run is that the death is noticed."""
-HANGS_SOON = ("collector.hang_timeout_s=2", "reward.time_limit_s=0.5")
+HANG_S = 10
+"""A busy machine has let a worker that is well take no step for three seconds."""
+HANGS_SOON = (f"collector.hang_timeout_s={HANG_S}", "reward.time_limit_s=0.5")
 LEARNS_LONG = ("algorithm.epochs=100", "algorithm.batch_size=32")
 """Little driving and much learning, so that a signal interrupts the update or the sending of weights."""
 
@@ -115,7 +117,7 @@ def test_a_run_stopped_as_a_whole_continues_afterwards(start_training):
     training = start_training(*HANGS_SOON, "budget.env_steps=null", "budget.iterations=40")
     training.wait_for_iterations(1)
     training.signal_group(signal.SIGSTOP)
-    time.sleep(6)
+    time.sleep(1.5 * HANG_S)
     training.signal_group(signal.SIGCONT)
     ended = training.end()
     assert ended.code == 0, ended.stderr
