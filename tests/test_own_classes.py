@@ -83,7 +83,7 @@ def at_home(run: Path) -> Path:
 def test_every_class_does_its_part(run, monkeypatch):
     monkeypatch.chdir(at_home(run))
     rows = metrics(run)
-    assert rows["lr"].tolist() == pytest.approx([1e-3, 5.5e-4, 1e-4, 5.5e-4])
+    assert rows["lr"].tolist() == pytest.approx([1.3e-3, 7.15e-4, 1.3e-4, 7.15e-4])
     assert curves(run)["completion"].dropna().tolist() == pytest.approx(rows["completion"].tolist())
     compose_experiment(OWN)  # names the classes for this process
     policy = load_policy(run, "last", run.parents[1])

@@ -36,7 +36,7 @@ def record(tmp_path: Path) -> Callable[..., RunRecord]:
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        ([[], ["algorithm.lr=3e-4", "seed=7"]], {"seed": [0, 7], "algorithm.lr": [0.001, 0.0003]}),
+        ([[], ["algorithm.lr=3e-4", "seed=7"]], {"seed": [0, 7], "algorithm.lr": [0.0013, 0.0003]}),
         ([["track=Oval_track"], []], {"track": ["Oval_track", "reinvent_base"]}),
         ([[], ["runs_dir=elsewhere", "tracking=off", "debug=true"]], {}),
     ],

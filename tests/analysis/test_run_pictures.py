@@ -110,7 +110,7 @@ def test_the_fastest_complete_lap_is_drawn_in_the_speeds_at_the_ends_of_its_segm
     figure = driven_lines(trace, {"circle": circle_track()})
     title, result = words(figure)
     assert title == "Circle"
-    assert result.startswith("lap in 10.00 s")
+    assert result.startswith("exploring lap in 10.00 s")
     (line,) = driven(figure)
     np.testing.assert_allclose(np.linalg.norm(np.concatenate(line.get_segments()), axis=1), 3.0)
     np.testing.assert_array_equal(line.get_array(), lap["speed_mps"][1:])
@@ -127,7 +127,7 @@ def test_each_track_has_its_own_best_episode_and_one_scale_of_speed_holds_for_al
         ]
     )
     figure = driven_lines(trace, {"a": circle_track(), "b": circle_track(), "c": circle_track()})
-    assert words(figure)[1::2] == ["lap in 10.00 s", "30.0% of the lap, off track", "not driven"]
+    assert words(figure)[1::2] == ["exploring lap in 10.00 s", "30.0% of the lap, off track", "not driven"]
     lines = driven(figure)
     assert [len(line.get_segments()) for line in lines] == [149, 59]
     assert {line.get_clim() for line in lines} == {lines[0].get_clim()}

@@ -67,7 +67,7 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
                 result.progress,
                 result.all_wheels_on_track,
                 result.status,
-                result.terminated,
+                result.terminated | result.truncated,
                 rules.nearer_waypoint(),
                 paid,
                 rules.steps,

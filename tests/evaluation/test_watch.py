@@ -249,7 +249,7 @@ def test_a_lap_that_the_end_of_the_race_cuts_off_is_drawn_but_not_counted(experi
     *complete, last = evaluation.groups[0].attempts
     assert last.end == "time_up"
     (shown,) = track_lines(evaluator, evaluation, recorder)
-    assert shown.words.startswith(f"{len(complete)} of {len(complete)} laps complete, the fastest in ")
+    assert shown.words.startswith(f"{len(complete)} of {len(complete)} usual laps complete, the fastest in ")
     assert len(shown.lines) == len(complete) + 1
 
 

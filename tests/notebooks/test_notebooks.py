@@ -68,7 +68,7 @@ def test_the_log_analysis_trains_a_short_run_where_there_is_none(tmp_path, monke
 
 
 def test_an_own_training_loop_learns_with_public_names_only():
-    assert run_cells("own_algorithm.ipynb")[-1] > 1.2
+    assert run_cells("own_algorithm.ipynb")[-1] > 0.3
     text = (FOLDER / "own_algorithm.ipynb").read_text(encoding="utf-8")
     assert "deepracer_exp." not in text
     (names,) = re.findall(r"from deepracer_exp import ([\w, ]+)", text)

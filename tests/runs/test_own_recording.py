@@ -70,7 +70,7 @@ def test_what_was_trained_with_is_reported_in_the_services_words(trained):
     recording = read_own_recording(trained().folder)
     assert recording.problems == ()
     assert recording.hyperparameters["batch_size"] == 256
-    assert recording.hyperparameters["discount_factor"] == 0.99
+    assert recording.hyperparameters["discount_factor"] == 0.97
     assert recording.track == "reinvent_base"
     assert recording.metadata.actions[0] == (-30.0, 1.0)
     assert "def reward_function" in recording.reward_source
