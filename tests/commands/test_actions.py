@@ -14,7 +14,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.fastest.lap import COLUMNS, FastestLap, Question, _keep
 
-LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
+LAPS = ("track=Straight_track", "action_space=deepracer", "reward=speed_on_track", "budget.env_steps=16384")
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from tests.page_html import Html
 
 from .test_result import attempt
 
-LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
+LAPS = ("track=Straight_track", "action_space=deepracer", "reward=speed_on_track", "budget.env_steps=16384")
 
 
 def driven(track: str, *times_s: float, condition: str = USUAL) -> Group:
