@@ -7,16 +7,14 @@ import pytest
 
 from tests.conftest import IN_PROCESS
 
-SWALLOWS_EVERYTHING = """
+DEAF = """
+import itertools
 def reward_function(params):
-    while params["steps"] > 3:
-        try:
-            while True:
-                pass
-        except:
-            pass
+    if params["steps"] > 3:
+        all(itertools.repeat(True))
     return 1.0
 """
+"""Never returns to the interpreter, which alone could raise an error; a loop that catches all may be left some time."""
 
 
 # What a reward function can do to the process around it, and what is said of it.
@@ -169,10 +167,10 @@ def test_a_reward_that_raises_in_a_worker_ends_the_run_with_the_workers_own_word
 
 
 @pytest.mark.slow
-def test_a_reward_that_swallows_its_time_limit_is_ended_by_the_watchdog(start_training, tmp_path):
+def test_a_reward_that_is_deaf_to_its_time_limit_is_ended_by_the_watchdog(start_training, tmp_path):
     path = tmp_path / "deaf.py"
-    path.write_text(SWALLOWS_EVERYTHING)
-    training = start_training(f"reward.file={path}", "reward.time_limit_s=1", "collector.hang_timeout_s=3")
+    path.write_text(DEAF)
+    training = start_training(f"reward.file={path}", "reward.time_limit_s=1", "collector.hang_timeout_s=10")
     ended = training.end()
     ended.assert_run_failed("collector worker", "took no step for", "(after 3 steps)")
     training.assert_nothing_left()
