@@ -219,7 +219,9 @@ def _command() -> str:
 
 def _lap(outcome: "TrainResult") -> str:
     """Return the fastest reliable lap of a run's evaluated policies, or what exploration did if there is none."""
-    found = fastest_reliable(read_metrics(outcome.folder / METRICS)) if outcome.summary else None
+    # A run that failed in its first iteration has no metrics.
+    file = outcome.folder / METRICS
+    found = fastest_reliable(read_metrics(file)) if file.is_file() else None
     return f"exploring: {_laps(outcome.summary)}" if found is None else f"fastest reliable lap: {found}"
 
 
