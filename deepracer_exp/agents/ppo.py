@@ -15,7 +15,7 @@ from torchrl.objectives.value import GAE
 
 from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig
 from deepracer_exp.config.own_class import OwnClass, build_own
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import BadInput, RunFailed
 
 from .actor_critic import ActorCritic
 from .schedules import Schedule, build_schedule
@@ -122,7 +122,6 @@ class PPO(Algorithm):
         schedule: Schedule,
         seed: int,
         device: torch.device = _CPU,
-        commands: Tensor | None = None,
     ) -> None:
         """Set up loss, advantages and optimizer.
 
@@ -132,10 +131,9 @@ class PPO(Algorithm):
             schedule: Of the learning rate.
             seed: Of the stream that shuffles the minibatches.
             device: Where updates are computed; if it is not the CPU, by a copy of the networks there.
-            commands: What the actions of a discrete policy mean, see `Smoothness`.
         """
         super().__init__(actor_critic, config, schedule, seed)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator, self._seed = torch.Generator().manual_seed(seed), seed
         self._device = device
         self._learner = actor_critic if device == _CPU else copy.deepcopy(actor_critic).to(device)
         self._parameters = list(self._learner.parameters())
@@ -162,10 +160,16 @@ class PPO(Algorithm):
             log_explained_variance=False,
             device=device,
         )
-        self._smoothness = (
-            Smoothness(self._learner, config.smoothness, commands, seed, device)
-            if config.smoothness
-            else None
+        self._smoothness: Smoothness | None = None
+
+    def smooth(self, commands: Tensor | None) -> None:
+        """Add the loss of `algorithm.smoothness`; a subclass's constructor need not know of it.
+
+        Args:
+            commands: What the actions of a discrete policy mean, see `Smoothness`.
+        """
+        self._smoothness = Smoothness(
+            self._learner, self.config.smoothness, commands, self._seed, self._device
         )
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
@@ -339,10 +343,9 @@ class Distillation(PPO):
         seed: int,
         teacher: TensorDictModuleBase,
         device: torch.device = _CPU,
-        commands: Tensor | None = None,
     ) -> None:
         """Set up PPO and the teacher, whose weights stay as they are."""
-        super().__init__(actor_critic, config, schedule, seed, device, commands)
+        super().__init__(actor_critic, config, schedule, seed, device)
         self._teacher = teacher.to(device)
         self._imitates = False
 
@@ -425,15 +428,24 @@ def build_agent(
         commands: What the actions of a discrete policy mean, see `Smoothness`.
 
     Raises:
-        BadInput: a class of the user's own cannot be used.
+        BadInput: a class of the user's own cannot be used, or has no loss that could be smooth.
     """
     schedule = build_schedule(lr_schedule)
+    agent: Algorithm
     if teacher is not None:
-        return Distillation(actor_critic, config, schedule, seed, teacher, device, commands)
-    if config.target is None:
-        return PPO(actor_critic, config, schedule, seed, device, commands)
-    own = OwnClass(target=config.target, kwargs=config.kwargs)
-    # Its constructor may draw weights; the global random state has no part in them.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return build_own(own, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)
+        agent = Distillation(actor_critic, config, schedule, seed, teacher, device)
+    elif config.target is None:
+        agent = PPO(actor_critic, config, schedule, seed, device)
+    else:
+        own = OwnClass(target=config.target, kwargs=config.kwargs)
+        # Its constructor may draw weights; the global random state has no part in them.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            agent = build_own(own, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)
+    if config.smoothness:
+        if not isinstance(agent, PPO):
+            raise BadInput(
+                f"algorithm.smoothness={config.smoothness:g}: {config.target} is no PPO; accepted: 0"
+            )
+        agent.smooth(commands)
+    return agent

@@ -1,7 +1,7 @@
 """Smoothness of a policy: a loss on how far apart its actions are in states that are close to each other.
 
 A policy that chooses -20 degrees in one state and +20 in the next makes the car zig-zag. The loss is that of CAPS
-(Mysore et al. 2021, arXiv 2012.06644, equations 1 to 3), temporal plus spatial:
+(Mysore et al. 2021, arXiv 2012.06644), temporal plus spatial:
 
     L_T = D(pi(s_t), pi(s_t+1)),   L_S = D(pi(s), pi(s')),   s' a variant of s
 

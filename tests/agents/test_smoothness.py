@@ -10,11 +10,14 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
-from deepracer_exp.agents.ppo import PPO, Distillation
+from deepracer_exp.agents.ppo import PPO, Algorithm, Distillation, build_agent
 from deepracer_exp.agents.smoothness import Smoothness
+from deepracer_exp.config import acting
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import ObservationShape
-from deepracer_exp.config.learning import CNNConfig
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.config.learning import CNNConfig, LRScheduleConfig
+from deepracer_exp.config.own_class import allow_given
+from deepracer_exp.errors import BadInput, RunFailed
 
 from .test_ppo import KINDS, drive, make, parameters, train
 
@@ -31,8 +34,9 @@ def smooth(
     **changes: object,
 ) -> tuple[ActorCritic, PPO]:
     networks, plain = make(shared, actions, seed, device, smoothness=smoothness, **changes)
-    commands = COMMANDS if actions else None
-    return networks, PPO(networks, plain.config, plain.schedule, seed, torch.device(device), commands)
+    if smoothness:
+        plain.smooth(COMMANDS if actions else None)
+    return networks, plain
 
 
 def apart(networks: ActorCritic, batch: TensorDict) -> float:
@@ -187,7 +191,9 @@ def test_a_teacher_is_imitated_as_without_it():
         networks, ppo = smooth(smoothness=strength)
         teacher, _ = make(seed=7)
         config = dataclasses.replace(ppo.config, teacher_iterations=2, teacher_batch_size=32)
-        pupil = Distillation(networks, config, ppo.schedule, 0, teacher.policy, commands=COMMANDS)
+        pupil = Distillation(networks, config, ppo.schedule, 0, teacher.policy)
+        if strength:
+            pupil.smooth(COMMANDS)
         train(networks, pupil, 2)
         results.append(parameters(networks))
     assert torch.equal(*results)
@@ -232,3 +238,35 @@ def test_a_policy_gone_bad_is_named_before_the_gradient_step():
     with pytest.raises(RunFailed, match="smoothness loss is nan"):
         ppo._gradient_step(steps)
     assert torch.equal(parameters(networks), before)
+
+
+class Own(PPO):
+    """A class of the user's own, which knows nothing of smoothness."""
+
+
+class NoLoss(Algorithm):
+    pass
+
+
+def built(own: type[Algorithm], actions: int | None) -> tuple[ActorCritic, Algorithm]:
+    networks, plain = make(actions=actions, smoothness=STRENGTH)
+    config = dataclasses.replace(plain.config, target=f"{own.__module__}:{own.__name__}")
+    allow_given([f"algorithm.target={config.target}"])
+    schedule = compose_option("lr_schedule", "constant", LRScheduleConfig)
+    return networks, build_agent(networks, config, schedule, 0, commands=COMMANDS if actions else None)
+
+
+@pytest.mark.parametrize("actions", [3, None])
+def test_an_own_ppo_has_it_too(actions, monkeypatch):
+    monkeypatch.setattr(acting, "_named", {})
+    networks, own = built(Own, actions)
+    other, ppo = smooth(actions=actions)
+    for agent, driven in ((own, networks), (ppo, other)):
+        agent.update(drive(driven), 0, 0.0)
+    assert own.state_dict()["smoothness"].keys() == ppo.state_dict()["smoothness"].keys()
+
+
+def test_what_is_no_ppo_is_refused(monkeypatch):
+    monkeypatch.setattr(acting, "_named", {})
+    with pytest.raises(BadInput, match=r"algorithm.smoothness=0.5: .*NoLoss is no PPO; accepted: 0"):
+        built(NoLoss, 3)
