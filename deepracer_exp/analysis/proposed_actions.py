@@ -166,7 +166,7 @@ def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionPr
     Laps that went well do not show how to come back to the line, and a policy has to learn that first. So these are
     added where no chosen action is `NEAR`: full lock to either side and straight ahead at the lowest speed of the laps
     and at most `RESCUE_MPS`, to turn and to brake, and `CORRECTION` of full lock to either side at the laps' median
-    speed. Where the laps have fewer different commands than there are actions to choose, there are fewer actions.
+    speed. Where rounded commands are the same, there are fewer actions.
 
     Args:
         commands: within the limits of the car.

@@ -231,5 +231,6 @@ def _print(source: _Source, proposal: "ActionProposal", count: int) -> None:
     )
     if len(proposal.actions) < count:
         console.print(
-            f"{len(proposal.actions)} of {count}: the laps have no more different commands", soft_wrap=True
+            f"{len(proposal.actions)} of {count}: the other commands of the laps are the same once rounded",
+            soft_wrap=True,
         )

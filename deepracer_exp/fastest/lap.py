@@ -36,7 +36,7 @@ from .search import OnRound, Search, lap_time_s
 
 Floats = NDArray[np.float64]
 
-ALGORITHM = 1
+ALGORITHM = 2
 """Laps that an earlier version found are searched again."""
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "progress", "steering_deg", "commanded_mps")
 """Of a lap's steps: clock, front of the car, heading, speed, per cent of the lap, and the command given there."""
@@ -52,8 +52,6 @@ class FastestLap:
     """By the service's clock, from the reset on."""
     bound_s: float
     """No lap of this kind is faster, as far as a search over lines tells (`tracks.line_time`)."""
-    start_ndist: float
-    """Where it begins, as a share of the lap."""
     steps: Floats
     """Its control steps, the prepare step first, (n, `COLUMNS`)."""
 
@@ -89,10 +87,9 @@ class Question:
     low: Floats
     """Lowest [steering_deg, speed_mps] that the car can be sent, (2,)."""
     high: Floats
-    start_ndist: float = 0.0
 
     @classmethod
-    def of(cls, experiment: Experiment, track: Track, start_ndist: float = 0.0) -> "Question":
+    def of(cls, experiment: Experiment, track: Track) -> "Question":
         """Return the question for an experiment's car and action space on a track.
 
         Raises:
@@ -105,19 +102,17 @@ class Question:
                 f"action_space: {name} is always {low[int(name == 'speed')]:g}; accepted for a fastest lap: two "
                 "different limits"
             )
-        start = start_ndist if track.closed else 0.0
-        return cls(experiment=experiment, track=track, low=low, high=high, start_ndist=start)
+        return cls(experiment=experiment, track=track, low=low, high=high)
 
     @cached_property
     def key(self) -> str:
-        """Return a hash of track, car, limits, start and algorithm."""
+        """Return a hash of track, car, limits and algorithm."""
         track = self.track
         asked = {
             "algorithm": ALGORITHM,
             "car": asdict(self.experiment.car),
             "low": self.low.tolist(),
             "high": self.high.tolist(),
-            "start": self.start_ndist,
             "closed": track.closed,
             "friction": track.floor.friction,
         }
@@ -133,7 +128,7 @@ class Question:
             [self.high[1], math.radians(self.high[0])]
         )
 
-    def answer(self, on_round: OnRound = lambda share, lap_time_s: None) -> FastestLap:
+    def answer(self, on_round: OnRound) -> FastestLap:
         """Search for the lap and drive it in the environment.
 
         Raises:
@@ -141,15 +136,15 @@ class Question:
         """
         car, track = self.experiment.car, self.track
         bound_s, line = self.bound()
-        places = self.start_ndist + np.linspace(0.0, 1.0, round(track.length_m / _LINE_M))
-        search = Search(car, track, *self._limits, self.start_ndist)
+        places = np.linspace(0.0, 1.0, round(track.length_m / _LINE_M))
+        search = Search(car, track, *self._limits)
         commands = search.run((track.points_at(places), line), on_round)
         steps = self._drive(commands)
         ahead = car.front_point_m * np.column_stack([np.cos(steps[:, 3]), np.sin(steps[:, 3])])
         time_s = float(steps[-1, 0])
         # The search for the line of the bound is local, too.
         bound_s = min(bound_s, self.bound(steps[1:, 1:3] - ahead[1:])[0], time_s)
-        return FastestLap(lap_time_s=time_s, bound_s=bound_s, start_ndist=self.start_ndist, steps=steps)
+        return FastestLap(lap_time_s=time_s, bound_s=bound_s, steps=steps)
 
     @cached_property
     def _ability(self) -> Ability:
@@ -162,9 +157,7 @@ class Question:
             driven: chassis origins of a lap (n, 2), from whose line the search for the least time begins as well.
         """
         car = self.experiment.car
-        least_s, line = fastest_line(
-            self.track, car.reach_m, self._ability, self.start_ndist, car.front_point_m, driven
-        )
+        least_s, line = fastest_line(self.track, car.reach_m, self._ability, 0.0, car.front_point_m, driven)
         # A lap ends with a control step.
         return lap_time_s(math.ceil(least_s * car.control_hz - 1e-9), car), line
 
@@ -184,7 +177,7 @@ class Question:
         course = Course(name=track.name, weight=1.0, tracks=(track,))
         actions = ContinuousActions(self.low, self.high)
         race = Race(replace(build_setup(plain, (course,), NO_REWARD), actions=actions), 1)
-        race.reset(None, None, np.array([self.start_ndist]))
+        race.reset(None, None, np.zeros(1))
         wanted = np.column_stack([np.degrees(commands[:, 1]), commands[:, 0]])
         # The car stands while the prepare step is taken, and at the last step its command no longer counts.
         wanted = np.concatenate([wanted[:1], wanted, wanted[-1:]])
@@ -229,7 +222,6 @@ def kept_lap(question: Question) -> FastestLap | None:
         return FastestLap(
             lap_time_s=float(content["lap_time_s"]),
             bound_s=float(content["bound_s"]),
-            start_ndist=float(content["start_ndist"]),
             steps=_table(content["steps"]),
         )
     except (BadInput, KeyError, TypeError, ValueError):
@@ -258,7 +250,6 @@ def _keep(question: Question, lap: FastestLap) -> None:
         "car": question.experiment.car.name,
         "lap_time_s": lap.lap_time_s,
         "bound_s": lap.bound_s,
-        "start_ndist": lap.start_ndist,
         "columns": COLUMNS,
         "steps": lap.steps.tolist(),
     }

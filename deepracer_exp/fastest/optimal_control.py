@@ -255,11 +255,7 @@ def improve(  # type: ignore[no-untyped-def]
     steps,
     dt_s,
 ):
-    """Improve commands in place.
-
-    Returns:
-        The damping with which to go on, and the cost; the damping is infinite where nothing improves them any more.
-    """
+    """Improve commands in place and return the damping with which to resume."""
     periods, size = len(commands), states.shape[1]
     by_state, by_command = np.empty((periods, size, size)), np.empty((periods, size, 2))
     step, gain = np.empty((periods, 2)), np.empty((periods, 2, size))
@@ -306,6 +302,4 @@ def improve(  # type: ignore[no-untyped-def]
             damping = max(damping * (0.5 if share == 1.0 else 1.0), 1e-6)
         else:
             damping *= 4.0
-            if damping > 1e6:
-                return np.inf, cost
-    return damping, cost
+    return damping

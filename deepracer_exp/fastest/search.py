@@ -58,9 +58,9 @@ class Problem(NamedTuple):
 
 
 class Search:
-    """Searches for the fastest lap of one car on one track, from standstill at one place."""
+    """Searches for the fastest lap of one car on one track, from standstill at the start line."""
 
-    def __init__(self, car: CarConfig, track: Track, low: Floats, high: Floats, start_ndist: float) -> None:
+    def __init__(self, car: CarConfig, track: Track, low: Floats, high: Floats) -> None:
         """Put the car at its start.
 
         Args:
@@ -68,13 +68,11 @@ class Search:
             track: with its floor.
             low: lowest [speed_mps, steering_rad] that is commanded, within the limits of the car, (2,).
             high: highest, likewise.
-            start_ndist: where the lap begins, as a share of the lap.
         """
         self._car, self._track, self._limits = car, track, np.array([low, high])
         self._cars, self._drive = one_car(car, track.floor.friction), drive_record()
         self._dt_s = car.control_period_s / car.substeps
-        self._begin_m = start_ndist * track.length_m
-        pose = track.start_pose(np.array([start_ndist]))
+        pose = track.start_pose(np.zeros(1))
         self._start = standing(car, pose.x[0], pose.y[0], pose.yaw_rad[0])
 
     def run(self, lines: Sequence[Floats], on_round: OnRound) -> Floats:
@@ -113,7 +111,7 @@ class Search:
         if commands is None:
             return None
         return self._improved(
-            self._start, commands, self._begin_m, self._track.length_m, _LAP,
+            self._start, commands, 0.0, self._track.length_m, _LAP,
             lambda share: progressed(_FIRST_SHARE + (1.0 - _FIRST_SHARE) * share),
         )  # fmt: skip
 
@@ -130,7 +128,7 @@ class Search:
             plan = np.concatenate(
                 [plan, self._along(line, self._states(state, plan)[-1], _WINDOW - len(plan))]
             )
-            begin_m = self._begin_m + driven_m_
+            begin_m = driven_m_
             planned = self._improved(state, plan, begin_m, length_m - driven_m_, _AHEAD)
             plan = planned.commands
             if planned.complete:
@@ -203,7 +201,7 @@ class Search:
         pull, damping, firm = np.zeros(len(states)), 1.0, effort.soft
         best, since = _Plan(commands, False, False, 0.0), 0
         for number in range(effort.rounds):
-            damping, _ = improve(
+            damping = improve(
                 self._cars, self._drive, problem, states, commands, self._limits, pull, firm,
                 _CALM * _FADE**number, min(damping, _MOST_DAMPING), _STEPS, self._car.substeps, self._dt_s,
             )  # fmt: skip

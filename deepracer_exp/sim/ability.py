@@ -58,6 +58,8 @@ def ability_of(car: CarConfig, low: Floats, high: Floats, floor_friction: float 
         straight.drive(high[0] if step < steps / 2 else low[0], 0.0)
         line.append(float(straight.read().speed_mps[0]))
     change = np.diff(line) * car.control_hz
+    # A car that turns meanwhile loses speed faster.
+    braking = max(-change.min(), -np.diff(speed, axis=0).min() * car.control_hz)
     edges = np.linspace(0.0, _TIGHTEST_PER_M, _BINS + 1)
     fastest = np.zeros(_BINS + 1)
     fastest[0] = max(speed.max(), max(line))
@@ -69,7 +71,7 @@ def ability_of(car: CarConfig, low: Floats, high: Floats, floor_friction: float 
     speeds = np.maximum.accumulate(fastest[::-1])
     # Bends tighter than any that was driven.
     speeds[speeds == 0.0] = speeds[speeds > 0.0].min()
-    return Ability(edges[::-1].copy(), speeds, float(change.max()), float(-change.min()))
+    return Ability(edges[::-1].copy(), speeds, float(change.max()), float(braking))
 
 
 def _bends(x_m: Floats, y_m: Floats, period_s: float) -> tuple[Floats, Floats]:

@@ -45,7 +45,7 @@ def test_the_option_and_the_file_of_a_run_are_the_same_actions(run_dir, call, tm
     assert "train action_space=mine" in ended.stdout
     assert re.search(r"\d of \d complete laps? without a reset on Straight_track", ended.stdout)
     # The run has a list of five actions, all at 0.6 m/s.
-    assert "5 of 8: the laps have no more different commands" in ended.stdout
+    assert "5 of 8: the other commands of the laps are the same once rounded" in ended.stdout
 
 
 def test_the_table_has_the_actions_of_the_file(logs, call, tmp_path):
@@ -66,7 +66,7 @@ def test_the_fastest_lap_of_a_track_has_actions(call, tmp_path, monkeypatch):
     steps = np.zeros((91, len(COLUMNS)))
     steps[1:, COLUMNS.index("steering_deg")] = np.repeat([4.0, 12.0, 20.0], 30)
     steps[1:, COLUMNS.index("commanded_mps")] = np.repeat([4.0, 3.0, 2.0], 30)
-    lap = FastestLap(lap_time_s=6.0, bound_s=5.9, start_ndist=0.0, steps=steps)
+    lap = FastestLap(lap_time_s=6.0, bound_s=5.9, steps=steps)
     _keep(Question.of(experiment, course), lap)
     ended = call("actions", "Oval_track", "--name", "mine", "car=deepracer_v5")
     assert ended.code == 0, ended.stderr

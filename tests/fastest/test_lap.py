@@ -21,8 +21,8 @@ def ring(radius_m=1.2, width_m=0.7):
     return Track.from_route(np.concatenate([unit * radius for radius in radii], axis=1), "ring")
 
 
-def question(*overrides, track=None, start=0.0):
-    return Question.of(compose_experiment([*FAST, *overrides])[0], track or ring(), start)
+def question(*overrides, track=None):
+    return Question.of(compose_experiment([*FAST, *overrides])[0], track or ring())
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +67,7 @@ def test_a_lap_is_searched_once(lap, cache, monkeypatch):
     assert (again.steps == lap.steps).all()
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{}", '{"lap_time_s": 1, "bound_s": 1, "start_ndist": 0, "steps": [[1]]}', "[1]"]
-)
+@pytest.mark.parametrize("text", ["", "{}", '{"lap_time_s": 1, "bound_s": 1, "steps": [[1]]}', "[1]"])
 def test_a_corrupt_file_counts_as_none(lap, cache, text):
     (file,) = cache.rglob(f"{question().key}.json")
     content = file.read_text()
@@ -81,14 +79,13 @@ def test_a_corrupt_file_counts_as_none(lap, cache, text):
     assert json.loads(content)["columns"] == list(fastest.COLUMNS)
 
 
-def test_the_lap_depends_on_track_car_limits_and_start():
+def test_the_lap_depends_on_track_car_and_limits():
     others = (
         question("car=deepracer_v5"),
         question("action_space.speed.high=3"),
         question(track=ring(1.3)),
-        question(start=0.5),
     )
-    assert len({question().key, *(other.key for other in others)}) == 5
+    assert len({question().key, *(other.key for other in others)}) == 4
 
 
 def test_a_list_of_actions_counts_with_the_box_of_its_limits():
