@@ -33,21 +33,29 @@ class Loss:
 
 
 def question_of(view: LogView, folder: Path) -> Question | None:
-    """Return what the fastest lap of a run's car on the view's course depends on; None where it cannot be told."""
+    """Return what the fastest lap of a run's car on the view's course depends on; None where that is not known.
+
+    Raises:
+        BadInput: the action space leaves the car nothing to choose.
+    """
     try:
         experiment = StoredRun(folder).experiment
         tracks = experiment.tracks
         config = tracks.get(view.track_name) or (next(iter(tracks.values())) if len(tracks) == 1 else None)
         if config is None or view.course is None:
             return None
-        return Question.of(experiment, Track.from_config(config, view.course.reversed))
+        track = Track.from_config(config, view.course.reversed)
     except BadInput:  # the page lists which files of the run could not be read
         return None
+    return Question.of(experiment, track)
 
 
 def loss(view: LogView, folder: Path) -> Loss | None:
     """Compare the run's fastest exploring lap from the start line; None without one, or without a fastest lap."""
-    question = question_of(view, folder)
+    try:
+        question = question_of(view, folder)
+    except BadInput:
+        return None
     fastest = None if question is None else kept_lap(question)
     lap = None if fastest is None else _lap_from_the_line(view, fastest)
     if question is None or fastest is None or lap is None:
@@ -104,10 +112,12 @@ def _in_sectors(lap: pd.DataFrame, sectors: list[Sector], track: Track) -> pd.Da
     # The last step is at the line or just beyond it.
     along = np.maximum.accumulate(along)
     bounds = np.array([0.0, *(sector.end for sector in sectors)])
-    bounds[0], bounds[-1] = min(along[0], bounds[1]), max(along[-1], bounds[-2])
+    bounds[-1] = max(along[-1], bounds[-2])
 
     def spent(values: Values) -> Values:
-        return np.diff(np.interp(bounds, along, values))
+        reached = np.interp(bounds, along, values)
+        reached[0] = values[0]  # the car stands in one place for some steps
+        return np.diff(reached)
 
     return pd.DataFrame(
         {
@@ -125,7 +135,10 @@ def _way_m(points: Values) -> Values:
 
 def loss_in_words(view: LogView, folder: Path) -> str:
     """Return what a run's lap loses to the fastest lap of its car, or how that is found out."""
-    question = question_of(view, folder)
+    try:
+        question = question_of(view, folder)
+    except BadInput as error:
+        return f"none: {error}"
     if question is None or kept_lap(question) is None:
         return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
     found = loss(view, folder)

@@ -45,5 +45,14 @@ def test_causes_and_sectors_add_up_to_the_whole_loss():
     assert table.to_numpy().sum() == pytest.approx(whole, abs=1e-9)
 
 
+def test_time_that_the_car_stands_at_its_start_counts():
+    faster = lap()
+    waits = pd.concat([faster.iloc[[0] * 5], faster], ignore_index=True)
+    waits["time_s"] = np.arange(len(waits)) / 15
+    table = lost(waits, faster)
+    assert table.sum().to_dict() == pytest.approx({"line": 0.0, "speed": 5 / 15, "steering": 0.0}, abs=1e-9)
+    assert table.iloc[0].sum() == pytest.approx(5 / 15, abs=1e-9)
+
+
 def test_a_lap_loses_nothing_to_itself():
     assert np.abs(lost(lap(), lap()).to_numpy()).max() < 1e-12
