@@ -17,6 +17,7 @@ from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.stopping import (
     ConvergedRule,
     EntropyStopping,
+    LapsSlowerRule,
     OverfittingRule,
     PlateauStopping,
     ReliableStopping,
@@ -204,7 +205,7 @@ class TrendRule(StoppingRule):
             ("collapsed", config.collapsed, ("entropy", "completion"), trends.collapsed),
             ("not_learning", config.not_learning, ("entropy", "completion"), trends.not_learning),
             ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), trends.overfits),
-            ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), trends.laps_slower),
+            ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), self._laps_slower),
             ("converged", config.converged, _ALWAYS, self._converged),
         )
         for name, rule, columns, judge in rules:
@@ -215,6 +216,16 @@ class TrendRule(StoppingRule):
             if all(one.known(rule.patience) for one in averages) and (found := judge(rule, *averages)):
                 return _decision(name, *found, rule)
         return None
+
+    def _laps_slower(self, rule: LapsSlowerRule, speed: Average, returns: Average) -> Found | None:
+        scores_s = self._race_scores_s
+        # A policy that gives up some speed for laps on held-out conditions may still become the best one.
+        improves = min(scores_s[-rule.patience :]) < min(scores_s[: -rule.patience], default=math.inf)
+        return (
+            None
+            if improves or not speed.is_fresh(rule.patience)
+            else trends.laps_slower(rule, speed, returns)
+        )
 
     def _converged(self, rule: ConvergedRule, *averages: Average) -> Found | None:
         completion, returns, laps, entropy = averages

@@ -14,13 +14,15 @@ class Average:
     def __init__(self, window: int):
         self._window = window
         self._known: list[float] = []
+        self._has_value: list[bool] = []
         self._averages: list[float | None] = []
         self.first = math.nan
         self.best, self._worst = -math.inf, math.inf
 
     def add(self, value: float | None) -> None:
         """Add the value of the newest row, None or NaN where it has none."""
-        if value is not None and math.isfinite(value):
+        self._has_value.append(value is not None and math.isfinite(value))
+        if value is not None and self._has_value[-1]:
             self._known = [*self._known, value][-self._window :]
         average = sum(self._known) / self._window if len(self._known) == self._window else None
         if average is not None:
@@ -32,6 +34,10 @@ class Average:
     def known(self, patience: int) -> bool:
         """Return whether there is an average before the last `patience` rows."""
         return len(self._averages) > patience and self._averages[-patience - 1] is not None
+
+    def is_fresh(self, rows: int) -> bool:
+        """Return whether the newest average is one of values of the last rows alone."""
+        return sum(self._has_value[-rows:]) >= self._window
 
     @property
     def now(self) -> float:

@@ -149,6 +149,11 @@ def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
         "held-out completion rises": falling(held_out=learned(LONG)),
         "held-out completion holds": falling(held_out=80.0),
         "held-out completion wobbles": falling(held_out=lambda i: 80.0 + 4 * (-1) ** (i // 5)),
+        "laps rise, but the race score improves": slowing(race_score_s=lambda i: 8 - 0.005 * i),
+        "laps rise, and then none is reliable": slowing(
+            lap_time_s=lambda i: 6.0 if i <= 100 else 6.5,
+            evaluated_lap_share=lambda i: 1.0 if i <= 110 else 0.9,
+        ),
         "laps hold": slowing(lap_time_s=lambda i: max(6.0, 8 - 2 * i / 60)),
         "laps become faster": slowing(lap_time_s=lambda i: 8 - 2 * i / LONG),
         "laps are slower by little": slowing(lap_time_s=lambda i: 6.0 if i <= 60 else 6.1),
