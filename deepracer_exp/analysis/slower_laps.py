@@ -33,11 +33,13 @@ class SlowerLaps:
     since: int
     """The iteration around which they were fastest."""
     fastest_s: float
-    """Mean of three lap times in a row around that iteration; likewise the next ones."""
+    """Mean of the three lap times in a row around that iteration, s."""
     now_s: float
-    """At the end."""
+    """Mean of the last three lap times, s."""
     return_then: float
+    """Mean return in the iterations of `fastest_s`."""
     return_now: float
+    """Mean return in the iterations of `now_s`."""
     return_rose: bool
 
     def __str__(self) -> str:
@@ -62,13 +64,13 @@ def slower_laps(iterations: pd.DataFrame) -> SlowerLaps | None:
     rose if the same test says so of the returns of the same iterations.
 
     Args:
-        iterations: a row each, with `iteration`, `reward_mean`, `eval_completion` and the columns SERIES; the first of
-            them with `LEAST_TIMES` lap times counts. Evaluations with less than `RELIABLE` of the way driven do not.
+        iterations: a row each, with `iteration`, `reward_mean`, `eval_lap_share` and the columns SERIES; the first of
+            them with `LEAST_TIMES` lap times counts. Evaluations with fewer complete laps than `RELIABLE` do not.
     """
     for column, name in SERIES.items():
         known = iterations[column].notna()
         if column.startswith("eval_"):  # the few laps that an unreliable policy completes may be fast ones
-            known &= iterations["eval_completion"] >= 100 * RELIABLE
+            known &= iterations["eval_lap_share"] >= RELIABLE
         if known.sum() >= LEAST_TIMES:
             # The return of an evaluated policy is that of the iterations since the evaluation before.
             block = known.cumsum() - known

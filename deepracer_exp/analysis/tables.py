@@ -87,6 +87,7 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "checkpoint": "the service's name of the checkpoint that drove it; empty where the log does not name it",
     "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
+    "eval_lap_share": "complete laps of the evaluation on usual conditions, as a share of those tried",
     "eval_lap_time_s": "s, mean of the complete laps of the evaluation on usual conditions; NaN on several tracks",
     "eval_zigzag_per_m": "changes of steering a metre of straight in the evaluation",
 }
@@ -433,13 +434,13 @@ def _evaluated(recording: Recording) -> pd.DataFrame:
         own = recording.evaluations.groupby("iteration").last()
         if recording.track is None:  # a mean over whichever tracks have a lap
             own["lap_time_s"] = np.nan
-        names = ("completion", "lap_time_s", "zigzag_per_m")
+        names = ("completion", "lap_share", "lap_time_s", "zigzag_per_m")
         return own.rename(columns={name: f"eval_{name}" for name in names})
     rows = _evaluation_rows(recording)
     groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
     means = groups["completion"].mean().to_frame("eval_completion")
-    lap_time_s = groups["time_s"].mean()
-    return means.assign(held_out_completion=np.nan, eval_lap_time_s=lap_time_s, eval_zigzag_per_m=np.nan)
+    laps = {"eval_lap_share": groups["lap"].mean(), "eval_lap_time_s": groups["time_s"].mean()}
+    return means.assign(held_out_completion=np.nan, **laps, eval_zigzag_per_m=np.nan)
 
 
 def _evaluation_rows(recording: Recording) -> pd.DataFrame:

@@ -12,7 +12,9 @@ ZIGZAG_DEG = 5.0
 """Angle to either side below which nobody would see it."""
 LEAST_M = 10.0
 """Metres of straight without which the figures say little."""
-CURE = "an action space with smaller angles, or `algorithm.smoothness=0.02` (docs/smoothness.md)"
+CURE = (
+    "an action space with smaller angles; algorithm.smoothness=0.02 helps some trainings (docs/smoothness.md)"
+)
 
 Figures = tuple[float, float, float]
 """`changes_per_m`, `amplitude_deg` (NaN without a change) and `lost_s` of a `ZigZag`."""

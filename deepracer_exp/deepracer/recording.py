@@ -78,6 +78,7 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
         "float64",
         "the same on conditions held out of the training; NaN where not evaluated",
     ),
+    "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
     "lap_time_s": ("float64", "s, mean of the complete laps; NaN without one"),
     "zigzag_per_m": ("float64", "changes of steering a metre of straight; NaN where not measured"),
     "zigzag_deg": ("float64", "degrees to either side in these changes; NaN without one"),

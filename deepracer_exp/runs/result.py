@@ -17,16 +17,16 @@ BUDGET_REACHED = "budget reached: "
 IN_TRAINING = "training"
 RELIABLE = 0.95
 """Share of complete laps on usual conditions from which on a policy counts as reliable."""
+BOTH = "race score (usual and held-out)"
+"""Name of the race score of an evaluation under both conditions."""
 CRITERIA = {
-    "race_score": "race score (usual and held-out)",
+    "race_score": BOTH,
     "reliable_lap": "reliable lap (usual)",
     "lap_time": "mean lap (usual and held-out)",
     "progress": "completion (usual and held-out)",
     IN_TRAINING: "exploring laps",
 }
 """What a measure is called; the best of several policies or runs is the one with the highest rank by it."""
-BOTH = "race score (usual and held-out)"
-"""Name of the race score of an evaluation under both conditions."""
 FIGURES: tuple[tuple[str, str, str, int], ...] = (
     ("mean usual lap, s", "lap_time_s", "{:.2f}", -1),
     ("usual laps complete, %", "laps_percent", "{:.0f}", 1),
@@ -106,8 +106,9 @@ class ReliableLap:
     lap_time_s: float
     """Mean of its complete laps on the usual conditions, with several tracks of all of them."""
     laps: int | None
-    """Complete ones; None in runs of older versions, which have their share only; likewise the next one."""
+    """Complete laps on the usual conditions; None in runs of older versions, which have their share only."""
     laps_tried: int | None
+    """Laps tried there; None where `laps` is."""
 
     def __str__(self) -> str:
         """Return it in words: ``checkpoint 40, 6.72 s, 8 of 8``."""

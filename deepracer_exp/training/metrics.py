@@ -316,14 +316,13 @@ def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
     """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`."""
     usual = evaluation.on(USUAL)
     held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
-    figures = (
-        usual.completion,
-        None if held_out is None else held_out.completion,
-        usual.lap_share,
-        len(usual.lap_times_s),
-        len(usual.decided),
-        usual.mean_lap_time_s,
-        evaluation.race_score_s,
-        *zigzag_columns(usual).values(),
-    )
-    return dict(zip(EVAL_COLUMNS, figures, strict=True))
+    return {
+        "eval_completion": usual.completion,
+        "held_out_completion": None if held_out is None else held_out.completion,
+        "eval_lap_share": usual.lap_share,
+        "eval_laps": len(usual.lap_times_s),
+        "eval_laps_tried": len(usual.decided),
+        "eval_lap_time_s": usual.mean_lap_time_s,
+        "eval_race_score_s": evaluation.race_score_s,
+        **zigzag_columns(usual),
+    }

@@ -29,7 +29,7 @@ def table(
     iterations = iterations.assign(reward_mean=np.repeat(np.asarray(returns, float), every))
     iterations[list(SERIES)] = np.nan
     iterations.loc[every - 1 :: every, column] = laps_s
-    iterations["eval_completion"] = 100.0
+    iterations["eval_lap_share"] = 1.0
     return iterations
 
 
@@ -82,9 +82,9 @@ def test_evaluated_laps_decide_whatever_the_exploring_laps_did() -> None:
 
 def test_fast_laps_of_policies_that_often_fail_do_not_count() -> None:
     laps = table([5.0, 5.1, 5.05, *[6.0] * 12], np.linspace(200, 280, 15))
-    assert slower_laps(laps.assign(eval_completion=np.where(laps["iteration"] <= 35, 60.0, 100.0))) is None
+    assert slower_laps(laps.assign(eval_lap_share=np.where(laps["iteration"] <= 35, 0.875, 1.0))) is None
     ramp = table(SLOWED_S, RETURNS)
-    assert slower_laps(ramp.assign(eval_completion=94.0)) is None
+    assert slower_laps(ramp.assign(eval_lap_share=0.94)) is None
 
 
 def scatter(rng: np.random.Generator, count: int, memory: float) -> np.ndarray:
@@ -154,7 +154,8 @@ def test_a_log_with_evaluations_is_judged_by_them() -> None:
 def own(times_s: list[float], **more: object) -> LogView:
     """Prepare a run of ours with evaluations."""
     rows = pd.DataFrame({"iteration": range(len(times_s)), "lap_time_s": times_s})
-    rows = rows.assign(completion=100.0, held_out_completion=90.0).reindex(columns=list(EVALUATION_COLUMNS))
+    rows = rows.assign(completion=100.0, lap_share=1.0, held_out_completion=90.0)
+    rows = rows.reindex(columns=list(EVALUATION_COLUMNS))
     best = RunResult(
         measure="race_score", rank=(1.0, -6.0), iteration=0, completion=100.0, lap_time_s=times_s[0]
     )
