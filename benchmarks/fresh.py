@@ -12,8 +12,8 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import resolve
 
 TRIALS = 64
 _SEED = 20_181_128

@@ -18,10 +18,10 @@ from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.own_recording import read_own_recording
-from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.run import resume as resume_run
 from deepracer_exp.training.run import run_training
 from deepracer_exp.training.trainer import Callback, TrainResult

@@ -9,8 +9,8 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.files import is_run
-from deepracer_exp.runs.resolve import BestOfSweep, write_best_of_sweep
 
 from .objectives import cost, objectives_of, shown_values
 

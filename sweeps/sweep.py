@@ -29,9 +29,9 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status

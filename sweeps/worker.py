@@ -19,6 +19,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import (
@@ -32,7 +33,6 @@ from deepracer_exp.runs.files import (
 )
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
-from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics

@@ -10,9 +10,9 @@ from deepracer_exp.deepracer.model_metadata import read_model_metadata
 from deepracer_exp.deepracer.routes import read_knots, read_route
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_yaml
+from deepracer_exp.lookup.best import read_best_of_sweep
 from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.runs.files import read_config, read_metrics
-from deepracer_exp.runs.resolve import read_best_of_sweep
 from tests.hostile_files import KINDS, PLACES, make
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.fastest.lap import FastestLap, Question, kept_lap
-from deepracer_exp.runs.resolve import StoredRun
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.tracks.track import Track
 
 from .log_view import LogView

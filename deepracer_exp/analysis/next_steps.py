@@ -8,6 +8,7 @@ from typing import Any
 
 from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.best import best_of
 from deepracer_exp.runs.files import (
     BEST,
     METRICS,
@@ -18,7 +19,6 @@ from deepracer_exp.runs.files import (
     sees_pictures,
 )
 from deepracer_exp.runs.folder import is_held
-from deepracer_exp.runs.resolve import best_of
 from deepracer_exp.runs.result import (
     BUDGET_REACHED,
     FAILED,

@@ -16,7 +16,7 @@ from .startup import check_policy
 
 if TYPE_CHECKING:
     from deepracer_exp.config.evaluation import EvaluateConfig
-    from deepracer_exp.runs.resolve import StoredRun
+    from deepracer_exp.lookup.resolve import StoredRun
 
 _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
@@ -198,7 +198,7 @@ def _watch(args: argparse.Namespace) -> int:
     from deepracer_exp.config.own_class import OF_POLICY
     from deepracer_exp.config.parse import import_own_classes
     from deepracer_exp.evaluation.live_server import LiveServer
-    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.lookup.resolve import resolve
 
     # Its first checkpoint may be still to come.
     stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
@@ -330,8 +330,8 @@ _STOPPING_EPILOG = """\
 
 def _replay(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_experiment, expand_grid
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.files import read_record
-    from deepracer_exp.runs.resolve import resolve
 
     runs, given = runs_and_overrides(args)
     stores, overrides = split_stores(given)

@@ -154,7 +154,7 @@ _EXPORT_EPILOG = """\
 def _export(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_export
     from deepracer_exp.config.overrides import override_line
-    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.lookup.resolve import resolve
 
     run, overrides = run_and_overrides(args)
     config, _ = compose_export([*overrides, override_line("run", run)])

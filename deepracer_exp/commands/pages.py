@@ -73,7 +73,7 @@ def run_or_logs(what: str, stores: Stores) -> Path:
     path = existing_logs(what)
     if path is not None:
         return path
-    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.lookup.resolve import resolve
 
     try:
         return resolve(what, stores.runs_dir, stores.uri).path

@@ -142,8 +142,8 @@ def _lineage(args: argparse.Namespace) -> int:
     from rich.table import Table
     from rich.tree import Tree
 
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.lineage import best_by_generation, best_members, family
-    from deepracer_exp.runs.resolve import resolve
 
     name, overrides = run_and_overrides(args)
     stores = read_stores(overrides)
@@ -212,9 +212,9 @@ def _promote(args: argparse.Namespace) -> int:
     from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.checkpoint_files import find_checkpoint
     from deepracer_exp.runs.files import read_config
-    from deepracer_exp.runs.resolve import resolve
     from deepracer_exp.tracking.registry import check_alias, check_model, promote
 
     name, overrides = run_and_overrides(args)

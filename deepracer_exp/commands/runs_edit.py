@@ -68,7 +68,7 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 
 def _send(args: argparse.Namespace) -> int:
-    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.tracking.delivery import deliver, is_delivered, undelivered
     from deepracer_exp.tracking.store import resolve_store
     from deepracer_exp.tracking.tracking_file import read_tracked_run
@@ -146,8 +146,8 @@ class _Target:
 
 
 def _target(name: str, stores: Stores) -> _Target:
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.files import read_run_id
-    from deepracer_exp.runs.resolve import resolve
     from deepracer_exp.tracking.store import is_run_id
 
     try:
@@ -204,9 +204,9 @@ def _tag(args: argparse.Namespace) -> int:
 def _delete(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.clean import deletable, remove, total
     from deepracer_exp.runs.files import read_run_id
-    from deepracer_exp.runs.resolve import resolve
     from deepracer_exp.tracking.delivery import marked_deleted
 
     runs, overrides = runs_and_overrides(args)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from deepracer_exp.config.evaluation import EvaluationConfig
     from deepracer_exp.config.experiment import Experiment
     from deepracer_exp.config.sweep import SweepRequest
-    from deepracer_exp.runs.resolve import StoredRun
+    from deepracer_exp.lookup.resolve import StoredRun
 
 
 def check_files(experiment: "Experiment") -> list[str]:
@@ -85,8 +85,8 @@ def check_run(run: str, runs_dir: str, tracking_uri: str | None, checkpoint: str
     Raises:
         BadInput: there is no such run or checkpoint, or its configuration is not one of this version.
     """
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.checkpoint_files import find_checkpoint
-    from deepracer_exp.runs.resolve import resolve
 
     stored = resolve(run, Path(runs_dir), tracking_uri)
     stored.experiment  # noqa: B018 - refuses what another version wrote

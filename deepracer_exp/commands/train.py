@@ -174,7 +174,7 @@ function that keeps something between calls starts without it.
 
 def _resume(args: argparse.Namespace) -> int:
     from deepracer_exp.config.parse import import_own_classes
-    from deepracer_exp.runs.resolve import resolve
+    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.training.budget import refuse_ended
 
     name, given = run_and_overrides(args)

@@ -22,8 +22,8 @@ from deepracer_exp.deepracer.recording import STEP_COLUMNS
 from deepracer_exp.deepracer.trace import to_table
 from deepracer_exp.deepracer.worlds import find_world
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.tracks.track import Track
 
 from .evaluator import Evaluator

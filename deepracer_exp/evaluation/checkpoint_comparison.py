@@ -17,9 +17,9 @@ from deepracer_exp.analysis.comparison_page import write_comparison
 from deepracer_exp.analysis.log_tables import Table as PageTable
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.errors import BadInput, count, writing
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.checkpoints import check, read_policy
-from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.runs.result import BOTH, CRITERIA
 
 from .evaluate import fit

@@ -12,8 +12,8 @@ from deepracer_exp.analysis.proposed_actions import Commands, fast_laps, in_word
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
-from deepracer_exp.runs.resolve import StoredRun
 
 from .evaluator import Evaluator
 from .film import LapRecorder, best_attempt

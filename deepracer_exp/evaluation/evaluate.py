@@ -18,9 +18,9 @@ from deepracer_exp.deepracer.car_controls import full_scale, throttle
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
-from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 from deepracer_exp.tracks.boards import Standing, standings, what_it_sees

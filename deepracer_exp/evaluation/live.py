@@ -20,10 +20,10 @@ from deepracer_exp.analysis.next_steps import outcome, state
 from deepracer_exp.analysis.page import Glimpse, Plot, plot_of, render
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy, check, read_policy
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_head, read_metrics
 from deepracer_exp.runs.folder import is_held
-from deepracer_exp.runs.resolve import StoredRun
 
 from .evaluate import results_table, trained_on
 from .evaluator import Evaluator

@@ -21,9 +21,9 @@ from deepracer_exp.config.own_class import OF_POLICY, named_again
 from deepracer_exp.deepracer.recording import LogProblem
 from deepracer_exp.env.action_space import ActionSpace
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import read_config
-from deepracer_exp.runs.resolve import StoredRun
 
 from .evaluator import Evaluator
 from .film import Lap, drive_best_lap, png

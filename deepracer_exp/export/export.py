@@ -19,10 +19,10 @@ from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_a
 from deepracer_exp.env.observation import feature_names, observation_shape
 from deepracer_exp.errors import BadInput, RunFailed, writing
 from deepracer_exp.files import atomic_write, read_text
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
 from deepracer_exp.runs.own_recording import read_own_recording
-from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.runs.result import read_result
 from deepracer_exp.validation.aws_rules import text_findings
 

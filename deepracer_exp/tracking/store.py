@@ -222,21 +222,6 @@ def has_store(uri: str | None, runs_dir: Path) -> bool:
     return uri is not None or (runs_dir / MLFLOW_DB).is_file()
 
 
-def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
-    """Return the folder of a recorded run in a store as of `open_client`.
-
-    Raises:
-        BadInput: the store has no such run, it was deleted there, or the store does not answer.
-    """
-    with open_client(run_id, uri, runs_dir) as client:
-        run = client.get_run(run_id)
-    if run.info.lifecycle_stage != "active":
-        raise BadInput(f"{run_id}: was deleted in MLflow; restore it there")
-    if "run_dir" not in run.data.tags:
-        raise BadInput(f"{run_id}: has no tag run_dir, so it is not a run of deepracer-exp")
-    return Path(run.data.tags["run_dir"])
-
-
 def existing_store(uri: str | None, runs_dir: Path) -> Store:
     """Return a store to read from, as `resolve_store` does for one to record in.
 

@@ -12,6 +12,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.stored import with_overrides
+from deepracer_exp.lookup.resolve import StoredRun, resolve
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import (
@@ -24,7 +25,6 @@ from deepracer_exp.runs.files import (
     read_run_id,
 )
 from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
-from deepracer_exp.runs.resolve import StoredRun, resolve
 
 SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""

@@ -9,9 +9,9 @@ from tensordict.nn import TensorDictModuleBase
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.resolve import StoredRun, resolve
 from deepracer_exp.runs.checkpoints import check, read_checkpoint, read_policy
 from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, TEACHER
-from deepracer_exp.runs.resolve import StoredRun, resolve
 
 
 def find_teacher(experiment: Experiment) -> StoredRun | None:

@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from deepracer_exp.analysis.next_steps import next_steps, own_word, run_word
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.files import read_object
-from deepracer_exp.runs.resolve import resolve
 
 
 @pytest.fixture

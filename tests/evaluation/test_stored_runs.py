@@ -13,8 +13,8 @@ from rich.console import Console
 
 from deepracer_exp.evaluation.evaluate import results_table
 from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
-from deepracer_exp.runs.resolve import resolve
 from tests.conftest import refused
 
 from .test_result import attempt, group

@@ -35,8 +35,8 @@ from deepracer_exp.evaluation.live import LivePage, track_lines
 from deepracer_exp.evaluation.live_server import LiveServer
 from deepracer_exp.evaluation.sight import picture_of, saliency
 from deepracer_exp.evaluation.watch import HEIGHT, WIDTH, Frames, rays
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import read_metrics
-from deepracer_exp.runs.resolve import StoredRun
 from deepracer_exp.sim.lidar import MOUNT_X_M
 from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track

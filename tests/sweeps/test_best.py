@@ -6,8 +6,9 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.best import best_run_of_sweep, read_best_of_sweep
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.files import BEST_OF_SWEEP
-from deepracer_exp.runs.resolve import best_run_of_sweep, read_best_of_sweep, resolve
 from sweeps.best import best_line, best_run, best_trial, best_values, complete_trials, write_best
 from tests.conftest import refused
 

@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from deepracer_exp.runs.resolve import resolve
-from deepracer_exp.tracking.store import folder_of, is_run_id
+from deepracer_exp.lookup.resolve import folder_of, resolve
+from deepracer_exp.tracking.store import is_run_id
 from tests.conftest import refused
 
 

@@ -9,10 +9,10 @@ import yaml
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import RunFailed
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.resolve import resolve
 from deepracer_exp.training.trainer import Trainer
 from tests.conftest import IN_PROCESS
 
