@@ -26,8 +26,8 @@ from mlflow import MlflowClient
 from mlflow.entities import Metric
 from optuna.storages import RDBStorage
 
-from sweeps.claims import TrialClaims
-from sweeps.storage import open_storage
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.storage import open_storage
 
 from .command import command_line
 from .report import benchmark_parser, number, table, write_json

@@ -12,7 +12,7 @@ Why replaying is exact. Collection in the trial's own process is deterministic, 
 uninterrupted one bit for bit (`benchmarks.resume` kills runs to show it), so that a pruned training is the beginning of
 the complete one. What each trial reported to Optuna must equal what its complete run reports, and a trial that used its
 budget must have the same value again; otherwise the benchmark fails. A pruner knows nothing of a trial but the values
-that it reports (`sweeps.objectives`) and their steps; they are read from the rows of the complete run and reported to a
+that it reports (`objectives.py`) and their steps; they are read from the rows of the complete run and reported to a
 new study in memory, one by one, and the trial ends where the pruner says so. Which values there are to compare with
 depends on how far the other trials are: workers are modelled as equally fast, a step and a trial taking as long as in
 the sweep on average. Two things are not replayed: what the sampler would have drawn after another pruner's decisions
@@ -47,13 +47,13 @@ from optuna.pruners import NopPruner
 from optuna.trial import TrialState
 
 from deepracer_exp.config.sweep import Pruner, compose_sweep
-from sweeps.best import best_trial
-from sweeps.labels import outcome_of
-from sweeps.objectives import cost
-from sweeps.pruners import build_pruner
-from sweeps.storage import open_storage
-from sweeps.study import load_study
-from sweeps.sweep import fresh
+from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.queue.study import load_study
+from deepracer_exp.sweeps.report.best import best_trial
+from deepracer_exp.sweeps.report.labels import outcome_of
+from deepracer_exp.sweeps.search.objectives import cost
+from deepracer_exp.sweeps.search.pruners import build_pruner
+from deepracer_exp.sweeps.sweep import fresh
 
 from .command import at_once
 from .fresh import TRIALS, Driven, drive

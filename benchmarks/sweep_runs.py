@@ -28,8 +28,8 @@ from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
 from deepracer_exp.runs.result import BUDGET_REACHED
-from sweeps.labels import outcome_of
-from sweeps.objectives import intermediate_value, values_of
+from deepracer_exp.sweeps.report.labels import outcome_of
+from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
 
 from .command import command_line, read_metrics, read_summary
 from .fresh import stored_policy

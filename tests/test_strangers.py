@@ -12,8 +12,8 @@ import yaml
 
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import compose_entry, compose_experiment
-from sweeps.storage import open_storage
-from sweeps.study import load_study
+from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.queue.study import load_study
 
 TINY = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.env_steps=2048")
 EVIL = "from pathlib import Path\nPath({canary!r}).touch()\n\ndef reward_function(params):\n    return 1.0\n"

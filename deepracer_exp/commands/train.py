@@ -271,7 +271,7 @@ how
 exit code: 0 all trials are done; 2 bad input; 3 all trials failed, or the database did not answer; 130, 143 interrupted
 """
 _WORDS = ("report", "best")
-_PRELOADED = "sweeps.worker"
+_PRELOADED = "deepracer_exp.sweeps.queue.worker"
 """What a fork server imports once for all workers."""
 
 
@@ -284,8 +284,8 @@ def _sweep(args: argparse.Namespace) -> int:
     args.debug = request.entry.debug
     print_notes(check_sweep(request))
     if not request.space:  # an existing study has its own
-        from sweeps.space import SearchSpace
-        from sweeps.study import load_request
+        from deepracer_exp.sweeps.queue.study import load_request
+        from deepracer_exp.sweeps.search.space import SearchSpace
 
         _, request, study = load_request(args.overrides)
         if study is None and not args.cfg:
@@ -300,8 +300,8 @@ def _sweep(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from sweeps.best import complete_trials
-    from sweeps.sweep import REPORT, sweep
+    from deepracer_exp.sweeps.report.best import complete_trials
+    from deepracer_exp.sweeps.sweep import REPORT, sweep
 
     with warnings_on_stderr():
         study, folder, code = sweep(args.overrides, Console(stderr=True))
@@ -327,7 +327,7 @@ def _show_study(word: str, *arguments: str) -> int:
         raise BadInput(f"sweep {word}: accepted: one study, as in `deepracer-exp sweep {word} lr_entropy`")
 
     from deepracer_exp.config.experiment import safe_name
-    from sweeps import DEFAULT_FILE
+    from deepracer_exp.sweeps import DEFAULT_FILE
 
     with reading(f"sweep {word} {names[0]}"):
         safe_name(names[0])
@@ -335,23 +335,23 @@ def _show_study(word: str, *arguments: str) -> int:
     if storage is None and not (runs_dir / DEFAULT_FILE).is_file():
         raise BadInput(f"runs_dir={runs_dir}: has no {DEFAULT_FILE}; give runs_dir=DIR or sweep.storage=URL")
 
-    from sweeps.storage import open_storage
-    from sweeps.study import load_study
+    from deepracer_exp.sweeps.queue.storage import open_storage
+    from deepracer_exp.sweeps.queue.study import load_study
 
     study = load_study(names[0], open_storage(storage, runs_dir))
     if word == "best":
         _print_best(study)
         return 0
 
-    from sweeps.report import write_study_page
-    from sweeps.sweep import REPORT
+    from deepracer_exp.sweeps.report.page import write_study_page
+    from deepracer_exp.sweeps.sweep import REPORT
 
     print(write_study_page(study, runs_dir / study.study_name / REPORT))
     return 0
 
 
 def _print_best(study: object) -> None:
-    from sweeps.best import best_line, best_shown, best_trial
+    from deepracer_exp.sweeps.report.best import best_line, best_shown, best_trial
 
     number, shown = best_trial(study).number, best_shown(study)  # type: ignore[arg-type]
     print(f"\nbest: trial {number}, {shown}\n\n  {best_line(study)}")  # type: ignore[arg-type]

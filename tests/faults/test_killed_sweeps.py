@@ -16,8 +16,8 @@ import psutil
 import pytest
 
 from deepracer_exp.runs.files import read_metrics, read_object
-from sweeps.claims import TrialClaims
-from sweeps.storage import open_storage
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.storage import open_storage
 from tests.waiting import PATIENCE_S
 
 TIMES = range(int(os.environ.get("FAULT_TIMES", "1")))

@@ -13,8 +13,8 @@ import pytest
 import sqlalchemy as sa
 
 from deepracer_exp.commands.startup import start_workers_early
-from sweeps.claims import TrialClaims
-from sweeps.storage import resolve_database
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.storage import resolve_database
 from tests.waiting import PATIENCE_S
 
 from .studies import season
@@ -93,7 +93,7 @@ class Racers:
 def fork_server() -> Iterator[None]:
     """Let processes fork from one that has imported what a sweep's worker needs, as the command does."""
     before = multiprocessing.get_start_method(allow_none=True)
-    start_workers_early(True, "sweeps.worker")
+    start_workers_early(True, "deepracer_exp.sweeps.queue.worker")
     yield
     multiprocessing.set_start_method(before, force=True)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import optuna
 import sqlalchemy as sa
 
-from sweeps.claims import TrialClaims
-from sweeps.storage import open_storage, resolve_database
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.storage import open_storage, resolve_database
 
 
 def claim_all(url: str, file: Path, start: Barrier, total: int, lease_s: float) -> None:

@@ -9,7 +9,14 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import best_run_of_sweep, read_best_of_sweep
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.files import BEST_OF_SWEEP
-from sweeps.best import best_line, best_run, best_trial, best_values, complete_trials, write_best
+from deepracer_exp.sweeps.report.best import (
+    best_line,
+    best_run,
+    best_trial,
+    best_values,
+    complete_trials,
+    write_best,
+)
 from tests.conftest import refused
 
 from .studies import add, new_study, write_metrics

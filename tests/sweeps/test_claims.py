@@ -5,7 +5,7 @@ import time
 
 import sqlalchemy as sa
 
-from sweeps.claims import TrialClaims, TrialResult
+from deepracer_exp.sweeps.queue.claims import TrialClaims, TrialResult
 from tests.waiting import wait_until
 
 from .racer import claim_all

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from optuna.distributions import CategoricalDistribution
 
-from sweeps.figures import FEWEST_COMPLETE, figures, narrowed, thinned
-from sweeps.labels import OUTCOMES, outcome_of, short_keys
+from deepracer_exp.sweeps.report.figures import FEWEST_COMPLETE, figures, narrowed, thinned
+from deepracer_exp.sweeps.report.labels import OUTCOMES, outcome_of, short_keys
 
 from .studies import DISTRIBUTIONS, add, new_study
 

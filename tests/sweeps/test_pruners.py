@@ -8,7 +8,7 @@ from optuna.trial import TrialState, create_trial
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-from sweeps.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
+from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
 
 from . import studies
 

@@ -13,8 +13,8 @@ import pytest
 from benchmarks.same import different_rows
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import read_metrics, read_object
+from deepracer_exp.sweeps.queue.ray_launcher import refuse_files
 from deepracer_exp.tracking.store import Store
-from sweeps.ray_launcher import refuse_files
 from tests.waiting import PATIENCE_S
 
 from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, claims  # noqa: TID252

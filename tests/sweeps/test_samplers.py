@@ -9,7 +9,7 @@ from optuna.trial import TrialState, create_trial
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-from sweeps.samplers import build_sampler
+from deepracer_exp.sweeps.search.samplers import build_sampler
 
 from . import studies
 

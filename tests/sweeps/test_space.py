@@ -11,7 +11,7 @@ from deepracer_exp.config.options import options
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput
-from sweeps.space import SearchSpace
+from deepracer_exp.sweeps.search.space import SearchSpace
 from tests.conftest import refused
 
 GRIDS = ("action_space=discrete,grid", "action_space.speed_levels=2,3", "algorithm.lr=interval(0.001,0.01)")

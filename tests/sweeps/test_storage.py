@@ -14,9 +14,9 @@ import sqlalchemy as sa
 
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import BadInput, RunFailed
-from sweeps.claims import TrialClaims
-from sweeps.storage import open_storage, patiently, resolve_database
-from sweeps.study import load_study
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.storage import open_storage, patiently, resolve_database
+from deepracer_exp.sweeps.queue.study import load_study
 from tests.conftest import refused
 from tests.waiting import PATIENCE_S, wait_until
 

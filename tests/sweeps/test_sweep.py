@@ -14,13 +14,13 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
 from deepracer_exp.runs.files import read_object
+from deepracer_exp.sweeps.queue.driver import Driver
+from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.queue.worker import Interrupted
+from deepracer_exp.sweeps.search.space import SearchSpace
+from deepracer_exp.sweeps.sweep import _conclude, _parent, _without_rules, begin_study_run, interval_of
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.training.signals import Interruption
-from sweeps.driver import Driver
-from sweeps.space import SearchSpace
-from sweeps.storage import open_storage
-from sweeps.sweep import _conclude, _parent, _without_rules, begin_study_run, interval_of
-from sweeps.worker import Interrupted
 
 from .studies import add, new_study
 

@@ -9,8 +9,8 @@ from optuna.trial import TrialState
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_config, read_object
-from sweeps.best import best_line, best_run
-from sweeps.storage import open_storage
+from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.report.best import best_line, best_run
 from tests.training.conftest import assert_same_run, workers_start_early  # noqa: F401 - a fixture
 
 TINY = (

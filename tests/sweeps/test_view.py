@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 from rich.console import Console
 
-from sweeps.claims import Claim, TrialResult
-from sweeps.view import SweepView
+from deepracer_exp.sweeps.queue.claims import Claim, TrialResult
+from deepracer_exp.sweeps.report.view import SweepView
 
 CONFIG = SimpleNamespace(trials=4, objectives=("race_score",))
 WORKER_CONFIG = SimpleNamespace(study="spring", config=CONFIG, folder="runs/spring")

@@ -10,14 +10,14 @@ from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.sweeps.queue.claims import TrialClaims, TrialResult
+from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.queue.study import open_study
+from deepracer_exp.sweeps.queue.worker import TrialRun, Worker
+from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
+from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.training import callbacks
 from deepracer_exp.training.signals import Interruption
-from sweeps.claims import TrialClaims, TrialResult
-from sweeps.space import SearchSpace
-from sweeps.storage import open_storage
-from sweeps.study import open_study
-from sweeps.worker import TrialRun, Worker
-from sweeps.worker_config import WorkerConfig
 
 SPACE = {
     "grid": ("algorithm.lr=1e-4,3e-4,1e-3", "network=mlp_small,mlp"),

@@ -41,13 +41,8 @@ def outcome_of(trial: FrozenTrial) -> str:
     """Return how a trial ended, a key of OUTCOMES."""
     if not trial.state.is_finished():
         return "running"
-    stored = stored_outcome(trial.user_attrs)
+    stored = trial.user_attrs.get("outcome", "")
     return stored if stored in OUTCOMES else _BY_STATE[trial.state]
-
-
-def stored_outcome(attrs: Mapping[str, Any]) -> str:
-    """Return the outcome among the attributes of a trial or one of its runs, empty if there is none."""
-    return str(attrs.get("outcome") or attrs.get("fate") or "")  # the second in older studies
 
 
 def outcome_words(outcome: str) -> str:

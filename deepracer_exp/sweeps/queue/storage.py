@@ -25,11 +25,10 @@ from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_de
 
 from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
+from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.tracking.calls import one_line
 from deepracer_exp.tracking.store import check_database_file
 from deepracer_exp.tracking.store_thread import PAUSES
-
-from . import DEFAULT_FILE
 
 Result = TypeVar("Result")
 

@@ -86,7 +86,7 @@ class Claim:
     """1 for the first owner, one more for each takeover."""
     owner: str
     state: str
-    """`claimed`, `settled` (has its result) or `reported` (Optuna has it, too; `told` in older studies)."""
+    """`claimed`, `settled` (has its result) or `reported` (Optuna has it, too)."""
     result: TrialResult | None
     trial_id: int | None
     """Optuna's id of the trial."""

@@ -13,12 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from deepracer_exp.errors import count
+from deepracer_exp.sweeps.queue.claims import Claim, TrialResult
+from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
+from deepracer_exp.sweeps.search.objectives import NONE, cost, shown_values
 from deepracer_exp.training.display import sparkline
 
-from .claims import Claim, TrialResult
-from .labels import duration, outcome_words, parameter, short_keys, stored_outcome
-from .objectives import NONE, cost, shown_values
-from .worker_config import WorkerConfig
+from .labels import duration, outcome_words, parameter, short_keys
 
 _POINTS = 16
 """Characters of a sparkline."""
@@ -43,8 +43,6 @@ class SweepView:
         self._printed: set[int] = set()
         self._completions: dict[int, collections.deque[float]] = {}
         self._evaluated: dict[int, str] = {}
-        self.stage = ""
-        """What happens while no trial runs."""
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -58,8 +56,8 @@ class SweepView:
         if self._live is not None:
             self._live.stop()
 
-    def show(self, claims: Sequence[Claim]) -> None:
-        """Draw the present state of all claims."""
+    def show(self, claims: Sequence[Claim], stage: str = "") -> None:
+        """Draw the present state of all claims; `stage` says what happens while no trial runs."""
         ended = {one.index for one in claims if one.result is not None}
         if self._made_before is None:
             self._made_before, self._printed = _made(claims), set(ended)
@@ -70,7 +68,7 @@ class SweepView:
                 self._line(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
         self._printed |= ended
         if self._live is not None:
-            self._live.update(self._panel(claims), refresh=True)
+            self._live.update(self._panel(claims, stage), refresh=True)
 
     def _line(self, text: str) -> None:
         self._console.print(text, highlight=False, soft_wrap=True)
@@ -83,13 +81,13 @@ class SweepView:
         if not seen or seen[-1] != completion:
             seen.append(float(completion))
 
-    def _panel(self, claims: Sequence[Claim]) -> Panel:
+    def _panel(self, claims: Sequence[Claim], stage: str) -> Panel:
         parts: list[Any] = [self._summary(claims)]
         running = [one for one in claims if one.result is None]
         if running:
             parts += [Text(), self._running(running)]
-        if self.stage or not claims:
-            parts += [Text(), Text(self.stage or "workers start", style="dim")]
+        if stage or not claims:
+            parts += [Text(), Text(stage or "workers start", style="dim")]
         return Panel(Group(*parts), title=self._study, title_align="left", border_style="dim")
 
     def _summary(self, claims: Sequence[Claim]) -> Table:
@@ -175,7 +173,7 @@ def _values(result: TrialResult, objectives: Sequence[str]) -> str:
 
 
 def _sentence(claim: Claim, result: TrialResult, objectives: Sequence[str]) -> str:
-    outcome, steps = outcome_words(stored_outcome(result.attrs)), result.attrs.get("env_steps", 0)
+    outcome, steps = outcome_words(result.attrs["outcome"]), result.attrs.get("env_steps", 0)
     end = _values(result, objectives) if result.values else result.attrs.get("reason", "")
     values = f" with {params}" if (params := _params(claim)) else ""
     return f"trial {_number(claim)}{values} {_STATES[result.state]} ({outcome}) after {steps:,} steps: {end}"

@@ -8,10 +8,10 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.analysis.evidence import Interval, difference, estimate
 from deepracer_exp.analysis.statistics import Values
+from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, objectives_of, shown
 
 from .best import best_trial, complete_trials
 from .labels import parameter
-from .objectives import MEASURES, NONE, objectives_of, shown
 
 _MOST_ROWS = 20
 

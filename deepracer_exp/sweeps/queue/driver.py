@@ -16,7 +16,6 @@ from .claims import Claim, TrialClaims
 from .launcher import LocalLauncher, LocalWorker
 from .ray_launcher import RayLauncher, RayWorker
 from .storage import patiently
-from .view import SweepView
 from .worker_config import WorkerConfig, is_gone
 
 _LOOK_S = 0.5
@@ -27,6 +26,10 @@ _FEW = 3
 """Failed trials, without any other, after which a sweep is given up."""
 
 
+Show = Callable[[Sequence[Claim], str], None]
+"""Draws all claims; the text says what happens while no trial runs, and may be empty."""
+
+
 class Driver:
     """Runs the workers of a sweep."""
 
@@ -35,11 +38,11 @@ class Driver:
         config: WorkerConfig,
         storage: RDBStorage,
         launcher: LocalLauncher | RayLauncher,
-        view: SweepView,
+        show: Show,
         on_ended: Callable[[Sequence[Claim]], None],
     ):
-        """Start nothing yet; `on_ended` is called with all claims whenever trials have ended."""
-        self._config, self._launcher, self._view, self._on_ended = config, launcher, view, on_ended
+        """Start nothing yet; `show` draws all claims, `on_ended` is called with them whenever trials have ended."""
+        self._config, self._launcher, self._show, self._on_ended = config, launcher, show, on_ended
         self._claims = TrialClaims(storage.engine, config.study)
         self._running: list[LocalWorker | RayWorker] = []
         self._all_made = False
@@ -67,12 +70,12 @@ class Driver:
                 self._start()
             while True:
                 claims = self._look()
-                self._view.show(claims)
+                self._show(claims, "")
                 if interruption.signum is not None:
-                    self._view.stage = "ending: running trials write their checkpoints"
-                    self._view.show(claims)
+                    stage = "ending: running trials write their checkpoints"
+                    self._show(claims, stage)
                     self._end()
-                    self._view.show(self._look())
+                    self._show(self._look(), stage)
                     return interruption.exit_code
                 self._give_up_if_all_fail(claims)
                 self._replace_lost_workers()

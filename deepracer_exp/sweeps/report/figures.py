@@ -28,10 +28,10 @@ from optuna.visualization import (
 from deepracer_exp.analysis.charts.style import CATEGORIES, GRID, NARROW_WIDTH, SPINE, base_layout
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS, read_metrics
+from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, objectives_of
 
 from .best import best_trial
 from .labels import OUTCOMES, outcome_of, outcome_words, parameter, short_keys
-from .objectives import MEASURES, NONE, objectives_of
 
 FEWEST_COMPLETE = 20
 """Complete trials below which importance is chance: the best quarter would be fewer than five trials."""

@@ -13,10 +13,10 @@ from deepracer_exp.addresses import redact
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.sweeps import DEFAULT_FILE
+from deepracer_exp.sweeps.search.objectives import MEASURES
+from deepracer_exp.sweeps.search.space import SearchSpace
 
-from . import DEFAULT_FILE
-from .objectives import MEASURES
-from .space import SearchSpace
 from .storage import open_storage
 
 MAY_DIFFER = (

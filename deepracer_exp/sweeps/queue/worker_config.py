@@ -11,9 +11,8 @@ from deepracer_exp.addresses import taken_out
 from deepracer_exp.config import acting
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepConfig
+from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.tracking.store import Store
-
-from .space import SearchSpace
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.files import is_run
-
-from .objectives import cost, objectives_of, shown_values
+from deepracer_exp.sweeps.search.objectives import cost, objectives_of, shown_values
 
 
 def reranked(study: optuna.Study) -> list[Mapping[str, Any]]:

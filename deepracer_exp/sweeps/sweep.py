@@ -37,20 +37,20 @@ from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
-from .best import best_line, best_shown, best_trial, best_values, complete_trials, write_best
-from .claims import Claim, TrialClaims, fail_unclaimed_trials, report_results
-from .driver import Driver
-from .launcher import LocalLauncher
-from .objectives import cost, values_of, without_lap
-from .pruners import build_pruner
-from .ray_launcher import RayLauncher
-from .samplers import build_sampler
-from .space import SearchSpace
-from .storage import open_storage, patiently, resolve_database
-from .study import load_request, open_study
-from .view import SweepView
-from .worker import Interrupted
-from .worker_config import WorkerConfig
+from .queue.claims import Claim, TrialClaims, fail_unclaimed_trials, report_results
+from .queue.driver import Driver
+from .queue.launcher import LocalLauncher
+from .queue.ray_launcher import RayLauncher
+from .queue.storage import open_storage, patiently, resolve_database
+from .queue.study import load_request, open_study
+from .queue.worker import Interrupted
+from .queue.worker_config import WorkerConfig
+from .report.best import best_line, best_shown, best_trial, best_values, complete_trials, write_best
+from .report.view import SweepView
+from .search.objectives import cost, values_of, without_lap
+from .search.pruners import build_pruner
+from .search.samplers import build_sampler
+from .search.space import SearchSpace
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -162,7 +162,7 @@ def _run(
     with Interruption() as interruption, SweepView(worker_config, launcher.workers, console) as view:
         view.show(patiently(claims.all, patience_s))
         if not claims.is_done(worker_config.config.trials):
-            code = Driver(worker_config, storage, launcher, view, track).run(interruption)
+            code = Driver(worker_config, storage, launcher, view.show, track).run(interruption)
             if code is not None:
                 return code
         for derive in (report_results, fail_unclaimed_trials):
@@ -216,7 +216,7 @@ def _conclude(
         Interrupted: the process was asked to end during the fresh laps.
     """
     # Imported here: it takes seconds, and the workers start first.
-    from .report import write_study_page
+    from .report.page import write_study_page
 
     if complete_trials(study) and worker_config.config.rerank:
         torch.set_num_threads(1)
@@ -227,13 +227,13 @@ def _conclude(
 
         def show(trial: FrozenTrial) -> None:
             check()
-            view.stage = f"trial {trial.number} drives {worker_config.config.rerank_laps} fresh laps"
-            view.show(claims.all())
+            view.show(
+                claims.all(), f"trial {trial.number} drives {worker_config.config.rerank_laps} fresh laps"
+            )
 
         again = rerank(worker_config, study, show, check)
         study.set_user_attr("reranked_of", len(complete_trials(study)))
         study.set_user_attr("reranked", again)
-        view.stage = ""
         view.show(claims.all())
     else:
         study.set_user_attr("reranked", [])

@@ -16,11 +16,18 @@ from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write, read_bytes
 from deepracer_exp.runs.files import BEST_LAP, read_config, read_head
+from deepracer_exp.sweeps.search.objectives import (
+    MEASURES,
+    NONE,
+    objectives_of,
+    shown,
+    shown_or_dash,
+    shown_values,
+)
 
 from .best import best_line, best_run, best_shown, best_trial, complete_trials, reranked
 from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
 from .labels import OUTCOMES, duration, outcome_of, outcome_words, parameter, short_keys, steps
-from .objectives import MEASURES, NONE, objectives_of, shown, shown_or_dash, shown_values
 from .seeds import over_seeds
 
 _MOST_ROWS = 300
@@ -51,7 +58,7 @@ def study_page(study: optuna.Study) -> str:
     ]
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
     return render(
-        "sweeps",
+        "deepracer_exp.sweeps.report",
         "report.html.j2",
         plots,
         study=study.study_name,

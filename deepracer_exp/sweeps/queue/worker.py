@@ -34,6 +34,9 @@ from deepracer_exp.runs.files import (
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY
+from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
+from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
+from deepracer_exp.sweeps.search.samplers import build_sampler
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
@@ -45,10 +48,6 @@ from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
 from .claims import Claim, Lease, TrialClaims, TrialResult, report_results
-from .labels import stored_outcome
-from .objectives import intermediate_value, values_of
-from .pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
-from .samplers import build_sampler
 from .storage import patiently
 from .worker_config import WorkerConfig
 
@@ -456,7 +455,7 @@ class TrialRun(Callback):
             "attempt": self._lease.claim.attempt,
             "runs": self._runs,
             "run_dir": self._runs[0]["run_dir"],
-            "outcome": stored_outcome(last),
+            "outcome": last["outcome"],
             "reason": last["reason"],
             "env_steps": sum(run["env_steps"] for run in self._runs),
             "wall_clock_s": sum(run["wall_clock_s"] for run in self._runs),

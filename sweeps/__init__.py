@@ -1,4 +1,0 @@
-"""Sweeps: Optuna studies of experiments."""
-
-DEFAULT_FILE = "sweeps.db"
-"""The database of studies, in `runs_dir`; named here because `sweeps.storage` takes seconds to import."""
