@@ -1,20 +1,19 @@
 """What `experiment=fast_lap` drives after a few minutes, beside the fastest lap of its car and official records.
 
-    python -m benchmarks.records [--seeds 5] [--minutes 10] [--tracks A,B,...] [--anchors FILE.csv] [--runs-dir DIR]
-                                 [--json FILE] [OVERRIDE...]
+    python -m benchmarks.records [--seeds 5] [--minutes 10] [--tracks A,B,...] [--runs-dir DIR] [--json FILE]
+                                 [OVERRIDE...]
 
 For each track and seed, `deepracer-exp train experiment=fast_lap` trains for so many minutes on this machine, one
 training at a time, and its best checkpoint drives 64 fresh laps from starts all around the track, under usual
 conditions. The lap of a seed is the mean of its complete laps, from standstill, by the service's clock. Beside it
 stands the fastest lap of the car within the recipe's limits, from standstill at the start line, and its bound from
-below (`deepracer-exp tracks NAME --fastest`). With --anchors, tracks with an official board of time trials since March
-2020 are trained again with `car=deepracer_v5`, that of the board's era; columns of the file as for
-`benchmarks.lap_bounds`.
+below (`deepracer-exp tracks NAME --fastest`). Tracks with official boards of time trials since March 2020 are trained
+again with the car of their newest board.
 
 JSON has, in `tracks` and `official`, for each track `bound_s`, `fastest_s`, `fastest_over_bound`, the `laps_s` of the
 seeds (null: none complete), their `median_s` and `best_s`, `median_over_fastest`, and `completion`, the mean share of
-complete laps; official ones `record_s` as well. `--runs-dir DIR` leaves the runs in DIR and takes those that it finds
-finished there: an interrupted benchmark continues.
+complete laps; official ones `car` and `record_s` as well. `--runs-dir DIR` leaves the runs in DIR and takes those that
+it finds finished there: an interrupted benchmark continues.
 """
 
 import argparse
@@ -28,14 +27,13 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.fastest.lap import Question, fastest_lap
+from deepracer_exp.tracks.boards import boards_of
 
 from .all_tracks import TRACKS
 from .command import trained
 from .fresh import Driven, drive
-from .lap_bounds import time_trials
 from .report import benchmark_parser, median, number, percent, table, with_exit_code, write_json
 
-OFFICIAL_CAR = "deepracer_v5"
 _ALWAYS = ("experiment=fast_lap", "tracking=off", "report=false", "budget.env_steps=null")
 
 
@@ -74,12 +72,15 @@ def measure(track: str, car: Sequence[str], options: argparse.Namespace, folder:
 def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Measure all tracks, then those with an official board again with the car of its era."""
     tracks = options.tracks.split(",")
-    boards = {} if options.anchors is None else dict(time_trials(options.anchors))
     found: dict[str, Any] = {"tracks": {track: measure(track, (), options, folder) for track in tracks}}
+    newest = {track: boards_of(track)[-1] for track in tracks if boards_of(track)}
     found["official"] = {
-        track: {**measure(track, (f"car={OFFICIAL_CAR}",), options, folder), "record_s": boards[track]}
-        for track in tracks
-        if track in boards
+        track: {
+            **measure(track, (f"car={board.car}",), options, folder),
+            "car": board.car,
+            "record_s": board.record_s,
+        }
+        for track, board in newest.items()
     }
     over = [row["fastest_over_bound"] for row in found["tracks"].values()]
     found["mean_fastest_over_bound"] = round(sum(over) / len(over), 4)
@@ -120,7 +121,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--tracks", default=",".join(TRACKS), help="A,B,... (the 18 of benchmarks.all_tracks)"
     )
-    parser.add_argument("--anchors", type=Path, help="records of leaderboards as CSV")
     parser.add_argument("--runs-dir", type=Path, help="folder of the runs; left out: they are not kept")
     options = parser.parse_args(arguments)
     if options.seeds < 1 or not options.minutes > 0:
@@ -129,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found = benchmark(options, options.runs_dir or Path(temporary))
     print(show(found["tracks"]))
     if found["official"]:
-        print(f"\nwith car={OFFICIAL_CAR}, beside the official records:\n\n{show(found['official'])}")
+        print(f"\nwith the car of the newest official board, beside its record:\n\n{show(found['official'])}")
     print(f"\nfastest lap above its bound, mean: {percent(found['mean_fastest_over_bound'], 1)}")
     write_json(options.json, found)
 

@@ -66,7 +66,8 @@ class Board:
 
 
 @cache
-def _boards() -> tuple[Board, ...]:
+def boards() -> tuple[Board, ...]:
+    """Return all boards."""
     with FILE.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     return tuple(Board(**{name: _value(name, text) for name, text in row.items()}) for row in rows)
@@ -83,7 +84,7 @@ def boards_of(world: str) -> tuple[Board, ...]:
 
     A world with the ending `_ccw` is that of the race, resampled; one with `_cw` is driven the other way.
     """
-    return tuple(board for board in _boards() if board.world == world.removesuffix("_ccw"))
+    return tuple(board for board in boards() if board.world == world.removesuffix("_ccw"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from deepracer_exp.tracks import boards
 from deepracer_exp.tracks.boards import Board, boards_of, standings, what_it_sees
 
 ALL = [
-    board for world in dict.fromkeys(board.world for board in boards._boards()) for board in boards_of(world)
+    board for world in dict.fromkeys(board.world for board in boards.boards()) for board in boards_of(world)
 ]
 
 
@@ -37,7 +37,7 @@ def test_a_board_is_one_of_a_world_and_of_the_time_of_four_metres_per_second(boa
 
 
 def test_there_are_sixty_boards_and_none_of_a_track_driven_the_other_way():
-    assert len(ALL) == len(boards._boards()) == 60
+    assert len(ALL) == len(boards.boards()) == 60
     assert boards_of("reInvent2019_track_ccw") == boards_of("reInvent2019_track")
     assert boards_of("reInvent2019_track_cw") == boards_of("reinvent_base") == ()
 
