@@ -16,9 +16,9 @@ policy completes no lap is slower than any. JSON has for each track and recipe, 
   no lap; `lap_share`, complete laps of those tried, mean over seeds;
 - `worst_rise`: how far any evaluation after the first lap is above the fastest one before it, as a share; null where
   there is no lap at all, or none any more later;
-- `bound_s`: the bound of a lap of this car from standstill at the start line (`deepracer-exp tracks NAME --fastest`),
-  and how far laps are above it as a share: `over_bound` after 1.5 million steps, `over_bound_end` after all; null
-  without a lap there.
+- `bound_s`: the bound of a lap from standstill at the start line by a perfect driver of this car within the car's own
+  limits, and how far laps are above it as a share: `over_bound` after 1.5 million steps, `over_bound_end` after all;
+  null without a lap there, or where a training ends before.
 
 `--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
 continues.
@@ -103,7 +103,7 @@ def measure(runs: Sequence[Path], bound: float) -> dict[str, Any]:
         "lap_share": [round(float(share), 4) for share in shares.mean(axis=0)],
         "worst_rise": worst_rise(middle),
         "bound_s": round(bound, 3),
-        "over_bound": _json(early[-1] / bound - 1) if early else None,
+        "over_bound": _json(early[-1] / bound - 1) if steps[-1] >= EARLY_STEPS else None,
         "over_bound_end": _json(middle[-1] / bound - 1),
         "runs": {
             run.parents[2].name: [_json(value) for value in own]
