@@ -9,9 +9,7 @@ misleads: beside a road that runs close by, and on the service where a training 
 import numpy as np
 
 PROGRESS_WEIGHT = 1.0  # reward for 1 m along the centre line
-STEP_COST = (
-    0.02  # what a step at 0.3 m/s gains: driving on is worth more than giving up at any speed of a race
-)
+STEP_COST = 0.045  # what a step at 0.7 m/s gains; with less, laps at 4 m/s return much the same however long they take
 OFF_ROAD_COST = 2.0  # cost of leaving the road
 
 _last = {"progress": 0.0, "steps": 0.0}

@@ -66,8 +66,8 @@ def test_a_stored_policy_drives_the_environment(trained):
     policy = load_policy(run.folder, "last")
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         first, second = (env.rollout(5, policy, auto_reset=True)["action"] for _ in range(2))
-    assert first.shape[:2] == (3, 5)
-    assert first.dtype == second.dtype == torch.int64
+    assert first.shape == (3, 5, 2)
+    assert first.dtype == second.dtype == torch.float32
 
 
 def test_what_a_public_function_returns_is_public():

@@ -164,8 +164,8 @@ def test_tracks_finds_the_fastest_lap_and_writes_its_line(call, tmp_path, monkey
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     ended = call("tracks", "Straight_track", "--fastest", "--line", "line.csv", "-o", "lap.png")
     assert ended.code == 0, ended.stderr
-    assert "fastest lap of deepracer_v6: 2." in ended.stdout
-    assert "commands between -30 and 30 degrees, 1 and 3 m/s" in ended.stdout
+    assert "fastest lap of deepracer_v6: 1." in ended.stdout
+    assert "commands between -30 and 30 degrees, 1 and 4 m/s" in ended.stdout
     rows = (tmp_path / "line.csv").read_text().splitlines()
     assert rows[0] == "x_m,y_m,speed_mps,progress"
     assert rows[-1].endswith(",100.0")

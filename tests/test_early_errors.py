@@ -74,7 +74,7 @@ CASES = {
         "alone",
         "network=mlp",
     ): "network: cannot be changed in a clone: hidden: [64, 64] -> [128, 128]",
-    ("clone", "alone", "action_space=continuous"): "action_space: cannot be changed in a clone",
+    ("clone", "alone", "action_space=discrete"): "action_space: cannot be changed in a clone",
     ("clone", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
     ("checkpoints", "runs/a/own"): "network.target=my_network:Net: named by a stored run",
     ("checkpoints", "unknown"): "unknown: no such run",

@@ -210,7 +210,7 @@ class SaysYes(StoppingRule):
         ),
         ("algorithm.kwargs.decay=1", "algorithm: kwargs are arguments of a class of your own"),
         ("network.kwargs.width=1", "network.kwargs: no such key"),
-        ("network=my_broken:WrongSize", "(2, 16) for two observations; accepted: a tensor of shape (2, 15)"),
+        ("network=my_broken:WrongSize", "(2, 3) for two observations; accepted: a tensor of shape (2, 2)"),
         ("network=my_broken:NoForward", "network.target=my_broken:NoForward: Module [NoForward] is missing"),
         ("observation=my_broken:NoComma", "names='side_force'; accepted: a tuple of text"),
         ("observation=my_broken:OneOfTwo", "compute returns the shape (2, 1) for two cars; accepted: (2, 2)"),

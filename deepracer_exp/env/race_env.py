@@ -100,7 +100,7 @@ class RaceEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         race = self.race
-        race.step(tensordict.get("action").numpy())
+        race.step(tensordict.get("action").detach().numpy())
         if self._on_step is not None:
             self._on_step()
         terminated = torch.from_numpy(race.terminated)[:, None]

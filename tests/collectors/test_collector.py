@@ -63,7 +63,7 @@ def test_a_batch_has_cars_first_and_time_last_in_whole_steps_of_all_cars(collect
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_the_cars_of_the_workers_drive_with_the_weights_published_last(driver_of, mode):
-    driver = driver_of(FEW, f"collector={mode}", "collector.processes=2", frames=61)
+    driver = driver_of(FEW, "action_space=discrete", f"collector={mode}", "collector.processes=2", frames=61)
     collection = driver.open()
     collection.next_batch()
     chosen = 3

@@ -169,7 +169,7 @@ def test_an_unknown_key_is_looked_for_in_the_chosen_option():
         ("episode.start_offset=1", "less than 1"),
         ("reward.constants.X=abc", "valid number"),
         ("observation.lookahead_m=[1,-2]", "greater than 0"),
-        ("action_space.actions=[{steering_angle: 99, speed: 1}]", "less than or equal to 60"),
+        ("action_space.steering_angle.high=99", "less than or equal to 60"),
     ],
 )
 def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepted):

@@ -14,8 +14,9 @@ from deepracer_exp.env.setup import RaceSetup, build_setup
 
 @cache
 def make_setup(*overrides: str) -> RaceSetup:
-    """Compose and build a setup, once for all tests that ask for the same."""
-    return build_setup(compose_experiment(overrides)[0])
+    """Compose and build a setup with the list of 15 actions, unless another space is named, once for all tests."""
+    plain = () if any(line.startswith("action_space=") for line in overrides) else ("action_space=discrete",)
+    return build_setup(compose_experiment([*plain, *overrides])[0])
 
 
 def random_actions(steps: int, cars: int) -> np.ndarray:

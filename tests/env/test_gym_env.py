@@ -97,7 +97,7 @@ def test_one_batch_of_cars_equals_gymnasiums_vector_of_single_cars():
 
 @pytest.mark.parametrize("seed", [4, [4, 9, None]])
 def test_a_seed_begins_the_vector_environment_again(seed):
-    env = DeepRacerVectorEnv(3, ["randomization=aws", "episode.max_steps=20"])
+    env = DeepRacerVectorEnv(3, [SPACES[0], "randomization=aws", "episode.max_steps=20"])
     actions = np.random.default_rng(0).integers(0, env.single_action_space.n, (40, 3))
 
     def drive() -> np.ndarray:
@@ -111,12 +111,12 @@ def test_a_seed_begins_the_vector_environment_again(seed):
 
 
 def test_gymnasiums_vector_wrappers_take_it():
-    env = RecordEpisodeStatistics(DeepRacerVectorEnv(2, ["episode.max_steps=10"]))
+    env = RecordEpisodeStatistics(DeepRacerVectorEnv(2, [SPACES[0], "episode.max_steps=10"]))
     env.reset()
     for _ in range(10):
         infos = env.step(np.zeros(2, np.int64))[4]
     np.testing.assert_array_equal(infos["episode"]["l"], 10)
-    listed = DictInfoToList(DeepRacerVectorEnv(2, ["episode.max_steps=10"]))
+    listed = DictInfoToList(DeepRacerVectorEnv(2, [SPACES[0], "episode.max_steps=10"]))
     listed.reset()
     for _ in range(10):
         infos = listed.step(np.zeros(2, np.int64))[4]
@@ -159,7 +159,7 @@ def test_stable_baselines_drives_the_same_cars_and_is_told_how_episodes_ended():
 
 
 def test_stable_baselines_trains_on_a_single_car():
-    cars = DummyVecEnv([lambda: gym.make("DeepRacer-v0", overrides=["episode.max_steps=40"])])
+    cars = DummyVecEnv([lambda: gym.make("DeepRacer-v0", overrides=[SPACES[0], "episode.max_steps=40"])])
     model = PPO("MlpPolicy", cars, n_steps=64, batch_size=32, n_epochs=1, device="cpu", seed=0)
     model.learn(128)
     assert model.num_timesteps == 128
@@ -171,7 +171,7 @@ def test_stable_baselines_trains_on_a_single_car():
 
 @pytest.mark.parametrize("track", ["reinvent_base", "Straight_track"])
 def test_the_picture_shows_the_car_where_it_is(track):
-    env = gym.make("DeepRacer-v0", render_mode="rgb_array", overrides=[f"track={track}"])
+    env = gym.make("DeepRacer-v0", render_mode="rgb_array", overrides=[SPACES[0], f"track={track}"])
     env.reset(seed=0)
 
     def where():
@@ -195,7 +195,7 @@ def test_the_picture_shows_the_car_where_it_is(track):
 
 
 def test_what_gymnasium_and_stable_baselines_ask_for_pictures_gets_them():
-    env = gym.make("DeepRacer-v0", render_mode="rgb_array")
+    env = gym.make("DeepRacer-v0", render_mode="rgb_array", overrides=SPACES[:1])
     collected = RenderCollection(env)
     collected.reset()
     collected.step(0)

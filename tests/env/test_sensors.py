@@ -56,7 +56,7 @@ def test_what_a_car_sees_depends_on_its_number_and_not_on_the_batch(race_of, key
     ],
 )
 def test_gymnasium_sees_one_sensor_or_a_dictionary_of_both(sensors, shapes):
-    overrides = [f"observation={sensors}"]
+    overrides = [f"observation={sensors}", "action_space=discrete"]
     env = gymnasium.make("DeepRacer-v0", overrides=overrides)
     seen, _ = env.reset()
     assert env.observation_space.contains(seen)

@@ -104,7 +104,7 @@ def test_steps_in_place_of_episodes_leave_the_services_own_number_and_are_report
         (["action_space=grid", "action_space.steering_levels=17"], "34 actions"),
         (
             ["action_space=continuous", "action_space.speed.low=0.3"],
-            "speed from 0.3 to 3; the AWS console accepts 0.5",
+            "speed from 0.3 to 4; the AWS console accepts 0.5",
         ),
     ],
 )

@@ -30,7 +30,7 @@ ROUNDED = {
     "progress": 4,
     "track_len": 2,
 }
-LONGER = ("algorithm.frames_per_iteration=4096", "budget.env_steps=16384")
+LONGER = ("algorithm.frames_per_iteration=4096", "budget.env_steps=16384", "action_space=discrete")
 LAYOUTS = {
     "console": LogFolderType.CONSOLE_MODEL_WITH_LOGS,
     "deepracer-for-cloud": LogFolderType.DRFC_MODEL_SINGLE_WORKERS,
@@ -187,7 +187,7 @@ def test_what_is_left_out_is_reported(run, ours, exported):
 
 
 def test_a_continuous_policy_with_lidar_writes_its_commands_and_sensors(trained, export, caplog):
-    run = trained(*LONGER, "action_space=continuous", "observation=lidar")
+    run = trained(*LONGER[:-1], "observation=lidar")
     folder, _ = export(run.folder, "deepracer-for-cloud")
     theirs = loaded(folder, "deepracer-for-cloud", caplog).dataframe()
     assert set(theirs["action"]) == {-1}

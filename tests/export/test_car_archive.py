@@ -77,7 +77,7 @@ def test_an_archive_has_the_metadata_at_its_root_and_one_graph_and_is_the_same_e
     assert one.metadata["sensor"] == ["FRONT_FACING_CAMERA"]
     assert not {"lidar_config", "neural_network"} & one.metadata.keys()  # the service has no cnn_small
     read = read_model_metadata("model_metadata.json", one.files["model_metadata.json"])
-    assert np.array_equal(np.array(read.actions), one.policy.table.numpy())
+    assert np.array_equal(np.array([read.low, read.high]), one.policy.table.numpy())
 
 
 @pytest.mark.parametrize(("kind", "reach", "numbers"), [("plain", 1.0, 64), ("sectors", 0.5, 8)])

@@ -57,8 +57,8 @@ def written(path: Path, *overrides: str) -> Written:
 
 @pytest.fixture(scope="module")
 def default(tmp_path_factory: pytest.TempPathFactory) -> Written:
-    """The default policy's file."""
-    return written(tmp_path_factory.mktemp("onnx") / "sub" / "policy.onnx")
+    """The file of a policy that chooses among 15 actions."""
+    return written(tmp_path_factory.mktemp("onnx") / "sub" / "policy.onnx", "action_space=discrete")
 
 
 @pytest.fixture
@@ -111,14 +111,14 @@ def test_a_file_of_another_network_is_detected(default):
     content = default.path.read_bytes()
     same = DeployedPolicy(default.networks, default.actions)
     assert largest_difference(same, content, [OBSERVATIONS]) < TOLERANCE
-    other = DeployedPolicy(*policy(seed=1))
+    other = DeployedPolicy(*policy("action_space=discrete", seed=1))
     assert largest_difference(other, content, [OBSERVATIONS]) > 100 * TOLERANCE
 
 
 def test_a_file_that_computes_something_else_is_not_written(programmed, tmp_path, monkeypatch):
     monkeypatch.setattr(exporting, "TOLERANCE", -1.0)
     with pytest.raises(RunFailed, match="differs from the network by"):
-        written(tmp_path / "policy.onnx")
+        written(tmp_path / "policy.onnx", "action_space=discrete")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -131,4 +131,4 @@ def test_without_its_packages_the_extra_is_named(tmp_path, monkeypatch):
 def test_a_place_that_cannot_be_written_is_named(programmed, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match=r"file/policy\.onnx: cannot be written"):
-        written(tmp_path / "file" / "policy.onnx")
+        written(tmp_path / "file" / "policy.onnx", "action_space=discrete")

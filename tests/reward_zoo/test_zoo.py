@@ -276,7 +276,7 @@ def test_progress_delta_adds_up_to_the_lap_less_the_time(scalar: bool) -> None:
             columns, roads = drive("oval", np.array([5]), np.zeros(1), np.zeros(1), **given)
             total += float(reward(columns, roads, None)[0])
         driven_m = (progress[-1] - progress[0]) / 100 * roads[0].track_length
-        assert total == pytest.approx(driven_m - 0.02 * len(progress))
+        assert total == pytest.approx(driven_m - 0.045 * len(progress))
 
 
 def test_look_ahead_pays_most_for_the_arc_of_the_road() -> None:

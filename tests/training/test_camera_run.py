@@ -56,7 +56,7 @@ FAR_LIDAR = ("observation=lidar", "observation.lidar.reach_m=12")
 
 @pytest.mark.parametrize("sensors", [(), SENSORS, FAR_LIDAR], ids=["camera", "both", "lidar"])
 def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_path, sensors):
-    ended = trained(*CAMERA, *sensors)
+    ended = trained(*CAMERA, *sensors, "action_space=discrete")
     exported = call("export", str(ended.folder), "format=onnx", "-o", str(tmp_path / "policy.onnx"))
     assert exported.code == 0, exported.stderr
     env = gymnasium.make_vec("DeepRacer-v0", num_envs=6, overrides=sensors or ["observation=camera_small"])

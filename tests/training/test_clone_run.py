@@ -112,7 +112,7 @@ def test_a_rate_that_is_given_is_taken(parent, call, override, lr):
     ("overrides", "words"),
     [
         (["action_space=deepracer"], ["action_space", "->", "5 actions", "networks were made for it"]),
-        (["action_space=continuous"], ["action_space", "continuous"]),
+        (["action_space=discrete"], ["action_space", "continuous"]),
         (["network=mlp_deep"], ["network", "hidden"]),
         (["observation.lookahead_m=[1.0]"], ["observation", "features"]),
         (["experiment=tiny"], ["experiment=tiny", "give the groups"]),
@@ -136,7 +136,7 @@ def test_another_track_or_reward_is_allowed_and_warned_of(parent, call):
     assert "Oval_track-speed_on_track" in child.name
     provenance = json.loads((child / "provenance.json").read_text())
     assert provenance["names"]["track"] == "Oval_track"
-    assert provenance["names"]["action_space"] == "discrete"
+    assert provenance["names"]["action_space"] == "continuous"
     assert config(child)["algorithm"]["lr"] == pytest.approx(1.3e-4)
 
 

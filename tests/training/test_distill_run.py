@@ -51,7 +51,7 @@ def test_it_is_resumed_bit_for_bit_without_the_teachers_folder_and_cloned_withou
         (("algorithm=distill",), ("teacher", "algorithm=distill", "teacher=RUN")),
         (("teacher=school/teacher",), ("teacher", "algorithm=distill")),
         (("algorithm=distill", "teacher=nowhere"), ("nowhere", "no such run")),
-        ((*TAUGHT, "action_space=continuous"), (*TAUGHT[1:], "actions")),
+        ((*TAUGHT, "action_space=discrete"), (*TAUGHT[1:], "actions")),
         ((*TAUGHT, "observation.lookahead_m=[1]"), (*TAUGHT[1:], "features")),
     ],
 )

@@ -18,7 +18,7 @@ from deepracer_exp.validation.validate import Check, look_closer, read, try_name
 
 @pytest.fixture(scope="session")
 def experiment() -> Experiment:
-    return compose_experiment([])[0]
+    return compose_experiment(["action_space=discrete"])[0]
 
 
 @pytest.fixture(scope="session")

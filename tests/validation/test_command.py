@@ -128,7 +128,7 @@ def test_open_and_crossing_tracks_are_drawn_too(call, tmp_path, track):
 def test_a_continuous_action_space_and_a_single_action_are_fine(call):
     assert call("validate", "reward=speed_on_track", "action_space=continuous").code == 0
     one = "action_space.actions=[{steering_angle: 0, speed: 1}]"
-    assert call("validate", "reward=speed_on_track", one).code == 0
+    assert call("validate", "reward=speed_on_track", "action_space=discrete", one).code == 0
 
 
 @pytest.mark.parametrize("name", zoo_names())
