@@ -4,7 +4,7 @@
                                   [--trials 64] [--reuse DIR] [--json FILE] [OVERRIDE...]
 
 For each track and seed, `deepracer-exp train` runs the default experiment for the full budget, without a stopping
-rule. Since a seed gives the same run every time (synchronous collection), the run that `stopping=entropy` ends is the
+rule. Since a seed gives the same run every time, the run that `stopping=entropy` ends is the
 beginning of that one: the rule is applied to its metrics.jsonl. One run, the first seed on the first track, is really
 run with the rule; it must end after the same iteration with the same metrics and best, or this benchmark fails.
 

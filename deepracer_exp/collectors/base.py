@@ -17,12 +17,8 @@ from deepracer_exp.sim.batch import cores
 class Collector(ABC):
     """An endless source of batches; a context manager that leaves no process behind.
 
-    Each batch is a TensorDict of batch size [cars of all processes, T], for asynchronous collection
-    [cars of one process, T], keys as in `RaceEnv` plus the policy's.
+    Each batch is a TensorDict of batch size [cars of all processes, T], keys as in `RaceEnv` plus the policy's.
     """
-
-    time_dim: int = 1
-    """Along which batches are joined: 1, or 0 where they come from different cars."""
 
     def __enter__(self) -> Self:
         return self
@@ -48,7 +44,7 @@ class Collector(ABC):
             if not enough:
                 chunks.append(chunk.clone())
                 continue
-            whole = torch.cat([*chunks, chunk], dim=self.time_dim) if chunks else chunk
+            whole = torch.cat([*chunks, chunk], dim=1) if chunks else chunk
             return whole, time.monotonic() - began
 
     @abstractmethod
@@ -67,8 +63,7 @@ class Collector(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next batch depends on except the policy: arrays and plain values.
 
-        It is the state at the end of the last batch; call it before the next. Asynchronous workers are by then in the
-        middle of other batches and have no such state: the result is empty. Raises as `next_batch`.
+        It is the state at the end of the last batch; call it before the next. Raises as `next_batch`.
         """
 
     @abstractmethod
@@ -102,7 +97,7 @@ def states_of(state: Mapping[str, Any], workers: int) -> list[Any]:
     names = by_worker(range(workers))
     if state and state.keys() != names.keys():
         raise BadInput(
-            f"the checkpoint does not fit: it has the cars of {count(len(state), 'synchronous worker')}; "
+            f"the checkpoint does not fit: it has the cars of {count(len(state), 'worker')}; "
             f"accepted by this collector: {len(names)}"
         )
     return [state[name] for name in names if state]

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector as TorchRLCollector
-from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import MultiSyncCollector
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from deepracer_exp.config.learning import AlgorithmConfig
@@ -53,20 +53,17 @@ class LocalCollector(Collector):
         """
         policy = SamplingPolicy(policy)
         self._workers = worker_count(config)
-        self._mode = config.mode
-        self.time_dim = 0 if config.mode == "async" else 1
         self._hang_timeout_s = config.hang_timeout_s
         self._run_dir = run_dir
         self._batches = 0
         self._begun_from = state or {}
-        states = states_of(self._begun_from, 0 if config.mode == "async" else max(1, self._workers))
+        states = states_of(self._begun_from, max(1, self._workers))
         self._watchdog: Watchdog | None = None
         cars = cars_per_process(config)
-        together = config.cars if config.mode == "sync" else cars
-        steps_per_batch = -(-frames_per_batch // together)
+        steps_per_batch = -(-frames_per_batch // config.cars)
         factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir)
         options: dict[str, Any] = {
-            "frames_per_batch": steps_per_batch * together,
+            "frames_per_batch": steps_per_batch * config.cars,
             "total_frames": -1,
             "use_buffers": True,
             "trust_policy": True,
@@ -78,17 +75,14 @@ class LocalCollector(Collector):
             )
         else:
             heartbeat = run_dir / HEARTBEAT
-            self._watchdog = Watchdog(
-                heartbeat, self._workers, config.hang_timeout_s, lockstep=config.mode == "sync"
-            )
+            self._watchdog = Watchdog(heartbeat, self._workers, config.hang_timeout_s)
             envs = [
                 factory(worker=worker, threads=config.threads or 1, heartbeat=heartbeat)
                 for worker in range(self._workers)
             ]
             self._collector = self._start(envs, policy, options)
             self._watchdog.workers_started(self._collector.procs)
-            if config.mode == "sync":
-                _watch_deliveries(self._collector.queue_out, self._watchdog)
+            _watch_deliveries(self._collector.queue_out, self._watchdog)
         self._source = iter(self._collector)
         if states:
             with contextlib.ExitStack() as undo:
@@ -112,8 +106,6 @@ class LocalCollector(Collector):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the cars after the last batch."""
-        if self._mode == "async":
-            return {}
         if not self._batches:
             return dict(self._begun_from)
         if self._watchdog is None:
@@ -137,10 +129,6 @@ class LocalCollector(Collector):
             self._close_weights()
 
     def _start(self, envs: list[EnvFactory], policy: torch.nn.Module, options: dict[str, Any]) -> Any:
-        if self._mode == "sync":
-            kind, more = MultiSyncCollector, {"cat_results": "stack"}
-        else:
-            kind, more = MultiAsyncCollector, {}
         others = len(multiprocessing.active_children())
         # The scheme that TorchRL would use itself; ours can be closed even if no collector is returned.
         self._weights = SharedMemWeightSyncScheme()
@@ -148,7 +136,9 @@ class LocalCollector(Collector):
         with contextlib.ExitStack() as undo:
             undo.callback(self._give_up_starting)
             try:
-                collector = kind(envs, policy, num_threads=torch.get_num_threads(), **more, **options)
+                collector = MultiSyncCollector(
+                    envs, policy, num_threads=torch.get_num_threads(), cat_results="stack", **options
+                )
             except (RuntimeError, ValueError, OSError) as error:
                 verdicts = self._watchdog.verdict.items() if self._watchdog is not None else ()
                 hung = next((f"worker {worker} {verdict}" for worker, verdict in verdicts), None)
@@ -246,7 +236,7 @@ class LocalCollector(Collector):
             raise loss from error
         finally:
             self._watchdog.rest()
-        return batch.flatten(0, 1) if self._mode == "sync" else batch
+        return batch.flatten(0, 1)
 
     def _loss(self, patience_s: float = 0.0) -> RunFailed | None:
         """Return the error about the first lost worker, None if all are still alive after `patience_s`."""
@@ -329,6 +319,4 @@ def open_collector(
 def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:
     """Return the control steps, over all cars, to ask of a collector at a time."""
     frames = algorithm.frames_per_iteration
-    if frames is None:
-        return config.cars * _CHUNK_STEPS
-    return -(-frames // worker_count(config)) if config.mode == "async" else frames
+    return config.cars * _CHUNK_STEPS if frames is None else frames

@@ -27,18 +27,16 @@ class Watchdog:
     before it reports.
     """
 
-    def __init__(self, heartbeat: Path, workers: int, timeout_s: float, lockstep: bool):
+    def __init__(self, heartbeat: Path, workers: int, timeout_s: float):
         """Create the counters' file, one int64 per worker, and start watching.
 
-        In `lockstep` (synchronous collection) every worker delivers one part of each batch, and may rest until the next
-        is asked for.
+        Every worker delivers one part of each batch, and may rest until the next is asked for.
         """
         self._file = heartbeat
         np.full(workers, -1, np.int64).tofile(heartbeat)
         self._beats = np.memmap(heartbeat, np.int64, "r")
         self._timeout_s = timeout_s
         self._start_timeout_s = max(_START_TIMEOUT_S, timeout_s)
-        self._lockstep = lockstep
         self._delivered = np.zeros(workers, bool)
         self._processes: Sequence[BaseProcess] | None = None
         self._waiting = threading.Event()
@@ -87,10 +85,9 @@ class Watchdog:
         while not self._over.wait(_LOOK_EVERY_S):
             now = time.monotonic()
             beats = np.array(self._beats)
-            owes = ~self._delivered if self._lockstep else np.ones(len(beats), bool)
             # A longer pause was ours: the whole run stopped with Ctrl-Z, or the machine asleep.
             idle_s += min(now - looked, 2 * _LOOK_EVERY_S) if self._waiting.is_set() else 0.0
-            idle_s[(beats != seen) | ~owes] = 0.0
+            idle_s[(beats != seen) | self._delivered] = 0.0
             seen, looked = beats, now
             for worker in np.flatnonzero(
                 idle_s > np.where(beats > 0, self._timeout_s, self._start_timeout_s)

@@ -166,9 +166,8 @@ _RESUME_EPILOG = """\
                                                             budget is used
 
 The run continues from its last checkpoint, in its own folder and in the same MLflow run; what it wrote after that
-checkpoint is overwritten. With collector=sync, in_process or ray the result equals that of an uninterrupted run, bit
-for bit. It cannot with collector=async, nor with a budget in minutes or money or one that several runs share. A reward
-function that keeps something between calls starts without it.
+checkpoint is overwritten. The result equals that of an uninterrupted run, bit for bit, except with a budget in minutes
+or money or one that several runs share. A reward function that keeps something between calls starts without it.
 """
 
 

@@ -83,7 +83,7 @@ def _check_combinations(experiment: Experiment) -> None:
     if collector.mode == "in_process" and collector.processes not in (None, 1):
         raise BadInput(
             f"collector.processes={collector.processes} with collector.mode=in_process: "
-            "choose collector=sync or collector=async for several processes"
+            "choose collector=sync for several processes"
         )
     accepted = collector.accepted_processes
     if collector.processes not in (None, *accepted):

@@ -18,8 +18,8 @@ _FEWEST_CARS = 4
 class CollectorConfig:
     """Where experience is collected."""
 
-    mode: Literal["in_process", "sync", "async", "ray"]
-    """In this process; in several processes that wait for each other, or do not; like sync, on a Ray cluster."""
+    mode: Literal["in_process", "sync", "ray"]
+    """In this process; in several that wait for each other; like sync, on a Ray cluster."""
     processes: UpTo1000 | None
     """Worker processes; null: one per core, as far as the cars can be dealt out evenly (not with `ray`)."""
     cars: Annotated[int, Field(ge=1, le=100_000)]
@@ -32,7 +32,7 @@ class CollectorConfig:
     @property
     def forks(self) -> bool:
         """Whether the training starts worker processes on its own machine."""
-        return self.mode in ("sync", "async")
+        return self.mode == "sync"
 
     @property
     def accepted_processes(self) -> list[int]:

@@ -125,9 +125,7 @@ class RunMetrics:
         """Number and count the episodes of a batch.
 
         Args:
-            trace: rows of `deepracer.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T. A car that
-                appears twice (in asynchronous collection, where one process was faster than the others) drove the
-                lower row later.
+            trace: rows of `deepracer.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
 
         Returns:
             The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and
@@ -135,9 +133,7 @@ class RunMetrics:
         """
         trace = trace.copy()
         cars = trace[:, 0, PACKED["car"]].astype(np.int64)
-        for part in _each_car_once(cars):
-            begins = trace[part, :, PACKED["steps"]] == 1
-            trace[part, :, PACKED["episode"]] = self._numbers(cars[part], begins)
+        trace[..., PACKED["episode"]] = self._numbers(cars, trace[..., PACKED["steps"]] == 1)
         finished = self._close(trace)
         rows = trace.reshape(-1, trace.shape[-1])
         return rows[np.lexsort((rows[:, PACKED["steps"]], rows[:, PACKED["episode"]]))], finished
@@ -230,15 +226,6 @@ class RunMetrics:
         for number, record in enumerate(self.tracks):
             record.add(finished.on(number))
         return finished
-
-
-def _each_car_once(cars: np.ndarray) -> list[np.ndarray]:
-    """Return the rows in which each car appears for the first time, for the second time, and so on."""
-    order = np.argsort(cars, kind="stable")
-    _, first, counts = np.unique(cars[order], return_index=True, return_counts=True)
-    turn = np.empty(len(cars), np.int64)
-    turn[order] = np.arange(len(cars)) - np.repeat(first, counts)
-    return [np.flatnonzero(turn == nth) for nth in range(turn.max() + 1)]
 
 
 def _figures(finished: Finished, record: Record) -> dict[str, float | None]:

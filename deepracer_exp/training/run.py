@@ -440,8 +440,6 @@ def _own_error(error: Exception, experiment: Experiment) -> str | None:
 def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:
     """Return why a resumed run cannot equal an uninterrupted one bit for bit."""
     why = []
-    if experiment.collector.mode == "async":
-        why.append("with collector=async the cars begin new episodes, and the order of the workers varies")
     clocks = ("minutes", "max_cost", "experiment_minutes", "experiment_max_cost", "experiment_env_steps")
     by_clock = [name for name in clocks if getattr(experiment.budget, name) is not None]
     if by_clock and getattr(experiment.lr_schedule, "by", "fraction") == "fraction":

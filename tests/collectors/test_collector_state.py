@@ -95,20 +95,11 @@ def test_closing_leaves_the_threads_of_this_process_as_they_were(driver_of):
     assert torch.get_num_threads() == before
 
 
-def test_asynchronous_workers_have_no_state_and_begin_again(driver_of):
-    driver = driver_of("collector=async", "collector.processes=1", "collector.cars=6")
-    collection = driver.open()
-    driver.collect(collection, range(1))
-    assert collection.state_dict() == {}
-    collection.close()
-    assert driver.collect(driver.open({}), range(1))
-
-
 def test_a_state_of_another_number_of_processes_is_refused(driver_of, nothing_left):
     here = driver_of(*IN_PROCESS)
     collection = here.open()
     here.collect(collection, range(1))
-    words = "the checkpoint does not fit: .*1 synchronous worker; accepted by this collector: 2"
+    words = "the checkpoint does not fit: .*1 worker; accepted by this collector: 2"
     with pytest.raises(BadInput, match=words):
         driver_of(*SYNC).open(collection.state_dict())
 

@@ -30,8 +30,8 @@ def watch(tmp_path, monkeypatch, processes):
     monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
     made = []
 
-    def make(lockstep: bool, timeout_s: float = 1.0) -> Watchdog:
-        made.append(Watchdog(tmp_path / "beats", 2, timeout_s, lockstep))
+    def make(timeout_s: float = 1.0) -> Watchdog:
+        made.append(Watchdog(tmp_path / "beats", 2, timeout_s))
         made[-1].workers_started(processes)
         return made[-1]
 
@@ -56,7 +56,7 @@ def _keep_beating(counters, workers, dog) -> None:
 
 
 def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, processes):
-    dog = watch(lockstep=False)
+    dog = watch()
     counters = beats()
     counters[:] = 1
     dog.expect()
@@ -68,8 +68,8 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     assert processes[1].is_alive()
 
 
-def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats):
-    dog = watch(lockstep=True)
+def test_a_worker_whose_part_has_arrived_may_rest(watch, beats):
+    dog = watch()
     beats()[:] = 10
     dog.expect()
     dog.delivered(0)
@@ -79,7 +79,7 @@ def test_a_worker_whose_part_has_arrived_may_rest_in_lockstep(watch, beats):
 
 def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats):
     """A worker may hang after the last step of its part as well as within it."""
-    dog = watch(lockstep=True)
+    dog = watch()
     counters = beats()
     counters[:] = 10
     dog.expect()
@@ -90,7 +90,7 @@ def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats):
 
 
 def test_no_worker_is_ended_while_none_is_waited_for(watch, beats, processes):
-    dog = watch(lockstep=False)
+    dog = watch()
     beats()[:] = 1
     dog.rest()
     time.sleep(1.5)

@@ -1,6 +1,6 @@
 """A recording that is killed with SIGKILL again and again and resumes each time: RUN_DIR URI KILLS.
 
-It stands for a training whose repeated iterations differ (`collector=async`). It forks, so that MLflow is imported
+It stands for a training whose repeated iterations differ (`budget.minutes`). It forks, so that MLflow is imported
 once.
 """
 

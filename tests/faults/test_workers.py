@@ -5,7 +5,6 @@ import time
 
 import pytest
 
-MODES = pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
 DEATHS_ALONE = ("collector.hang_timeout_s=600",)
 """The watchdog would end a worker later than the tests wait: what ends the run is that the death is noticed."""
 HANG_S = 10
@@ -22,9 +21,8 @@ def _lost(training, *words):
     return ended
 
 
-@MODES
-def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
-    training = start_training(f"collector={mode}", *DEATHS_ALONE)
+def test_a_killed_worker_never_ends_in_a_finished_run(start_training):
+    training = start_training("collector=sync", *DEATHS_ALONE)
     training.wait_for_iterations(2)
     victim = training.workers()[1]
     victim.send_signal(signal.SIGKILL)
@@ -33,18 +31,16 @@ def test_a_killed_worker_never_ends_in_a_finished_run(start_training, mode):
 
 
 @pytest.mark.slow
-@MODES
-def test_a_worker_that_stops_is_ended_and_named(start_training, mode):
-    training = start_training(f"collector={mode}", *HANGS_SOON)
+def test_a_worker_that_stops_is_ended_and_named(start_training):
+    training = start_training("collector=sync", *HANGS_SOON)
     training.wait_for_iterations(2)
     training.workers()[0].send_signal(signal.SIGSTOP)
     _lost(training, "collector worker 0", "took no ")
 
 
-@MODES
 @pytest.mark.slow
-def test_a_worker_killed_while_it_starts_ends_the_run(start_training, mode):
-    training = start_training(f"collector={mode}", *DEATHS_ALONE)
+def test_a_worker_killed_while_it_starts_ends_the_run(start_training):
+    training = start_training("collector=sync", *DEATHS_ALONE)
     training.wait_for_worker().send_signal(signal.SIGKILL)
     _lost(training, "orker 0")
 
@@ -73,9 +69,8 @@ def test_a_worker_lost_while_the_learner_learns_ends_the_run(start_training, sig
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", ["start", "driving"])
-@MODES
-def test_workers_do_not_outlive_a_killed_training(start_training, mode, moment):
-    training = start_training(f"collector={mode}")
+def test_workers_do_not_outlive_a_killed_training(start_training, moment):
+    training = start_training("collector=sync")
     if moment == "start":
         training.wait_for_worker()
     else:

@@ -65,17 +65,6 @@ def test_episodes_are_numbered_without_gaps_over_batches_of_any_length(lengths, 
         assert np.array_equal(keys, keys[np.lexsort((keys[:, 1], keys[:, 0]))])
 
 
-@given(st.lists(st.lists(st.integers(0, 2), min_size=1, max_size=4), min_size=1, max_size=5))
-def test_a_process_that_delivers_twice_in_one_iteration_keeps_its_episodes_apart(deliveries):
-    """Asynchronous collection: cars 0 and 1, 2 and 3, 4 and 5 belong together; one of them may be faster."""
-    driven, book = Driven([[3, 1, 4, 2, 5] * 20] * 6), book_of(6)
-    rows = []
-    for iteration in deliveries:
-        parts = [driven.batch(4, [2 * process, 2 * process + 1]) for process in iteration]
-        rows.append(book.enter(np.concatenate(parts))[0])
-    _check(rows)
-
-
 def test_finished_episodes_come_in_the_order_of_their_ends():
     driven, book = Driven([[3, 9], [2, 9], [4, 9]]), book_of(3)
     _, finished = book.enter(driven.batch(4))

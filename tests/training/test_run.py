@@ -97,14 +97,6 @@ def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tm
     assert len(read_trace(folders[0] / "trace", ["steps"])) == 2048
 
 
-@pytest.mark.usefixtures("workers_start_early")
-def test_asynchronous_collection_numbers_and_counts_every_step(call):
-    processes = ("collector=async", "collector.processes=2")
-    ended = call("train", "experiment=tiny", "tracking=off", *processes, *OVERRIDES)
-    assert ended.code == 0, ended.stderr
-    assert_trace_gives_the_metrics(ended)
-
-
 @pytest.mark.parametrize(
     ("limits", "reason", "iterations"),
     [
