@@ -1,9 +1,7 @@
 """Databases of the tests of `sweeps`, and processes that race for what is in them."""
 
 import multiprocessing
-import os
 import signal
-import uuid
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -19,25 +17,14 @@ from tests.waiting import PATIENCE_S
 
 from .studies import season
 
-MYSQL = "SWEEPS_TEST_MYSQL"
-"""Names a variable with the URL of a MySQL server whose user may make databases; the tests run on it, too."""
 
-
-@pytest.fixture(params=["sqlite", "postgresql", *(["mysql"] if MYSQL in os.environ else [])])
+@pytest.fixture(params=["sqlite", "postgresql"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     """The URL of an empty database, of each kind in turn."""
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path}/sweeps.db"
-    elif request.param == "postgresql":
-        yield request.getfixturevalue("postgres_server").new_database()
     else:
-        server = sa.make_url(os.environ[MYSQL])
-        name = f"study_{uuid.uuid4().hex[:12]}"
-        with sa.create_engine(server, poolclass=sa.NullPool).begin() as connection:
-            connection.execute(sa.text(f"CREATE DATABASE {name}"))
-        yield server.set(database=name).render_as_string(hide_password=False)
-        with sa.create_engine(server, poolclass=sa.NullPool).begin() as connection:
-            connection.execute(sa.text(f"DROP DATABASE {name}"))
+        yield request.getfixturevalue("postgres_server").new_database()
 
 
 @pytest.fixture

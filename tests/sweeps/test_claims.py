@@ -3,8 +3,6 @@
 import random
 import time
 
-import sqlalchemy as sa
-
 from deepracer_exp.sweeps.queue.claims import TrialClaims, TrialResult
 from tests.waiting import wait_until
 
@@ -86,17 +84,6 @@ def test_a_second_result_is_accepted_and_the_first_one_stays(claims):
     assert not claims.record(claim, trial_id=1)
     (stored,) = claims.all()
     assert (stored.state, stored.result) == ("reported", first)
-
-
-def test_a_study_of_before_is_done_when_its_trials_are(claims):
-    claim = claims.claim("one", 1, HOUR_S)
-    claims.settle(claim, result(values=[12.5]))
-    with claims._engine.begin() as connection:  # as earlier versions called what Optuna has
-        connection.execute(sa.text("UPDATE deepracer_slots SET state = 'told'"))
-    assert claims.is_done(1)
-    assert claims.settle(claim, result("FAIL"))
-    assert claims.unreported() == []
-    assert claims.claim("two", 1, HOUR_S) is None
 
 
 def test_a_release_frees_the_trials_of_that_owner_only(claims):

@@ -21,7 +21,6 @@ import sqlalchemy as sa
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.dialects import mysql
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from .storage import DOWN, patiently
@@ -34,12 +33,10 @@ _RELEASED = 0.0
 _RENEWALS = 12
 """Renewals within one lease; the live view is at most one of them behind."""
 
-_Json = sa.Text().with_variant(mysql.MEDIUMTEXT(), "mysql")
-
 _table = sa.Table(
     _TABLE,
     sa.MetaData(),
-    # The longest study name that Optuna allows, and the longest key of MySQL.
+    # The longest study name that Optuna allows.
     sa.Column("study", sa.String(512), primary_key=True),
     sa.Column("slot", sa.Integer, primary_key=True, autoincrement=False),
     sa.Column("attempt", sa.Integer, nullable=False),
@@ -47,11 +44,11 @@ _table = sa.Table(
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("expires_s", sa.Double, nullable=False),
     sa.Column("trial_id", sa.Integer),
-    sa.Column("runs", _Json),
-    sa.Column("progress", _Json),
+    sa.Column("runs", sa.Text),
+    sa.Column("progress", sa.Text),
     sa.Column("outcome", sa.String(16)),
-    sa.Column("objective_values", _Json),
-    sa.Column("attrs", _Json),
+    sa.Column("objective_values", sa.Text),
+    sa.Column("attrs", sa.Text),
 )
 _of = _table.c
 
@@ -60,7 +57,6 @@ _of = _table.c
 _CLOCKS = {
     "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
     "postgresql": "CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS DOUBLE PRECISION)",
-    "mysql": "(TIMESTAMPDIFF(MICROSECOND, '1970-01-01', UTC_TIMESTAMP(6)) / 1000000.0)",
 }
 
 

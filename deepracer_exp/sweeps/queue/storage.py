@@ -37,16 +37,14 @@ DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInt
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
 _SAY_AFTER_S = 5.0
 
-_KINDS = ("sqlite", "postgresql", "mysql")
-_ACCEPTED = (
-    "accepted: sqlite:////path/sweeps.db, postgresql+psycopg://user@host/name, mysql+pymysql://user@host/name"
-)
-_DRIVERS = {"psycopg": "psycopg[binary]", "pymysql": "pymysql", "mysqldb": "mysqlclient"}
+_KINDS = ("sqlite", "postgresql")
+_ACCEPTED = "accepted: sqlite:////path/sweeps.db, postgresql+psycopg://user@host/name"
+_DRIVERS = {"psycopg": "psycopg[binary]"}
 """Package of each driver."""
 _CONNECT_S = 10
 _STUCK_S = 60
 """How long a process may leave a transaction open, or wait for one: a suspended machine must not block others."""
-_LOCK, _LOCK_NUMBER = "deepracer_exp sweeps", 0x64726578
+_LOCK_NUMBER = 0x64726578
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -73,24 +71,16 @@ class Database:
         """
         if self.file is not None:
             return {"connect_args": {"timeout": _STUCK_S}}
-        driver = self.url.get_driver_name()
-        arguments: dict[str, Any] = {}
-        if driver in ("psycopg", "psycopg2"):
-            arguments = {
-                "connect_timeout": _CONNECT_S,
-                "keepalives_idle": 15,
-                "keepalives_interval": 5,
-                "keepalives_count": 4,
-                "tcp_user_timeout": 30_000,
-                "options": f"-c idle_in_transaction_session_timeout={_STUCK_S}s -c lock_timeout={_STUCK_S}s",
-            }
-        elif driver in ("pymysql", "mysqldb"):
-            arguments = {
-                "connect_timeout": _CONNECT_S,
-                "read_timeout": 2 * _STUCK_S,
-                "write_timeout": 2 * _STUCK_S,
-                "init_command": f"SET SESSION wait_timeout={_STUCK_S}, innodb_lock_wait_timeout={_STUCK_S}",
-            }
+        if self.url.get_driver_name() not in ("psycopg", "psycopg2"):
+            return {"poolclass": sa.NullPool}
+        arguments = {
+            "connect_timeout": _CONNECT_S,
+            "keepalives_idle": 15,
+            "keepalives_interval": 5,
+            "keepalives_count": 4,
+            "tcp_user_timeout": 30_000,
+            "options": f"-c idle_in_transaction_session_timeout={_STUCK_S}s -c lock_timeout={_STUCK_S}s",
+        }
         given = {key: value for key, value in arguments.items() if key not in self.url.query}
         return {"poolclass": sa.NullPool, "connect_args": given}
 
@@ -106,10 +96,7 @@ class Database:
                 yield
             return
         with engine.connect() as connection:
-            if engine.dialect.name == "postgresql":
-                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK_NUMBER)))
-            else:
-                connection.execute(sa.select(sa.func.get_lock(_LOCK, _STUCK_S)))
+            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK_NUMBER)))
             yield
 
 
