@@ -25,7 +25,7 @@ _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN checkpoint=last evaluation.trials=20
   deepracer-exp evaluate RUN evaluation.tracks=[Oval_track,Bowtie_track]
   deepracer-exp evaluate RUN evaluation.held_out=null       on the usual conditions only
-  deepracer-exp evaluate RUN --video lap.mp4 --view top
+  deepracer-exp evaluate RUN --video lap.mp4
 
 The results are also written to evaluations/TIME.json in the run's folder.
 """
@@ -48,7 +48,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
     parser.add_argument("--video", metavar="FILE", help="film the fastest usual lap (.mp4)")
-    parser.add_argument("--view", choices=("chase", "top"), default="chase", help="camera of the film")
     parser.add_argument(
         "--cfg", action="store_true", help="print the composed configuration as YAML and stop"
     )
@@ -130,7 +129,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     from deepracer_exp.evaluation.evaluate import evaluate_run
 
-    video = None if args.video is None else (Path(args.video), args.view)
+    video = None if args.video is None else Path(args.video)
     out = Console(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
         evaluate_run(run, config, video, out, Console(stderr=True))

@@ -55,9 +55,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="find the fastest lap of the car; picture and line are then those of the lap, with its speed",
     )
     parser.add_argument("--video", metavar="FILE", help="film the fastest lap (.mp4)")
-    parser.add_argument(
-        "--view", choices=("chase", "top"), default="chase", help="where the film is seen from"
-    )
 
 
 ROUTES = (".npy", ".yaml", ".yml")
@@ -251,7 +248,7 @@ def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: arg
         time_s=lap.column("time_s"),
         **{name: lap.column(name) for name in ("x_m", "y_m", "yaw_rad", "speed_mps", "progress")},
     )
-    write_video(Path(args.video), args.view, film_lap, experiment.car, Console(stderr=True))
+    write_video(Path(args.video), film_lap, experiment.car, Console(stderr=True))
     print(f"\nfilm: {args.video}")
 
 

@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -28,9 +28,6 @@ from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 from .evaluator import Evaluator, tracks_of
 from .film import LapRecorder, best_attempt
 from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number, zigzag_columns
-
-if TYPE_CHECKING:
-    from .video import View
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s", "zig-zag /m")
@@ -158,7 +155,7 @@ def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:
 
 
 def evaluate_run(
-    run: StoredRun, config: EvaluateConfig, video: "tuple[Path, View] | None", out: Console, err: Console
+    run: StoredRun, config: EvaluateConfig, video: Path | None, out: Console, err: Console
 ) -> Evaluation:
     """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.
 
@@ -199,9 +196,9 @@ def evaluate_run(
     if video is not None:
         from .video import write_video  # imports MuJoCo's renderer
 
-        write_video(*video, recorder.lap(best_attempt(evaluation)), evaluator.race.setup.car, err)
-        out.print(f"  video    {video[0]}", soft_wrap=True, highlight=False)
-        files[video[0]] = FILMS
+        write_video(video, recorder.lap(best_attempt(evaluation)), evaluator.race.setup.car, err)
+        out.print(f"  video    {video}", soft_wrap=True, highlight=False)
+        files[video] = FILMS
     tracking = run.experiment.tracking
     uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
     metrics = _metrics(evaluation, known)

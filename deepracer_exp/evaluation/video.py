@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +17,10 @@ from deepracer_exp.tracks.track import Track
 
 from .film import FRAMES_PER_S, Lap, in_frames, png, write_film
 
-View = Literal["chase", "top"]
-
 WIDTH, HEIGHT = 960, 544
 """Multiples of 16, as video codecs want them."""
 
 _PIXELS_PER_M, _MOST_PIXELS = 160, 4096
-_HEAD = 0.2
-"""Share of the frame that the view from above leaves free at the top for the overlay."""
-_MARK_RGBA = (1.0, 0.75, 0.0, 0.55)
 _SMOOTHING = 0.13
 """Share of a heading change that the chase camera follows per frame."""
 
@@ -42,9 +36,9 @@ def can_draw() -> bool:
     return True
 
 
-def render_lap(lap: Lap, car: CarConfig, view: View) -> Iterator[NDArray[np.uint8]]:
+def render_lap(lap: Lap, car: CarConfig) -> Iterator[NDArray[np.uint8]]:
     """Render a lap in frames with MuJoCo, (HEIGHT, WIDTH, 3) each; poses are given, nothing is simulated."""
-    model, camera = _build(lap.track, car, view), mujoco.MjvCamera()
+    model, camera = _build(lap.track, car), mujoco.MjvCamera()
     data = mujoco.MjData(model)
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     place, steer, spin = (
@@ -68,31 +62,18 @@ def render_lap(lap: Lap, car: CarConfig, view: View) -> Iterator[NDArray[np.uint
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
-            if view == "top":
-                _look_down(camera, lap.track, np.radians(model.vis.global_.fovy))
-            else:
-                azimuth_rad += _SMOOTHING * ((yaw_rad - azimuth_rad + np.pi) % (2 * np.pi) - np.pi)
-                ahead = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)])
-                camera.lookat[:] = *(np.array([lap.x_m[at], lap.y_m[at]]) + 0.25 * ahead), 0.05
-                camera.distance, camera.elevation = 1.3, -24.0
-                camera.azimuth = np.degrees(azimuth_rad)
+            azimuth_rad += _SMOOTHING * ((yaw_rad - azimuth_rad + np.pi) % (2 * np.pi) - np.pi)
+            ahead = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)])
+            camera.lookat[:] = *(np.array([lap.x_m[at], lap.y_m[at]]) + 0.25 * ahead), 0.05
+            camera.distance, camera.elevation = 1.3, -24.0
+            camera.azimuth = np.degrees(azimuth_rad)
             renderer.update_scene(data, camera)
             # Shadows of the distant light cost more than the rest of the image.
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
             yield renderer.render()
 
 
-def _look_down(camera: mujoco.MjvCamera, track: Track, angle_rad: float) -> None:
-    """Show the whole track from above, below the overlay; the angle is the picture's height."""
-    low, high = extent(track)
-    middle, (width, height) = 0.5 * (low + high), high - low
-    seen_m = max(height / (1 - _HEAD), width * HEIGHT / WIDTH)
-    camera.lookat[:] = middle[0], middle[1] + 0.5 * _HEAD * seen_m, 0.0
-    camera.distance = 0.5 * seen_m / np.tan(angle_rad / 2)
-    camera.azimuth, camera.elevation = 90.0, -90.0
-
-
-def _build(track: Track, car: CarConfig, view: View) -> mujoco.MjModel:
+def _build(track: Track, car: CarConfig) -> mujoco.MjModel:
     low, high = extent(track)
     spec = build_spec(car, visual=True)
     vis = spec.visual
@@ -121,29 +102,17 @@ def _build(track: Track, car: CarConfig, view: View) -> mujoco.MjModel:
         ("ground", [0, 0, -0.01], [0, 0, 1]),
     ):
         spec.worldbody.add_geom(name=name, type=plane, pos=pos, size=size, material=name, **seen)
-    if view == "top":
-        # From up there the car is a few pixels long: a disc under it.
-        mark_m = 0.025 * float(np.max(high - low))
-        spec.body("chassis").add_geom(
-            name="mark",
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[0, 0, 0.01],
-            size=[mark_m, 0.005, 0],
-            rgba=_MARK_RGBA,
-            mass=0,
-            **seen,
-        )
     return spec.compile()
 
 
-def write_video(file: Path, view: View, lap: Lap, car: CarConfig, err: Console) -> None:
-    """Render a lap as an .mp4 file, from behind the car or from above.
+def write_video(file: Path, lap: Lap, car: CarConfig, err: Console) -> None:
+    """Render a lap as an .mp4 file, seen from behind the car.
 
     Raises:
         RunFailed: the file cannot be written.
     """
     shown, _ = in_frames(lap, car.control_hz)
-    frames = (_overlay(picture, shown, at) for at, picture in enumerate(render_lap(shown, car, view)))
+    frames = (_overlay(picture, shown, at) for at, picture in enumerate(render_lap(shown, car)))
     write_film(file, frames, len(shown), (WIDTH, HEIGHT), err)
 
 

@@ -13,19 +13,15 @@ drawable = os.environ.get("MUJOCO_GL") or any(map(ctypes.util.find_library, ("EG
 @pytest.mark.slow
 @pytest.mark.skipif(not drawable, reason="this machine has neither EGL nor OSMesa")
 @pytest.mark.parametrize(
-    ("view", "sees", "given"),
-    [
-        ("chase", (), ()),
-        ("top", (), ()),
-        ("chase", ("observation=camera", "budget.env_steps=256"), ("evaluation=real_car",)),
-    ],
+    ("sees", "given"),
+    [((), ()), (("observation=camera", "budget.env_steps=256"), ("evaluation=real_car",))],
 )
-def test_a_film_shows_the_car_on_its_way(copied, start, tmp_path, view, sees, given):
+def test_a_film_shows_the_car_on_its_way(copied, start, tmp_path, sees, given):
     """As fast as it drove, also where it acts more often than in the simulator."""
     folder = copied(*sees)
     ended = start(
         *("evaluate", str(folder), *given, "evaluation.trials=1", "evaluation.time_s=2"),
-        *("evaluation.held_out=null", "--video", "lap.mp4", "--view", view),
+        *("evaluation.held_out=null", "--video", "lap.mp4"),
     ).end(300)
     assert ended.code == 0, ended.stderr
     frames = read_frames(str(tmp_path / "lap.mp4"))
