@@ -16,7 +16,6 @@ from typing import NoReturn
 from deepracer_exp import __version__
 from deepracer_exp.addresses import redact, without_passwords
 from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
-from deepracer_exp.commands.arguments import refuse_old_spellings
 from deepracer_exp.errors import BadInput, RunFailed, nearest
 from deepracer_exp.lifeline import die_with_parent, guard_imports
 from deepracer_exp.scratch import own_scratch
@@ -70,7 +69,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.print_help()
         raise SystemExit(0)
     given = without_passwords(list(arguments))
-    refuse_old_spellings(given)
     args, rest = parser.parse_known_args(runs.with_default_action(given))
     if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
         raise BadInput(f"unrecognized arguments: {' '.join(rest)}; see `{args.prog} --help`")

@@ -1,7 +1,6 @@
-"""Arguments of a command line: RUN, overrides, where runs are, old spellings, and shell completion."""
+"""Arguments of a command line: RUN, overrides, where runs are, and shell completion."""
 
 import argparse
-import itertools
 import re
 import shlex
 from collections.abc import Callable, Iterable, Sequence
@@ -16,35 +15,6 @@ STORES = ("runs_dir", "tracking.uri")
 """Where runs are, and the MLflow store in which ids and aliases are looked up."""
 
 _OVERRIDE = re.compile(r"[+~]*[A-Za-z_][\w./@-]*=.*", re.DOTALL)
-_OLD_FLAGS = {
-    "--runs-dir": "runs_dir={}",
-    "--tracking-uri": "tracking.uri={}",
-    "--uri": "tracking.uri={}",
-    "--storage": "sweep.storage={}",
-    "--checkpoint": "checkpoint={}",
-    "--out": "--output {}",
-}
-_OLD_COMMANDS = ("lineage", "promote", "clean")
-
-
-def refuse_old_spellings(arguments: Sequence[str]) -> None:
-    """Refuse a command or flag that is spelled differently now.
-
-    Raises:
-        BadInput: names the present spelling.
-    """
-    if arguments and arguments[0] in _OLD_COMMANDS:
-        raise BadInput(f"{arguments[0]}: write deepracer-exp runs {shlex.join(arguments)}")
-    if list(arguments[:2]) == ["runs", "compare"]:
-        raise BadInput(f"runs compare: write deepracer-exp {shlex.join(arguments[1:])}")
-    if "--compare" in arguments:
-        raise BadInput("--compare: write deepracer-exp compare, with all runs and logs that are compared")
-    for argument, following in itertools.pairwise([*arguments, ""]):
-        flag, _, value = argument.partition("=")
-        if flag in _OLD_FLAGS:
-            raise BadInput(
-                f"{flag}: write {_OLD_FLAGS[flag].format(shlex.quote(value or following or '...'))}"
-            )
 
 
 def add_command(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from .bounds import Natural, NonNegative, UpTo1000
 
@@ -11,11 +11,6 @@ Trials = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
 # More than an hour of driving in one trial is a mistake of units.
 Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
-
-
-def _renamed(failed_lap: object) -> object:
-    # As it is in runs that were trained before the value had its present name.
-    return "restarts_lap" if failed_lap == "starts_anew" else failed_lap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +69,7 @@ class EvaluationConfig:
     """Duration of a trial, penalties included; a lap that is not complete by then does not count."""
     resets_per_lap: Natural
     """How often in a lap the car is put back at its last progress, standing; after one more the lap has failed."""
-    failed_lap: Annotated[Literal["ends_trial", "restarts_lap"], BeforeValidator(_renamed)]
+    failed_lap: Literal["ends_trial", "restarts_lap"]
     """After a failed lap the trial ends, or the car starts a new lap, standing."""
     penalty_s: PenaltyConfig
     trials: Trials

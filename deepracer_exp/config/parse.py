@@ -23,15 +23,8 @@ def parse_experiment(mapping: dict[str, Any]) -> Experiment:
     """Return the experiment that plain values describe; types are strict (no text for numbers, no bool for int).
 
     Raises:
-        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict; or the car is
-            that of an earlier version.
+        BadInput: a key is unknown, missing, of another type or out of its range, or two keys contradict.
     """
-    car = mapping.get("car")
-    if isinstance(car, dict) and "contact_time_s" in car:
-        raise BadInput(
-            "car: this run drove the car of an earlier version of deepracer-exp, which this one does not simulate; "
-            "evaluate it with the version that trained it, or train again"
-        )
     experiment = parse_config(mapping, Experiment)
     _check_combinations(experiment)
     return experiment

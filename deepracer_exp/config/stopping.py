@@ -126,8 +126,7 @@ class EntropyStopping:
     overfitting: OverfittingRule | None
     collapsed: CollapsedRule | None
     not_learning: NotLearningRule | None
-    laps_slower: LapsSlowerRule | None = None
-    """Runs of older versions do not have it."""
+    laps_slower: LapsSlowerRule | None
 
 
 PresetStopping = NoStopping | ReliableStopping | PlateauStopping | EntropyStopping

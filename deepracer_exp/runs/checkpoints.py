@@ -118,7 +118,7 @@ def check(path: Path, *, resumable: bool = False) -> Path:
         raise BadInput(f"{path}: has {total:,} bytes; accepted: up to {_MOST_BYTES // 2**30} GiB")
     for name in (MANIFEST, HASHES):
         if name not in files:
-            raise BadInput(f"{path}: has no {name}: incomplete, or written by an older version")
+            raise BadInput(f"{path}: has no {name}: incomplete")
     verify(path)
     try:
         components = Checkpoint.manifest(path)["components"]

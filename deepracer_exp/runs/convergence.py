@@ -396,7 +396,13 @@ def overfitting(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None =
         if len(known) < 6:
             continue
         only = EntropyStopping(
-            kind="entropy", window=3, converged=None, overfitting=rule, collapsed=None, not_learning=None
+            kind="entropy",
+            window=3,
+            converged=None,
+            overfitting=rule,
+            collapsed=None,
+            not_learning=None,
+            laps_slower=None,
         )
         judge, decision = TrendRule(only, None), None
         for returned, completion in zip(iterations["reward_mean"], iterations[column], strict=True):

@@ -105,17 +105,14 @@ class ReliableLap:
     """After which the policy was evaluated, the number of its checkpoint."""
     lap_time_s: float
     """Mean of its complete laps on the usual conditions, with several tracks of all of them."""
-    laps: int | None
-    """Complete laps on the usual conditions; None in runs of older versions, which have their share only."""
-    laps_tried: int | None
-    """Laps tried there; None where `laps` is."""
+    laps: int
+    """Complete laps on the usual conditions."""
+    laps_tried: int
+    """Laps tried there."""
 
     def __str__(self) -> str:
         """Return it in words: ``checkpoint 40, 6.72 s, 8 of 8``."""
-        laps = (
-            f"{self.laps} of {self.laps_tried}" if self.laps_tried else f"{RELIABLE:.0%} or more of the laps"
-        )
-        return f"checkpoint {self.iteration}, {self.lap_time_s:.2f} s, {laps}"
+        return f"checkpoint {self.iteration}, {self.lap_time_s:.2f} s, {self.laps} of {self.laps_tried}"
 
 
 def fastest_reliable(rows: Iterable[Mapping[str, Any]]) -> ReliableLap | None:
@@ -131,8 +128,8 @@ def fastest_reliable(rows: Iterable[Mapping[str, Any]]) -> ReliableLap | None:
     return ReliableLap(
         iteration=best["iteration"],
         lap_time_s=best["eval_lap_time_s"],
-        laps=best.get("eval_laps"),
-        laps_tried=best.get("eval_laps_tried"),
+        laps=best["eval_laps"],
+        laps_tried=best["eval_laps_tried"],
     )
 
 

@@ -6,7 +6,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.config.compose import compose_entry, compose_experiment, compose_option, expand_grid
+from deepracer_exp.config.compose import compose_experiment, compose_option, expand_grid
 from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.options import options_of
 from deepracer_exp.config.overrides import parse_single
@@ -322,13 +322,6 @@ def test_an_option_by_itself_is_refused_with_its_name(text, words, own):
 def test_an_option_by_itself_that_is_not_there_is_refused_with_the_nearest():
     with pytest.raises(BadInput, match=r"randomization=sim2rael: no such .*did you mean sim2real"):
         compose_option("randomization", "sim2rael", RandomizationConfig)
-
-
-def test_a_run_of_the_car_of_before_is_refused_with_what_to_do():
-    values = compose_entry("train", []).mapping
-    values["car"] |= {"contact_time_s": 0.04, "chassis_mass_kg": 5.9811}
-    with pytest.raises(BadInput, match=r"^car: .* train again$"):
-        parse_experiment(values)
 
 
 def test_a_password_in_a_change_of_a_stored_run_is_not_kept():

@@ -22,13 +22,6 @@ def test_the_entry_point_is_its_group_and_a_few_keys():
     assert set(entry) - {"defaults"} == {f.name for f in dataclasses.fields(EvaluateConfig)} - {"evaluation"}
 
 
-def test_a_protocol_of_before_is_read_with_the_present_names():
-    config, _ = compose_evaluation(["run=x", "evaluation.failed_lap=starts_anew"])
-    assert (
-        config.evaluation == compose_evaluation(["run=x", "evaluation.failed_lap=restarts_lap"])[0].evaluation
-    )
-
-
 def test_a_run_may_look_like_a_number():
     assert compose_evaluation(["run=12e45678"])[0].run == "12e45678"
     assert compose_evaluation(["run=x", "checkpoint=000012"])[0].checkpoint == "000012"

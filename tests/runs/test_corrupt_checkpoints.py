@@ -146,11 +146,11 @@ def test_a_training_resumes_only_from_its_own_state(folder, caplog):
     assert "a training cannot resume" in refusal(folder, "30", resumable=True)
 
 
-def test_a_checkpoint_of_an_older_version_is_named_as_such(folder):
+def test_a_checkpoint_without_hashes_is_incomplete(folder):
     for path in folder.glob("0*"):
         (path / "hashes.json").unlink()
     for name in ("best", "last", "10"):
-        assert "older version" in refusal(folder, name)
+        assert "incomplete" in refusal(folder, name)
 
 
 def test_a_link_out_of_the_folder_is_refused_with_others_intact(folder, four):

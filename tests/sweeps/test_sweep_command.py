@@ -36,7 +36,7 @@ def load(cwd, name):
         (("observation=camera,camera_small", "sweep.protocol=real_car"), ("observation=camera", "160x120")),
         ((LR, "seed=0,1"), ("sweep.seeds",)),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
-        ((LR, "--storage", "sqlite:///x.db"), ("--storage", "sweep.storage=sqlite:///x.db")),
+        ((LR, "--storage", "sqlite:///x.db"), ("unrecognized arguments: --storage",)),
         ((LR, "sweep.storage=sqlite:////proc/x.db"), ("sweep.storage=", "/proc/x.db cannot be written")),
         ((LR, f"sweep.storage={SERVER}"), ("sweep.storage=postgresql+psycopg://", "127.0.0.1")),
     ],
