@@ -29,7 +29,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.errors import BadInput
 
 from .command import command_line

@@ -1,4 +1,4 @@
-"""Write the catalogue's data file, `deepracer_exp/deepracer/worlds.zip`, from route files.
+"""Write the catalogue's data file, `deepracer_exp/aws/worlds/worlds.zip`, from route files.
 
     git clone https://github.com/aws-deepracer-community/deepracer-simapp
     git -C deepracer-simapp checkout 01f5f015fd85
@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from deepracer_exp.deepracer.routes import is_first_of_equals, read_route
-from deepracer_exp.deepracer.worlds import FILE, INDEX, ROUTES, UNITS_PER_M, World
+from deepracer_exp.aws.worlds.catalogue import FILE, INDEX, ROUTES, UNITS_PER_M, World
+from deepracer_exp.aws.worlds.routes import is_first_of_equals, read_route
 
 SOURCES = (
     {

@@ -12,9 +12,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.replay import WARM_UP_STEPS, Windows, cut_windows, errors, replay
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.recording_reader import read_recording
 from deepracer_exp.errors import BadInput
 
 Floats = NDArray[np.float64]

@@ -162,7 +162,7 @@ class RunTables:
 
     @cached_property
     def steps(self) -> pd.DataFrame:
-        """One row per control step of the trace, columns `deepracer.recording.STEP_COLUMNS`."""
+        """One row per control step of the trace, columns `aws.logs.recording.STEP_COLUMNS`."""
         return read_own_recording(self.path).steps
 
 

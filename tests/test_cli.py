@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from deepracer_exp import __version__
+from deepracer_exp.aws.worlds.catalogue import leaders, worlds
 from deepracer_exp.config.options import groups
-from deepracer_exp.deepracer.worlds import leaders, worlds
 
 HEAVY = (
     "torch",

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
+from deepracer_exp.aws.models.model_metadata import read_model_metadata
+from deepracer_exp.aws.worlds.routes import read_knots, read_route
 from deepracer_exp.config.driving import RewardConfig
-from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
-from deepracer_exp.deepracer.model_metadata import read_model_metadata
-from deepracer_exp.deepracer.routes import read_knots, read_route
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_yaml
 from deepracer_exp.lookup.best import read_best_of_sweep

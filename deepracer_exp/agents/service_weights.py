@@ -14,8 +14,8 @@ import torch
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 
-from deepracer_exp.deepracer.log_archive import natural
-from deepracer_exp.deepracer.model_metadata import CAMERAS, LIDARS
+from deepracer_exp.aws.logs.files import natural
+from deepracer_exp.aws.models.model_metadata import CAMERAS, LIDARS
 from deepracer_exp.errors import BadInput
 
 from .actor_critic import ActorCritic, SensorNet

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.deepracer.recording import STEP_COLUMNS, TRAINING, Recording
+from deepracer_exp.aws.logs.recording import STEP_COLUMNS, TRAINING, Recording
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.tracks.track import Track

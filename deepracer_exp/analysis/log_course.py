@@ -9,13 +9,13 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
+from deepracer_exp.aws.logs.recording import LogProblem, Recording
+from deepracer_exp.aws.worlds.catalogue import find_world, worlds
+from deepracer_exp.aws.worlds.routes import NEAR_M, recognise, world_rows
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.track import TrackConfig
-from deepracer_exp.deepracer.recording import LogProblem, Recording
-from deepracer_exp.deepracer.routes import NEAR_M, recognise, world_rows
-from deepracer_exp.deepracer.worlds import find_world, worlds
 from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.files import CONFIG, read_config

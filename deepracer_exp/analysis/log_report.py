@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from deepracer_exp.deepracer.recording import Recording, readable
+from deepracer_exp.aws.logs.recording import Recording, readable
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.deepracer.hyperparameters import Hyperparameters
-from deepracer_exp.deepracer.recording import TRAINING, LogProblem, Recording
+from deepracer_exp.aws.logs.recording import TRAINING, LogProblem, Recording
+from deepracer_exp.aws.models.hyperparameters import Hyperparameters
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import Track
 

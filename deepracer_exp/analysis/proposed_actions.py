@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 
+from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.models.model_metadata import Action
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.deepracer.model_metadata import Action
-from deepracer_exp.deepracer.recording import Recording
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.fastest.lap import FastestLap
 

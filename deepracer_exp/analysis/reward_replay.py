@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from deepracer_exp.aws.logs.recording import TRAINING
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.deepracer.recording import TRAINING
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.rewards.guard import Guard, Misconduct
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction

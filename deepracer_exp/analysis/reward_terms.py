@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.aws.logs.recording import LogProblem
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.deepracer.recording import LogProblem
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.guard import CtrlC, Guard
 from deepracer_exp.rewards.reward import RewardFunction, Unusable, what_happened

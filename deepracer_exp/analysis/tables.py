@@ -7,7 +7,7 @@ import pandas as pd
 from numba import njit
 from numpy.typing import NDArray
 
-from deepracer_exp.deepracer.recording import TRAINING, Recording
+from deepracer_exp.aws.logs.recording import TRAINING, Recording
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.tracks.track import Track
 

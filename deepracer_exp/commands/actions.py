@@ -17,8 +17,8 @@ from .tracks import ROUTES, experiment_on, search_fastest
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.proposed_actions import ActionProposal, Commands
+    from deepracer_exp.aws.models.model_metadata import ModelMetadata
     from deepracer_exp.config.car import CarConfig
-    from deepracer_exp.deepracer.model_metadata import ModelMetadata
 
 _EPILOG = """\
   deepracer-exp actions RUN                                 from the fast laps of its best checkpoint, driven now
@@ -88,8 +88,8 @@ def _whole(given: str) -> int:
 
 def _actions(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.proposed_actions import check_count, propose_actions
+    from deepracer_exp.aws.models.model_metadata import model_metadata_text
     from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
-    from deepracer_exp.deepracer.model_metadata import model_metadata_text
     from deepracer_exp.files import atomic_write
 
     words = [word for word in (args.what, *args.overrides) if word is not None]
@@ -166,9 +166,9 @@ def _source(what: str, overrides: list[str], track: str | None) -> _Source:
         raise BadInput(f"checkpoint={stores.values['checkpoint']}: {what} is a log; accepted for a run")
 
     from deepracer_exp.analysis.proposed_actions import commands_of_log
+    from deepracer_exp.aws.logs.reader import read_recording
+    from deepracer_exp.aws.models.model_metadata import ModelMetadata
     from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.deepracer.model_metadata import ModelMetadata
-    from deepracer_exp.deepracer.recording_reader import read_recording
 
     recording = read_recording(place)
     commands = commands_of_log(recording, track)

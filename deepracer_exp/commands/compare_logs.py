@@ -70,7 +70,7 @@ def against_log(args: argparse.Namespace, name: str, place: Path, stores: Stores
     from deepracer_exp.analysis.charts.runs import recordings_compared
     from deepracer_exp.analysis.lap_replay import laps_of_log
     from deepracer_exp.analysis.log_view import prepare
-    from deepracer_exp.deepracer.recording_reader import read_recording
+    from deepracer_exp.aws.logs.reader import read_recording
     from deepracer_exp.runs.own_recording import read_log
 
     recording = read_recording(place)

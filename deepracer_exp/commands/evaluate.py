@@ -232,7 +232,7 @@ def _replay_laps(args: argparse.Namespace) -> int:
         place = Path(runs[1]).expanduser()
         if place.exists() and not is_run(place):
             from deepracer_exp.analysis.against_log import prepare_races
-            from deepracer_exp.deepracer.recording_reader import read_recording
+            from deepracer_exp.aws.logs.reader import read_recording
 
             view = prepare_races(read_recording(place))
         else:

@@ -91,9 +91,9 @@ def _list_tracks() -> None:
     """Print a line for each family of worlds, then the user's own tracks."""
     from rich.table import Table
 
+    from deepracer_exp.aws.worlds.catalogue import leaders, worlds
     from deepracer_exp.config.options import options
     from deepracer_exp.config.overrides import override_line
-    from deepracer_exp.deepracer.worlds import leaders, worlds
 
     out = table_console(160)
     table = Table(box=None, pad_edge=False, header_style="dim")
@@ -256,7 +256,7 @@ def _measures(name: str) -> tuple[float, float]:
     """Return a world's length and median width in metres."""
     import numpy as np
 
-    from deepracer_exp.deepracer.routes import world_rows
+    from deepracer_exp.aws.worlds.routes import world_rows
 
     center, inner, outer = np.split(world_rows(name), 3, axis=1)
     length_m = np.linalg.norm(np.diff(center, axis=0), axis=1).sum()

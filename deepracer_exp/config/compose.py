@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.addresses import without_passwords
-from deepracer_exp.deepracer.worlds import find_world
+from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import read_yaml
 

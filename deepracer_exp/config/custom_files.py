@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from deepracer_exp.deepracer import hyperparameters, model_metadata
-from deepracer_exp.deepracer.hyperparameters import Hyperparameters, read_hyperparameters
-from deepracer_exp.deepracer.job_settings import JobSettings, read_run_env, read_training_params
-from deepracer_exp.deepracer.model_metadata import (
+from deepracer_exp.aws.models import hyperparameters, model_metadata
+from deepracer_exp.aws.models.hyperparameters import Hyperparameters, read_hyperparameters
+from deepracer_exp.aws.models.job_settings import JobSettings, read_run_env, read_training_params
+from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
     ModelMetadata,

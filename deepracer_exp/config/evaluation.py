@@ -42,7 +42,7 @@ class CarTimingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CarControlsConfig:
-    """What the car makes of actions, see `deepracer.car_controls`."""
+    """What the car makes of actions, see `aws.models.car_controls`."""
 
     full_lock_deg: Annotated[float, Field(gt=0, le=30, allow_inf_nan=False)]
     """Angle of the wheels at full lock."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from deepracer_exp.deepracer.model_metadata import Action
+from deepracer_exp.aws.models.model_metadata import Action
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 

@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from deepracer_exp.deepracer.job_settings import FILE_KEYS, JobSettings
-from deepracer_exp.deepracer.routes import runs_clockwise, world_rows
-from deepracer_exp.deepracer.worlds import find_world, worlds
+from deepracer_exp.aws.models.job_settings import FILE_KEYS, JobSettings
+from deepracer_exp.aws.worlds.catalogue import find_world, worlds
+from deepracer_exp.aws.worlds.routes import runs_clockwise, world_rows
 from deepracer_exp.errors import BadInput, nearest
 
 from .overrides import first_given, key_of, override_line

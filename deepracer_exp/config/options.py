@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from deepracer_exp.deepracer.worlds import worlds
+from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.files import read_bytes, read_text
 

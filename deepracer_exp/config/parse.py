@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from deepracer_exp.deepracer.worlds import worlds
+from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.errors import BadInput, nearest
 
 from .experiment import Experiment

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 from hydra.core.override_parser.types import Override
 
-from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
+from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
 from deepracer_exp.errors import BadInput, nearest
 
 from .options import conf_dir, listed, options

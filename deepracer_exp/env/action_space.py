@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata, read_model_metadata
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import (
     ActionSpaceConfig,
@@ -14,7 +15,6 @@ from deepracer_exp.config.driving import (
     SpeedRange,
     SteeringRange,
 )
-from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
 
 Commands = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -18,13 +18,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.trace import EPISODE_STATUS, PACKED
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
 from .setup import RaceSetup, build_setup, deal
 from .top_view import TopView
+from .trace import EPISODE_STATUS, PACKED
 
 Observed = Any
 """An array, or with two sensors a dictionary of arrays."""
@@ -93,7 +93,7 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
 class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
 
-    `infos` holds arrays `progress` and `episode_status` (codes of `deepracer.trace.EPISODE_STATUS`) of the poses
+    `infos` holds arrays `progress` and `episode_status` (codes of `env.trace.EPISODE_STATUS`) of the poses
     before the step. In a step that ended episodes it also holds, as Gymnasium's own vector environments do, `final_obs`
     (objects: an observation, or None) with the mask `_final_obs`, and `final_info` with `_final_info`.
     """

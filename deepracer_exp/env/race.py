@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from deepracer_exp.config.driving import RandomizationConfig
-from deepracer_exp.deepracer.trace import PACKED, RANDOMIZED
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFunction
@@ -21,6 +20,7 @@ from .real_car import Servos
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
+from .trace import PACKED, RANDOMIZED
 
 _RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
 """The columns of `RANDOMIZED`, which are adjacent in packed rows."""
@@ -54,7 +54,7 @@ class Race:
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step cut the drive off, see `StepResult`, (N,), bool.
-        trace: one row per car for the last step, columns `deepracer.trace.PACKED_COLUMNS`, (N, C), float64.
+        trace: one row per car for the last step, columns `env.trace.PACKED_COLUMNS`, (N, C), float64.
     """
 
     def __init__(

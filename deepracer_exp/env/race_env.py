@@ -9,10 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
+from .trace import PACKED
 
 _FLAGS = ("done", "terminated", "truncated")
 
@@ -22,7 +22,7 @@ class RaceEnv(EnvBase):
 
     Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), with a LIDAR
     `lidar` (float32), `action` (int64 index, or float32 steering and speed in -1..1), and under `next` also `reward`,
-    `done`, `terminated`, `truncated` and `trace` (float64, columns `deepracer.trace.PACKED_COLUMNS`). `trace` is part
+    `done`, `terminated`, `truncated` and `trace` (float64, columns `env.trace.PACKED_COLUMNS`). `trace` is part
     of the reward spec because it exists only after a step.
     """
 

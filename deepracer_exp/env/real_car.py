@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from deepracer_exp.aws.models.car_controls import full_scale, servo_value, steering_share, throttle
 from deepracer_exp.config.evaluation import CarControlsConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.car_controls import full_scale, servo_value, steering_share, throttle
 from deepracer_exp.errors import BadInput
 
 from .action_space import ActionSpace, Commands, ContinuousActions, build_action_space, metadata_of

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.config.driving import EpisodeConfig
-from deepracer_exp.deepracer.trace import STATUS_CODE
 from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.track import Pose, Tracks
 
 from .setup import RaceSetup, courses_of_cars
 from .state import Floats, Measures, checked_array
+from .trace import STATUS_CODE
 
 Ids = NDArray[np.intp]
 Bools = NDArray[np.bool_]
@@ -133,7 +133,7 @@ class StepResult:
     off_track: Bools
     """No wheel on the road."""
     status: NDArray[np.int64]
-    """Codes of `deepracer.trace.STATUS_CODE`."""
+    """Codes of `env.trace.STATUS_CODE`."""
     terminated: Bools
     truncated: Bools
     """The drive was cut off where it could go on: at `episode.max_steps`, or at the end of a lap of a closed track."""

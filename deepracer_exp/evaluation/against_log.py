@@ -14,13 +14,13 @@ from deepracer_exp.analysis.log_course import catalogue_track, directed, numbere
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import subsample
 from deepracer_exp.analysis.tables import first_rows, flying_rows
+from deepracer_exp.aws.logs.recording import STEP_COLUMNS
+from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
-from deepracer_exp.deepracer.recording import STEP_COLUMNS
-from deepracer_exp.deepracer.trace import to_table
-from deepracer_exp.deepracer.worlds import find_world
+from deepracer_exp.env.trace import to_table
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import read_checkpoint

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from deepracer_exp.analysis.lap_replay import ReplayedLap, is_same_start
 from deepracer_exp.analysis.proposed_actions import Commands, fast_laps, in_words
 from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint

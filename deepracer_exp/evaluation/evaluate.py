@@ -11,10 +11,10 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from deepracer_exp.aws.models.car_controls import full_scale, throttle
 from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
-from deepracer_exp.deepracer.car_controls import full_scale, throttle
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write

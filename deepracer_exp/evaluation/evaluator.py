@@ -16,10 +16,10 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
-from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup, directed_tracks
+from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import NO_REWARD
 

@@ -15,8 +15,8 @@ from rich.progress import track as with_progress
 from tensordict import TensorDict
 from torch import nn
 
-from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.race import Race
+from deepracer_exp.env.trace import PACKED
 from deepracer_exp.errors import RunFailed, writing
 from deepracer_exp.tracks.track import Track
 

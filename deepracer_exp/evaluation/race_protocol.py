@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.deepracer.trace import EPISODE_STATUS, STATUS_CODE
 from deepracer_exp.env.rules import lap_clock_s
+from deepracer_exp.env.trace import EPISODE_STATUS, STATUS_CODE
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
@@ -80,7 +80,7 @@ class RaceProtocol:
         """Process one control step.
 
         Args:
-            status: `deepracer.trace.STATUS_CODE` of the poses, (N,).
+            status: `env.trace.STATUS_CODE` of the poses, (N,).
             progress: per cent of the lap, (N,).
 
         Returns:

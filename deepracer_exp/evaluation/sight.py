@@ -16,9 +16,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.page import Glimpse, png_uri
+from deepracer_exp.aws.logs.recording import LogProblem
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.config.own_class import OF_POLICY, named_again
-from deepracer_exp.deepracer.recording import LogProblem
 from deepracer_exp.env.action_space import ActionSpace
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lookup.resolve import StoredRun

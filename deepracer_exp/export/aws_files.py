@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from deepracer_exp.aws.models.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
+from deepracer_exp.aws.models.model_metadata import LIDARS, LidarSectors, ModelMetadata, model_metadata_text
 from deepracer_exp.config.custom_files import CARS, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
-from deepracer_exp.deepracer.model_metadata import LIDARS, LidarSectors, ModelMetadata, model_metadata_text
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import writing
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.sim_trace import LOG_LAYOUTS
+from deepracer_exp.aws.models.hyperparameters import hyperparameters_text
+from deepracer_exp.aws.models.model_metadata import model_metadata_text
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.hyperparameters import hyperparameters_text
-from deepracer_exp.deepracer.model_metadata import model_metadata_text
-from deepracer_exp.deepracer.recording import Recording
-from deepracer_exp.deepracer.sim_trace import LOG_LAYOUTS
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, count, writing
 

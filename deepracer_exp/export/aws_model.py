@@ -9,20 +9,20 @@ import yaml
 
 from deepracer_exp.agents.actor_critic import ActorCritic, SensorNet, build_actor_critic
 from deepracer_exp.agents.service_weights import to_service
-from deepracer_exp.config.compose import compose_option
-from deepracer_exp.config.custom_files import services_network
-from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import CNNConfig
-from deepracer_exp.deepracer.model_archive import CHECKPOINTS, NEWEST
-from deepracer_exp.deepracer.model_metadata import (
+from deepracer_exp.aws.models.archive import CHECKPOINTS, NEWEST
+from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
     ModelMetadata,
     model_metadata_text,
 )
-from deepracer_exp.deepracer.protobuf import field
-from deepracer_exp.deepracer.tf_checkpoint import DATA, INDEX, META, write_checkpoint
-from deepracer_exp.deepracer.worlds import find_world
+from deepracer_exp.aws.models.protobuf import field
+from deepracer_exp.aws.models.tf_checkpoint import DATA, INDEX, META, write_checkpoint
+from deepracer_exp.aws.worlds.catalogue import find_world
+from deepracer_exp.config.compose import compose_option
+from deepracer_exp.config.custom_files import services_network
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput

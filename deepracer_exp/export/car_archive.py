@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from deepracer_exp.aws.models.car_controls import full_scale, steering_share, throttle
+from deepracer_exp.aws.models.graph_def import HEAD, POLICY_NETWORK, policy_graph, read_weights
+from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata, model_metadata_text
 from deepracer_exp.config.driving import LidarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
-from deepracer_exp.deepracer.car_controls import full_scale, steering_share, throttle
-from deepracer_exp.deepracer.graph_def import HEAD, POLICY_NETWORK, policy_graph, read_weights
-from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata, model_metadata_text
 from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, build_action_space, metadata_of
 from deepracer_exp.env.real_car import car_refusals
 from deepracer_exp.errors import BadInput, RunFailed

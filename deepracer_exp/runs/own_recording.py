@@ -12,11 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
-from deepracer_exp.config.custom_files import TAKEN
-from deepracer_exp.config.driving import ActionSpaceConfig
-from deepracer_exp.deepracer import sim_trace
-from deepracer_exp.deepracer.model_metadata import ModelMetadata
-from deepracer_exp.deepracer.recording import (
+from deepracer_exp.aws.logs import sim_trace
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.logs.recording import (
     EVALUATION_COLUMNS,
     METRICS_COLUMNS,
     STEP_COLUMNS,
@@ -26,9 +24,11 @@ from deepracer_exp.deepracer.recording import (
     Recording,
     typed_table,
 )
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.trace import EPISODE_STATUS, SCHEMA
+from deepracer_exp.aws.models.model_metadata import ModelMetadata
+from deepracer_exp.config.custom_files import TAKEN
+from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
+from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object

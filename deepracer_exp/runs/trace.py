@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from deepracer_exp.deepracer.trace import SCHEMA, TRACE_COLUMNS
+from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
 
 if TYPE_CHECKING:

@@ -10,6 +10,8 @@ import torch
 
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
 from deepracer_exp.agents.service_weights import VALUE, from_service, match_service
+from deepracer_exp.aws.models.archive import StoredModel, read_model
+from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata
 from deepracer_exp.config.compose import Composition, compose_experiment, compose_option
 from deepracer_exp.config.custom_files import (
     KEY,
@@ -25,8 +27,6 @@ from deepracer_exp.config.imported_options import import_files, remove_options
 from deepracer_exp.config.job_overrides import job_overrides, several_of
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.config.overrides import key_of, override_line
-from deepracer_exp.deepracer.model_archive import StoredModel, read_model
-from deepracer_exp.deepracer.model_metadata import NEURAL_NETWORKS, ModelMetadata
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput

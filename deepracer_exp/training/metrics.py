@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
-from deepracer_exp.deepracer.trace import PACKED, STATUS_CODE
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, zigzag_columns
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.tracking.metrics import track_labels, track_metric
@@ -125,7 +125,7 @@ class RunMetrics:
         """Number and count the episodes of a batch.
 
         Args:
-            trace: rows of `deepracer.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
+            trace: rows of `env.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
 
         Returns:
             The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and

@@ -19,10 +19,10 @@ from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
 from deepracer_exp.collectors.base import Collector
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.trace import to_table
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.trace import to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.deepracer.trace import STATUS_CODE
 from deepracer_exp.env.rules import RaceRules, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.state import Measures
+from deepracer_exp.env.trace import STATUS_CODE
 from deepracer_exp.rewards.params import BATCH_COLUMNS
 from deepracer_exp.sim.batch import CarBatch
 

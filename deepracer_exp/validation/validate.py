@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from deepracer_exp.aws.worlds.catalogue import UNITS_PER_M
+from deepracer_exp.aws.worlds.routes import recognise
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.deepracer.routes import recognise
-from deepracer_exp.deepracer.worlds import UNITS_PER_M
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed, count, writing
 from deepracer_exp.rewards.reward import RewardFailed

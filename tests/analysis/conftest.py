@@ -1,7 +1,7 @@
 import pytest
 
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
 from tests.conftest import REFERENCE
 
 CONSOLE = REFERENCE / "console_training"

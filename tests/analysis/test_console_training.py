@@ -10,7 +10,7 @@ from deepracer.logs import AnalysisUtils, DeepRacerLog
 
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
 
 from .conftest import CONSOLE
 

@@ -10,10 +10,10 @@ import pytest
 from deepracer_exp.analysis.log_course import catalogue_track, find_courses, numbered_as_logged
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.sectors import sectors_of
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.worlds.routes import world_rows
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.recording import Recording
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.routes import world_rows
 from deepracer_exp.errors import BadInput
 
 from .made_up import Drive, made_up_course, made_up_recording

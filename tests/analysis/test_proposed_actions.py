@@ -131,7 +131,7 @@ def test_too_few_or_too_many_actions_are_refused(car, wanted):
 
 
 def test_a_real_training_has_its_fast_laps_and_its_list_of_actions(car, reference):
-    from deepracer_exp.deepracer.recording_reader import read_recording
+    from deepracer_exp.aws.logs.reader import read_recording
 
     recording = read_recording(reference / "race_pace" / "droa_v6_fast.tar.gz")
     found = commands_of_log(recording)

@@ -9,9 +9,9 @@ import pytest
 from deepracer_exp.analysis import reward_replay
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
+from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.deepracer.recording import STEP_COLUMNS
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs.files import read_config

@@ -10,7 +10,7 @@ from deepracer_exp.analysis.charts.training import training_progress
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.slower_laps import SERIES, SlowerLaps, slower_laps
-from deepracer_exp.deepracer.recording import EVALUATION_COLUMNS, METRICS_COLUMNS
+from deepracer_exp.aws.logs.recording import EVALUATION_COLUMNS, METRICS_COLUMNS
 from deepracer_exp.runs.result import RunResult
 
 from .made_up import Drive, made_up_recording, typed

@@ -3,8 +3,8 @@
 import pytest
 
 from benchmarks.analysis import write_long_log
-from deepracer_exp.deepracer.recording_reader import read_recording
-from tests.deepracer import made_up_logs as made
+from deepracer_exp.aws.logs.reader import read_recording
+from tests.aws import made_up_logs as made
 
 
 # Lines that are left out make a turn shorter than the file, the more the shorter the others are.

@@ -10,7 +10,7 @@ import pytest
 from deepracer_exp.analysis import log_report
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs import own_recording
-from tests.deepracer.made_up_logs import drives, log_text
+from tests.aws.made_up_logs import drives, log_text
 from tests.page_html import Html
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")

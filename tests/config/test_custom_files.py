@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from deepracer_exp.aws.models import hyperparameters, model_metadata
 from deepracer_exp.config.compose import Composition, compose_experiment, expand_grid
 from deepracer_exp.config.custom_files import TAKEN, FileOverrides, file_overrides, read_custom_files
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line, parse_single
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.deepracer import hyperparameters, model_metadata
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 

@@ -3,11 +3,11 @@ from dataclasses import fields
 
 import pytest
 
+from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
 from deepracer_exp.config.compose import compose_experiment, expand_grid
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.config.track_options import by_world_name
-from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
 from tests.conftest import refused
 
 TWO = "track=[Oval_track,Bowtie_track]"

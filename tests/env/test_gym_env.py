@@ -10,9 +10,9 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
+from deepracer_exp.env.trace import EPISODE_STATUS
 from deepracer_exp.errors import BadInput
 
 SPACES = ["action_space=discrete", "action_space=continuous"]

@@ -5,9 +5,9 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.env.trace import PACKED
 
 SPACES = ["action_space=discrete", "action_space=continuous"]
 

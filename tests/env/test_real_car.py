@@ -16,11 +16,11 @@ from deepracer_exp.config.evaluation import (
     CarTimingConfig,
     RealCarConfig,
 )
-from deepracer_exp.deepracer.trace import PACKED
 from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import Servos, as_the_car, car_pictures, car_refusals
 from deepracer_exp.env.setup import build_setup
+from deepracer_exp.env.trace import PACKED
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.trace import EPISODE_STATUS
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import build_setup
+from deepracer_exp.env.trace import EPISODE_STATUS
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.sim.batch import CarState

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps, prepare_races
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.against_log import course_driven, race_as_logged
 from deepracer_exp.export.aws_logs import TRACE_HEADER

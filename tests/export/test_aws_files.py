@@ -2,10 +2,10 @@ import json
 
 import pytest
 
+from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
+from deepracer_exp.aws.models.model_metadata import read_model_metadata
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.custom_files import read_custom_files, sensor_overrides
-from deepracer_exp.deepracer.hyperparameters import read_hyperparameters
-from deepracer_exp.deepracer.model_metadata import read_model_metadata
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
 from deepracer_exp.export.aws_files import aws_files, write_files

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from deepracer.logs import AnalysisUtils, DeepRacerLog, LogFolderType, TrainingMetrics
 
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.runs.trace import read_trace
 
 RENAMED = {

@@ -14,9 +14,9 @@ import torch
 from torch import nn
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.aws.models.graph_def import INPUTS, POLICY, read_weights
+from deepracer_exp.aws.models.model_metadata import read_model_metadata
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.graph_def import INPUTS, POLICY, read_weights
-from deepracer_exp.deepracer.model_metadata import read_model_metadata
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput, RunFailed

@@ -6,13 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.recording import (
+from deepracer_exp.aws.logs.recording import (
     EVALUATION_COLUMNS,
     METRICS_COLUMNS,
     STEP_COLUMNS,
     UPDATE_COLUMNS,
 )
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.own_recording import is_own_run, read_own_recording

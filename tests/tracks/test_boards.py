@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from deepracer_exp.aws.worlds.catalogue import worlds
+from deepracer_exp.aws.worlds.routes import world_rows
 from deepracer_exp.config.options import options
-from deepracer_exp.deepracer.routes import world_rows
-from deepracer_exp.deepracer.worlds import worlds
 from deepracer_exp.tracks import boards
 from deepracer_exp.tracks.boards import Board, boards_of, standings, what_it_sees
 

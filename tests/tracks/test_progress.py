@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.deepracer.routes import read_route
+from deepracer_exp.aws.worlds.routes import read_route
 from deepracer_exp.env.rules import lap_progress
 from deepracer_exp.tracks.track import Track
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.deepracer.routes import rows_from_knots
+from deepracer_exp.aws.worlds.routes import rows_from_knots
 from deepracer_exp.errors import BadInput
 
 SQUARE = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 6.0], [0.0, 6.0]])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.routes import is_first_of_equals, read_route, recognise, world_rows
-from deepracer_exp.deepracer.worlds import find_world, leaders, worlds
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
+from deepracer_exp.aws.worlds.routes import is_first_of_equals, read_route, recognise, world_rows
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.track import world_track
 

@@ -17,10 +17,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.service_weights import POLICY, VALUE, to_service
+from deepracer_exp.aws.models.archive import read_model
+from deepracer_exp.aws.models.graph_def import policy_graph
+from deepracer_exp.aws.models.tf_checkpoint import write_checkpoint
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.deepracer.graph_def import policy_graph
-from deepracer_exp.deepracer.model_archive import read_model
-from deepracer_exp.deepracer.tf_checkpoint import write_checkpoint
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput

@@ -5,8 +5,8 @@ import contextlib
 import numpy as np
 import pytest
 
-from deepracer_exp.deepracer.protobuf import field
-from deepracer_exp.deepracer.tf_checkpoint import (
+from deepracer_exp.aws.models.protobuf import field
+from deepracer_exp.aws.models.tf_checkpoint import (
     Entry,
     masked_crc32c,
     read_index,

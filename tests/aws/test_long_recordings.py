@@ -7,9 +7,10 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from deepracer_exp.deepracer import log_blocks, sim_trace
-from deepracer_exp.deepracer.recording_reader import read_recording
-from deepracer_exp.deepracer.training_log import TrainingLog, read_training_logs
+from deepracer_exp.aws.logs import blocks as log_blocks
+from deepracer_exp.aws.logs import sim_trace
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.logs.text_log import TrainingLog, read_training_logs
 from deepracer_exp.runs.own_recording import read_own_recording
 from deepracer_exp.runs.trace import read_trace
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from deepracer_exp.errors import BadInput
 
-from .deduplicate import (
+from .drives import (
     EPISODES_PER_ITERATION,
     Drives,
     Ints,
@@ -26,7 +26,7 @@ from .deduplicate import (
     rows_also_in,
     steps_of,
 )
-from .log_archive import (
+from .files import (
     PACKED,
     LogFile,
     Place,
@@ -38,6 +38,7 @@ from .log_archive import (
     same_job,
     without_worker,
 )
+from .parts import Parts, TraceFile, read_parts
 from .recording import (
     METRICS_COLUMNS,
     TRAINING,
@@ -48,8 +49,7 @@ from .recording import (
     readable,
     typed_table,
 )
-from .recording_parts import Parts, TraceFile, read_parts
-from .training_log import TrainingLog, Update, join_rolled
+from .text_log import TrainingLog, Update, join_rolled
 
 _KINDS = (TRAINING, "evaluation", "leaderboard")
 _NEARLY = 0.75

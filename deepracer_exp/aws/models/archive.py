@@ -18,12 +18,12 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from deepracer_exp.aws.logs.blocks import READ_ERRORS, reason_of
+from deepracer_exp.aws.logs.files import natural
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES
 
 from .graph_def import GRAPH_BYTES, read_weights
-from .log_archive import natural
-from .log_blocks import READ_ERRORS, reason_of
 from .tf_checkpoint import DATA, DATA_BYTES, INDEX, INDEX_BYTES, read_index, read_tensors
 
 Tensors = Mapping[str, npt.NDArray[np.float32]]

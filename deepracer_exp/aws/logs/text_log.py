@@ -11,8 +11,8 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .log_archive import LogFile
-from .log_blocks import Blocks
+from .blocks import Blocks
+from .files import LogFile
 from .sim_trace import LOG_LAYOUTS, REST_REFUSED, StepTables, is_hopeless, read_rows, with_one_value_an_action
 
 MARKER = b"SIM_TRACE_LOG:"

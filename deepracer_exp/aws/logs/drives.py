@@ -11,10 +11,10 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from .log_archive import Place
+from .files import Place
 from .recording import STEP_COLUMNS, typed_table
 from .sim_trace import COMMON
-from .training_log import TrainingLog
+from .text_log import TrainingLog
 
 EPISODES_PER_ITERATION = 20
 """The service's default."""

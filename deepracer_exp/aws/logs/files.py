@@ -17,7 +17,7 @@ from typing import IO, Any
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
-from .log_blocks import READ_ERRORS, reason_of
+from .blocks import READ_ERRORS, reason_of
 from .recording import LogProblem, readable
 
 _ACCEPTED = "trace CSVs or logs of the service"

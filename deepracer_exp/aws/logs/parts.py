@@ -8,17 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import IO, Any
 
+from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
+from deepracer_exp.aws.models.model_metadata import ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import SETTINGS_BYTES, read_yaml
 
 from . import sim_trace
-from .hyperparameters import read_hyperparameters
-from .log_archive import LOG, LogFile, LogFolder, Place, natural, place_of
-from .log_blocks import READ_ERRORS, reason_of
-from .model_metadata import ModelMetadata, read_model_metadata
+from .blocks import READ_ERRORS, reason_of
+from .files import LOG, LogFile, LogFolder, Place, natural, place_of
 from .recording import TRAINING, LogProblem
 from .sim_trace import StepTables, read_trace_csv
-from .training_log import MARKER, TrainingLog, piece_of, read_training_logs
+from .text_log import MARKER, TrainingLog, piece_of, read_training_logs
 
 MOST_LISTED = 20
 """Lines of one file that are listed one by one; the rest is counted."""

@@ -6,8 +6,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from deepracer_exp.deepracer.graph_def import HEAD, INPUTS, POLICY, POLICY_NETWORK, policy_graph, read_weights
-from deepracer_exp.deepracer.protobuf import field, read_fields
+from deepracer_exp.aws.models.graph_def import (
+    HEAD,
+    INPUTS,
+    POLICY,
+    POLICY_NETWORK,
+    policy_graph,
+    read_weights,
+)
+from deepracer_exp.aws.models.protobuf import field, read_fields
 from deepracer_exp.errors import BadInput
 from tests.conftest import REFERENCE, refused
 

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.deepracer.recording import Recording
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.logs.recording import Recording
 from tests.conftest import REFERENCE
 
 CONSOLE = REFERENCE / "console_training"

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from deepracer_exp.deepracer import model_metadata
-from deepracer_exp.deepracer.hyperparameters import (
+from deepracer_exp.aws.models import model_metadata
+from deepracer_exp.aws.models.hyperparameters import (
     KEYS,
     Hyperparameters,
     hyperparameters_text,
     read_hyperparameters,
 )
-from deepracer_exp.deepracer.model_metadata import (
+from deepracer_exp.aws.models.model_metadata import (
     Action,
     LidarSectors,
     ModelMetadata,

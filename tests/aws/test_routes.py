@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepracer_exp.deepracer.routes import read_knots, read_route
+from deepracer_exp.aws.worlds.routes import read_knots, read_route
 from deepracer_exp.errors import BadInput
 
 STRIP = np.column_stack(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs.reader import read_recording
 from tests.conftest import refused
 
 from . import made_up_logs as made

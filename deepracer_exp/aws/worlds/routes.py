@@ -13,7 +13,7 @@ from pydantic import Field, TypeAdapter
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import ROUTE_BYTES, open_user_file, read_yaml_as
 
-from .worlds import FILE, ROUTES, UNITS_PER_M, worlds
+from .catalogue import FILE, ROUTES, UNITS_PER_M, worlds
 
 REPEAT_M = 1e-9
 """A point closer than this to the one before it repeats it."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from .model_metadata import ModelMetadata
+from deepracer_exp.aws.models.model_metadata import ModelMetadata
 
 if TYPE_CHECKING:
     from deepracer_exp.runs.result import RunResult

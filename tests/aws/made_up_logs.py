@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.deepracer.recording import Recording
+from deepracer_exp.aws.logs.recording import Recording
 
 COMMON = (
     *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done"),

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv as arrow_csv
 
-from .log_blocks import Blocks
+from .blocks import Blocks
 
 COMMON = (
     *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done"),

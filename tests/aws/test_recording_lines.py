@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepracer_exp.deepracer import sim_trace
-from deepracer_exp.deepracer.recording import Recording
-from deepracer_exp.deepracer.recording_reader import read_recording
+from deepracer_exp.aws.logs import sim_trace
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.logs.recording import Recording
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 

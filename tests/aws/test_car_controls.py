@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from deepracer_exp.deepracer.car_controls import full_scale, servo_value, steering_share, throttle
-from deepracer_exp.deepracer.model_metadata import Action, ModelMetadata
+from deepracer_exp.aws.models.car_controls import full_scale, servo_value, steering_share, throttle
+from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata
 
 
 def test_half_speed_is_four_fifths_of_the_throttle_and_nothing_exceeds_it():
