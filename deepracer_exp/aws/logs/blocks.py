@@ -34,6 +34,7 @@ class Blocks:
         self.stream = stream
         self._ended = False
         self._bytes = 0
+        self._block = b""
         self.lines = 0
         """Lines before the current block."""
         self.refused: list[tuple[int | None, str]] = []
@@ -57,11 +58,17 @@ class Blocks:
                     rest, skipping = b"", True
                 continue
             block = rest + chunk[:end]
+            self._block = block
             yield block
             self.lines += block.count(b"\n")
             rest = chunk[end:]
         if rest:
+            self._block = rest
             yield rest
+
+    def line(self, offset: int) -> int:
+        """Return the number of the line, from 1, that an offset in the current block is in."""
+        return self.lines + self._block.count(b"\n", 0, offset) + 1
 
     def _chunks(self) -> Iterator[bytes]:
         decoder = None

@@ -1,11 +1,11 @@
 """The simulation trace of every generation of the service, as tables: lines of a log, or a CSV file."""
 
-import csv
 import math
 import re
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from typing import IO
+from itertools import pairwise
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +22,7 @@ COMMON = (
 """Columns of every generation."""
 LATER = ("episode_status", "pause_duration", "obstacle_crash_counter", "wall_clock")
 """Columns of some generations."""
-_COUNTER_OR_CLOCK = "counter or clock"
+_COUNTER_OR_CLOCK = "the value before the last"
 Layouts = Mapping[int, Sequence[str]]
 """Names of the columns by the number of values of a line."""
 # deepracer-simapp, metrics/constants.py. The fourth of 18 later values is the obstacle counter in some versions and
@@ -43,10 +43,11 @@ _LARGEST_ACTION = 9_999
 _LARGEST = dict.fromkeys((*COMMON, *LATER), 1e9) | {"reward": 1e100, "tstamp": 1e12, "wall_clock": 1e12}
 """Largest absolute values of the other columns."""
 _FLAGS = ("done", "all_wheels_on_track")
-_TRUE, _FALSE = ("True", "true", "1"), ("False", "false", "0")
+_FLAG_OF = dict.fromkeys(("True", "true", "1"), True) | dict.fromkeys(("False", "false", "0"), False)
 _STATUS = re.compile(r"[A-Za-z_ ]{0,40}")
-_CHUNK = 1024
-_HEADER = b"episode"
+_READ = {*COMMON, *LATER, _COUNTER_OR_CLOCK}
+_HEADER = re.compile(rb'[" ]*episode')
+_BEFORE_HEADER = re.compile(rb'\n(?=[" ]*episode)')
 MOST_REFUSED = 1000
 """Lines without a row at the beginning of a file after which the rest is not read: that would take minutes."""
 MOST_STEPS = 4_000_000
@@ -70,6 +71,10 @@ SCHEMA = pa.schema(
 def left_out_reason(steps: int) -> str:
     """Return the message about steps that were left out because there are too many."""
     return f"{steps:,} steps are left out: only the last {MOST_STEPS:,} of a recording are kept"
+
+
+Refused = list[tuple[int | None, str]]
+"""Line (None: from an unknown line on) and reason of what is not a row."""
 
 
 class StepTables:
@@ -103,10 +108,13 @@ class StepTables:
         self.left_out += dropped
         return dropped
 
-    @property
-    def found_rows(self) -> bool:
-        """Whether the file had any rows."""
-        return self.rows + self.left_out > 0
+    def give_up(self, refused: Refused) -> bool:
+        """Return whether reading ends: there are no rows, but many lines that are none; the last reason says so."""
+        if self.rows + self.left_out or len(refused) < MOST_REFUSED:
+            return False
+        rest = f"the rest is not read: none of the first {MOST_REFUSED:,} lines is a row"
+        refused[MOST_REFUSED:] = [(None, rest)]
+        return True
 
     @property
     def found(self) -> bool:
@@ -120,26 +128,17 @@ class StepTables:
 
 
 _LISTED_ACTION = re.compile(rb"(\[[^\[\],\n]*),")
+_QUOTED = re.compile(rb'"([^"\n]*)"')
 
 
-def with_one_value_an_action(rows: bytes) -> bytes:
-    """Return rows of a trace in which no comma separates the two numbers of a continuous action.
+def with_plain_commas(rows: bytes) -> bytes:
+    """Return rows of a trace in which every comma separates two columns.
 
-    The console wrote `[-30.0, 1.2]` from November 2022 to June 2023, `[-30.0 1.2]` before and since.
+    The console wrote the two numbers of a continuous action as `[-30.0, 1.2]` from November 2022 to June 2023, and as
+    `[-30.0 1.2]` before and since. Other programs put values in quotes.
     """
-    return _LISTED_ACTION.sub(rb"\1 ", rows) if b"[" in rows else rows
-
-
-Refused = list[tuple[int | None, str]]
-"""Line (None: from an unknown line on) and reason of what is not a row."""
-
-
-def is_hopeless(steps: "StepTables", refused: Refused) -> bool:
-    """Return whether a trace has no rows and so many lines that are none that the rest is not worth reading."""
-    return not steps.found_rows and len(refused) >= MOST_REFUSED
-
-
-REST_REFUSED = f"the rest is not read: none of the first {MOST_REFUSED:,} lines is a row"
+    rows = _LISTED_ACTION.sub(rb"\1 ", rows) if b"[" in rows else rows
+    return _QUOTED.sub(lambda match: match[1].replace(b",", b" "), rows) if b'"' in rows else rows
 
 
 def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
@@ -152,24 +151,28 @@ def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
     refused: Refused = []
     header: Sequence[str] | None = None
     for block in blocks:
-        at, number = 0, blocks.lines + 1
-        while header is None and at < len(block):
-            end = block.find(b"\n", at) + 1 or len(block)
-            line, at, number = block[at:end], end, number + 1
-            if line.strip():
-                header = _column_names(line)
-        if header is None:
-            continue
-        data = with_one_value_an_action(block[at:])
-        count = data.count(b"\n") + (not data.endswith(b"\n"))
-        table = _read_fast(data, header, count) if data else SCHEMA.empty_table()
-        if table is not None:
+        if steps.give_up(refused):
+            break
+        # The pattern takes a hundred times as long as the search, and few files have a second header.
+        again = block.find(b"episode", block.find(b"\n") + 1) >= 0
+        headers = [found.end() for found in _BEFORE_HEADER.finditer(block)] if again else []
+        for start, end in pairwise([0, *headers, len(block)]):
+            rows = block[start:end]
+            if header is None or _HEADER.match(rows):
+                line, _, rows = rows.lstrip().partition(b"\n")
+                if not line:
+                    continue
+                try:
+                    header = _column_names(line)
+                except ValueError as error:
+                    if header is None:
+                        raise
+                    refused.append((blocks.line(start), str(error)))
+            table, bad = read_rows(with_plain_commas(rows), {len(header): header}, skip_blank=True)
             steps.add(table)
-        else:
-            header = _read_csv_lines(steps, refused, data, number, header)
-            if is_hopeless(steps, refused):
-                refused.append((None, REST_REFUSED))
-                break
+            if bad:
+                first = blocks.line(end - len(rows))
+                refused += [(first + place, reason) for place, reason in bad]
     if header is None:
         raise ValueError("empty" if not blocks.refused else blocks.refused[0][1])
     return steps, refused + blocks.refused
@@ -183,78 +186,57 @@ def _column_names(line: bytes) -> list[str]:
     return names
 
 
-def _read_csv_lines(
-    steps: StepTables, refused: Refused, data: bytes, first: int, header: Sequence[str]
-) -> Sequence[str]:
-    """Read lines of which some are not rows; return the header in force at the end."""
-    lines: list[bytes] = []
-    numbers: list[int] = []
-
-    def flush() -> None:
-        table, bad = read_rows(lines, {len(header): header}, may_stop=not steps.found_rows)
-        steps.add(table)
-        refused.extend((numbers[at], reason) for at, reason in bad)
-        lines.clear()
-        numbers.clear()
-
-    for number, line in enumerate(data.split(b"\n"), start=first):
-        line = line.rstrip(b"\r")
-        if not line.strip():
-            continue
-        if line.lstrip(b'" ').startswith(_HEADER):
-            flush()
-            try:
-                header = _column_names(line)
-            except ValueError as error:
-                refused.append((number, str(error)))
-            continue
-        lines.append(line)
-        numbers.append(number)
-    flush()
-    return header
-
-
 def read_rows(
-    lines: Sequence[bytes], layouts: Layouts, before: int | None = None, *, may_stop: bool = False
+    data: bytes, layouts: Layouts, before: int | None = None, *, skip_blank: bool = False
 ) -> tuple[pa.Table, list[tuple[int, str]]]:
     """Read the lines of a trace.
 
     A single line with fewer values than its neighbours is incomplete, even if an older generation had so many.
 
     Args:
-        lines: comma-separated values, without what precedes them in a log.
+        data: lines of comma-separated values, without what precedes them in a log.
         layouts: the columns by the number of values.
         before: how many values the line before the first had; None if there was none.
-        may_stop: stop at `MOST_REFUSED` lines if none of them is a row.
+        skip_blank: whether blank lines are ignored, not refused.
 
     Returns:
-        Rows in the order of lines with the columns of `SCHEMA`; and of the lines that are not rows, the index among
-        `lines` and the reason.
+        Rows in the order of lines with the columns of `SCHEMA`; and of the lines that are not rows, the index and the
+        reason.
     """
-    if not lines:
+    if not data:
         return SCHEMA.empty_table(), []
-    whole = _read_chunk(lines, layouts) if len(lines) > 1 or before is None else None
-    if whole is not None:
-        return whole, []
-    incomplete = _incomplete(np.array([line.count(b",") + 1 for line in lines]), before)
+    end = data.find(b"\n") + 1 or len(data)
+    width = data.count(b",", 0, end) + 1
+    if width in layouts and (end < len(data) or before is None):
+        alike = _read_alike(data, layouts[width])
+        if alike is not None and not alike.refused:
+            return alike.table(), []
+    # Arrow would end a line at a lone carriage return, too.
+    lines = data.replace(b"\r", b" ").removesuffix(b"\n").split(b"\n")
+    places = np.array([place for place, line in enumerate(lines) if not skip_blank or line.strip()], np.int64)
+    if not len(places):
+        return SCHEMA.empty_table(), []
+    widths = np.array([lines[place].count(b",") + 1 for place in places])
+    incomplete = _incomplete(widths, before)
     refused = [
-        (at, f"incomplete: {lines[at].count(b',') + 1} values, fewer than the lines around it")
-        for at in np.flatnonzero(incomplete).tolist()
+        (place, f"incomplete: {width} values, fewer than the lines around it")
+        for place, width in zip(places[incomplete].tolist(), widths[incomplete].tolist(), strict=True)
     ]
-    kept: list[int] = np.flatnonzero(~incomplete).tolist()
-    tables = []
-    for start in range(0, len(kept), _CHUNK):
-        places = kept[start : start + _CHUNK]
-        chunk = [lines[place] for place in places]
-        table = _read_chunk(chunk, layouts)
-        if table is None:
-            table, bad = _read_slowly(chunk, layouts)
-            refused += [(places[at], reason) for at, reason in bad]
-        tables.append(table)
-        if may_stop and len(refused) >= MOST_REFUSED and not any(one.num_rows for one in tables):
-            break
-    table = pa.concat_tables(tables) if tables else SCHEMA.empty_table()
-    return table, sorted(refused)
+    tables, order = [SCHEMA.empty_table()], [places[:0]]
+    for width in np.unique(widths[~incomplete]).tolist():
+        chosen = places[(widths == width) & ~incomplete]
+        if width not in layouts:
+            least, most = min(layouts), max(layouts)
+            reason = f"{width} values; accepted: {f'{least} to {most}' if most > least else least}"
+            refused += [(place, reason) for place in chosen.tolist()]
+            continue
+        alike = _read_alike(b"\n".join([lines[place] for place in chosen]), layouts[width])
+        assert alike is not None, "lines with as many values as the columns"
+        tables.append(alike.table())
+        order.append(np.delete(chosen, list(alike.refused)))
+        refused += [(int(chosen[place]), reason) for place, reason in alike.refused.items()]
+    whole = pa.concat_tables(tables).unify_dictionaries()
+    return whole.take(np.argsort(np.concatenate(order))), sorted(refused)
 
 
 def _incomplete(counts: NDArray[np.int64], before: int | None) -> NDArray[np.bool_]:
@@ -268,172 +250,130 @@ def _incomplete(counts: NDArray[np.int64], before: int | None) -> NDArray[np.boo
     return (counts < ahead) & (counts < after)
 
 
-def _read_chunk(lines: Sequence[bytes], layouts: Layouts) -> pa.Table | None:
-    columns = layouts.get(lines[0].count(b",") + 1)
-    return None if columns is None else _read_fast(b"\n".join(lines), columns, len(lines))
-
-
-def _read_fast(data: bytes, columns: Sequence[str], lines: int) -> pa.Table | None:
-    """Read flawless lines of the same columns; None if they are anything else.
-
-    What it accepts, it reads exactly as `_read_slowly` does.
-    """
-    kinds = {name: pa.float64() for name in columns}
-    kinds |= dict.fromkeys(_FLAGS, pa.bool_()) | {"action": pa.string()}
-    if "episode_status" in columns:
-        kinds["episode_status"] = pa.dictionary(pa.int32(), pa.string())
-    known = [name for name in columns if name in COMMON or name in LATER or name == _COUNTER_OR_CLOCK]
-    # Arrow would end a line at a lone carriage return, too.
-    if len(set(known)) != len(known) or (b"\r" in data and b"\r" in data.replace(b"\r\n", b"")):
-        return None
+def _read_alike(data: bytes, columns: Sequence[str]) -> "_Rows | None":
+    """Read lines that all have the same columns; None if they have not."""
+    # Of a column that appears twice the first one counts.
+    places = {name: str(place) for place, name in reversed(list(enumerate(columns))) if name in _READ}
+    names = [str(place) for place in range(len(columns))]
     try:
         read = arrow_csv.read_csv(
             pa.BufferReader(data),
-            arrow_csv.ReadOptions(column_names=list(columns), use_threads=False, block_size=len(data) + 1),
-            arrow_csv.ParseOptions(quote_char='"' if b'"' in data else False),
+            arrow_csv.ReadOptions(column_names=names, use_threads=False, block_size=len(data) + 1),
+            arrow_csv.ParseOptions(quote_char=False),
             arrow_csv.ConvertOptions(
-                column_types={name: kinds[name] for name in known},
-                include_columns=known,
-                null_values=[],
-                true_values=_TRUE,
-                false_values=_FALSE,
+                column_types=dict.fromkeys(names, pa.binary()), include_columns=list(places.values())
             ),
         )
-    except (pa.ArrowInvalid, UnicodeDecodeError):
-        return None
-    if read.num_rows != lines:
-        return None
-    return _checked({name: read[name] for name in known}, len(columns), lines)
-
-
-def _checked(read: dict[str, pa.ChunkedArray], values: int, rows: int) -> pa.Table | None:
-    """Return the table of `SCHEMA`, None if a value is out of range."""
-    if _COUNTER_OR_CLOCK in read:
-        numbers = read[_COUNTER_OR_CLOCK].to_numpy()
-        clock = numbers >= _EARLIEST_CLOCK_S
-        read["obstacle_crash_counter"] = pa.chunked_array([np.where(clock, math.nan, numbers)])
-        read["wall_clock"] = pa.chunked_array([np.where(clock, numbers, math.nan)])
-    columns: list[pa.ChunkedArray] = []
-    for name, kind in zip(SCHEMA.names, SCHEMA.types, strict=True):
-        column = read.get(name)
-        if name == "values":
-            column = np.full(rows, min(values, 127), np.int8)
-        elif column is None and name == "episode_status":
-            column = pa.DictionaryArray.from_arrays(np.zeros(rows, np.int32), pa.array([""]))
-        elif column is None:
-            column = np.full(rows, 0.0 if name == "pause_duration" else math.nan)
-        elif name in _WHOLE:
-            numbers = column.to_numpy()
-            # A NaN makes every comparison false.
-            if not (
-                ((numbers >= 0) & (numbers <= _WHOLE[name])).all() and (numbers == np.floor(numbers)).all()
-            ):
-                return None
-            column = numbers.astype(np.int32)
-        elif name == "action":
-            column = _actions(column)
-            if column is None:
-                return None
-        elif name == "episode_status":
-            words = {word for chunk in column.chunks for word in chunk.dictionary.to_pylist()}
-            if any(word != word.strip() or not _STATUS.fullmatch(word) for word in words):
-                return None
-        elif name == "track_len":
-            numbers = column.to_numpy()
-            if not ((numbers > 0) & (numbers <= _LARGEST[name])).all():
-                return None
-        elif pa.types.is_floating(kind):
-            numbers = column.to_numpy()
-            known = np.abs(numbers) <= _LARGEST[name]
-            if not (known | (np.isnan(numbers) & (name in LATER))).all():
-                return None
-        columns.append(column if isinstance(column, pa.ChunkedArray) else pa.chunked_array([column]))
-    return pa.Table.from_arrays(columns, schema=SCHEMA)
-
-
-def _actions(column: pa.ChunkedArray) -> pa.ChunkedArray | None:
-    """Return action numbers, NaN for a continuous action: [steer speed]."""
-    continuous = pc.and_(pc.starts_with(column, "["), pc.ends_with(column, "]"))
-    try:
-        numbers = pc.cast(pc.if_else(continuous, pa.scalar("nan"), column), pa.float64())
     except pa.ArrowInvalid:
         return None
-    discrete = numbers.to_numpy()[~continuous.to_numpy()]
-    return numbers if (np.abs(discrete) <= _LARGEST_ACTION).all() else None
+    rows = _Rows(read.num_rows, len(columns), has_lists=b"[" in data)
+    for name, place in places.items():
+        rows.add(name, read[place].chunk(0))
+    return rows
 
 
-def _read_slowly(lines: Sequence[bytes], layouts: Layouts) -> tuple[pa.Table, list[tuple[int, str]]]:
-    """Read line by line, and say what is wrong with those that are not rows."""
-    rows, refused = [], []
-    for index, line in enumerate(lines):
-        try:
-            rows.append(_row(line.decode("utf-8", "replace"), layouts))
-        except ValueError as error:
-            refused.append((index, str(error)))
-    return pa.Table.from_pylist(rows, schema=SCHEMA), refused
+class _Rows:
+    """Converts the columns of lines to values, and collects why lines are not rows."""
+
+    def __init__(self, count: int, width: int, has_lists: bool) -> None:
+        self.count = count
+        self.has_lists = has_lists
+        """Whether an action may be a list: [steering angle, speed]."""
+        self.refused: dict[int, str] = {}
+        """Reasons by the index of the line."""
+        self._columns: dict[str, Any] = {
+            "episode_status": pa.repeat("", count),
+            "pause_duration": np.zeros(count),
+            "obstacle_crash_counter": np.full(count, math.nan),
+            "wall_clock": np.full(count, math.nan),
+            "values": np.full(count, min(width, 127), np.int8),
+        }
+
+    def add(self, name: str, texts: pa.Array) -> None:
+        """Add a column of texts."""
+        if name in _FLAGS:
+            codes, words = _words(texts)
+            flags = np.array([_FLAG_OF.get(word, -1) for word in words])[codes]
+            self._refuse(name, texts, flags < 0, "True or False")
+            self._columns[name] = flags > 0
+        elif name == "episode_status":
+            codes, words = _words(texts)
+            is_status = np.array([_STATUS.fullmatch(word) is not None for word in words])
+            self._refuse(name, texts, ~is_status[codes], "a status of the service")
+            self._columns[name] = pa.array(words, pa.string()).take(codes)
+        else:
+            listed = np.zeros(self.count, np.bool_)
+            if name == "action" and self.has_lists:
+                is_list = pc.match_substring_regex(texts, rb"^\s*\[.*\]\s*$")
+                listed = is_list.to_numpy(zero_copy_only=False)
+                texts = pc.if_else(is_list, pa.scalar(b"nan"), texts)
+            numbers, unreadable = _numbers(texts)
+            self._refuse(name, texts, unreadable, "a number")
+            if name == _COUNTER_OR_CLOCK:
+                clock = numbers >= _EARLIEST_CLOCK_S
+                self._add_numbers("obstacle_crash_counter", texts, np.where(clock, math.nan, numbers))
+                self._add_numbers("wall_clock", texts, np.where(clock, numbers, math.nan))
+            elif name == "action":
+                accepted = f"an action up to {_LARGEST_ACTION}"
+                self._refuse(name, texts, ~(np.abs(numbers) <= _LARGEST_ACTION) & ~listed, accepted)
+                self._columns[name] = numbers
+            else:
+                self._add_numbers(name, texts, numbers)
+
+    def _add_numbers(self, name: str, texts: pa.Array, numbers: NDArray[np.float64]) -> None:
+        # A NaN makes every comparison false.
+        if name in _WHOLE:
+            last = _WHOLE[name]
+            bad = ~((numbers >= 0) & (numbers <= last) & (numbers == np.floor(numbers)))
+            self._refuse(name, texts, bad, f"a whole number from 0 to {last}")
+            numbers = np.where(bad, 0, numbers).astype(np.int32)
+        else:
+            most = _LARGEST[name]
+            bad = ~(np.abs(numbers) <= most) & ~(np.isnan(numbers) & (name in LATER))
+            self._refuse(name, texts, bad, f"a number from {-most:g} to {most:g}")
+            if name == "track_len":
+                self._refuse(name, texts, numbers <= 0, "a length above 0")
+        self._columns[name] = numbers
+
+    def _refuse(self, name: str, texts: pa.Array, bad: NDArray[np.bool_], accepted: str) -> None:
+        for place in np.flatnonzero(bad).tolist():
+            value = _text(texts[place].as_py())
+            shown = repr(value if len(value) <= 40 else f"{value[:39]}…")
+            self.refused.setdefault(place, f"{name} is {shown}; accepted: {accepted}")
+
+    def table(self) -> pa.Table:
+        """Return the lines that are rows, with the columns of `SCHEMA`."""
+        arrays = [pa.array(self._columns[name]) for name in SCHEMA.names]
+        if self.refused:
+            kept = np.delete(np.arange(self.count), list(self.refused))
+            arrays = [array.take(kept) for array in arrays]
+        status = SCHEMA.get_field_index("episode_status")
+        arrays[status] = arrays[status].dictionary_encode()
+        return pa.Table.from_arrays(arrays, schema=SCHEMA)
 
 
-def _row(line: str, layouts: Layouts) -> dict[str, object]:
-    """Read one line.
+def _words(texts: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
+    """Return texts of which there are few different ones as numbers in a list of these."""
+    encoded = texts.dictionary_encode()
+    return encoded.indices.to_numpy(), [_text(word) for word in encoded.dictionary.to_pylist()]
 
-    Raises:
-        ValueError: it is not a row; the message gives the reason.
-    """
+
+def _numbers(texts: pa.Array) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return texts as numbers, NaN for those that are none; and which are none."""
     try:
-        values = next(csv.reader([line]), []) if '"' in line else line.split(",")
-    except csv.Error as error:
-        raise ValueError(f"cannot be split into values ({error})") from error
-    columns = layouts.get(len(values))
-    if columns is None:
-        least, most = min(layouts), max(layouts)
-        accepted = f"{least} to {most}" if most > least else str(least)
-        raise ValueError(f"{len(values)} values; accepted: {accepted}")
-    # Of a column that appears twice the first one counts.
-    by_name = dict(zip(reversed(columns), reversed([value.strip() for value in values]), strict=True))
-    row: dict[str, object] = {"values": min(len(values), 127), "episode_status": "", "pause_duration": 0.0}
-    row |= {"obstacle_crash_counter": math.nan, "wall_clock": math.nan}
-    for name, value in by_name.items():
-        if name in COMMON or name in LATER:
-            row[name] = _value(name, value)
-        elif name == _COUNTER_OR_CLOCK:
-            number = _number("the value before the last", value)
-            named = "wall_clock" if number >= _EARLIEST_CLOCK_S else "obstacle_crash_counter"
-            row[named] = _value(named, value)
-    return row
+        return pc.cast(texts, pa.float64()).to_numpy(), np.zeros(len(texts), np.bool_)
+    except pa.ArrowInvalid:  # for one text that is no number, or has blanks around it
+        numbers = [_number(_text(text)) for text in texts.to_pylist()]
+        unreadable = np.array([number is None for number in numbers])
+        return np.array(numbers, np.float64), unreadable
 
 
-def _value(name: str, value: str) -> float | bool | str:
-    if name in _FLAGS:
-        if value not in (*_TRUE, *_FALSE):
-            raise ValueError(f"{name} is {_short(value)}; accepted: True or False")
-        return value in _TRUE
-    if name == "episode_status":
-        if not _STATUS.fullmatch(value):
-            raise ValueError(f"{name} is {_short(value)}; accepted: a status of the service")
-        return value
-    if name == "action" and value.startswith("[") and value.endswith("]"):
-        return math.nan
-    number = _number(name, value)
-    if name in _WHOLE:
-        if not (0 <= number <= _WHOLE[name] and number == math.floor(number)):
-            raise ValueError(f"{name} is {_short(value)}; accepted: a whole number from 0 to {_WHOLE[name]}")
-        return int(number)
-    if name == "action" and not abs(number) <= _LARGEST_ACTION:
-        raise ValueError(f"{name} is {_short(value)}; accepted: an action up to {_LARGEST_ACTION}")
-    if not abs(number) <= _LARGEST[name] and not (name in LATER and math.isnan(number)):
-        largest = _LARGEST[name]
-        raise ValueError(f"{name} is {_short(value)}; accepted: a number from {-largest:g} to {largest:g}")
-    if name == "track_len" and number <= 0:
-        raise ValueError(f"{name} is {_short(value)}; accepted: a length above 0")
-    return number
-
-
-def _number(name: str, value: str) -> float:
+def _number(text: str) -> float | None:
     try:
-        return float(value)
+        return float(text)
     except ValueError:
-        raise ValueError(f"{name} is {_short(value)}; accepted: a number") from None
+        return None
 
 
-def _short(value: str) -> str:
-    return repr(value if len(value) <= 40 else f"{value[:39]}…")
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", "replace").strip()

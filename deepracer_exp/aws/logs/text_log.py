@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .blocks import Blocks
 from .files import LogFile
-from .sim_trace import LOG_LAYOUTS, REST_REFUSED, StepTables, is_hopeless, read_rows, with_one_value_an_action
+from .sim_trace import LOG_LAYOUTS, StepTables, read_rows, with_plain_commas
 
 MARKER = b"SIM_TRACE_LOG:"
 """Precedes the values of a control step; anything may stand before it."""
@@ -167,17 +167,15 @@ def _read_checkpoints(log: TrainingLog, block: bytes) -> None:
 
 
 def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
-    if is_hopeless(log.steps, log.refused):
+    if log.steps.give_up(log.refused):
         return 0
-    lines = with_one_value_an_action(b"\n".join(_TRACE.findall(block))).split(b"\n")
-    table, refused = read_rows(lines, LOG_LAYOUTS, before, may_stop=not log.steps.found_rows)
+    rows = with_plain_commas(b"\n".join(_TRACE.findall(block)) + b"\n")
+    table, refused = read_rows(rows, LOG_LAYOUTS, before)
     log.steps.add(table)
     if refused:
         starts = [found.start() for found in _TRACE.finditer(block)]
         log.refused += [(_line(block, starts[at], lines_before), reason) for at, reason in refused]
-        if is_hopeless(log.steps, log.refused):
-            log.refused.append((None, REST_REFUSED))
-    return int(lines[-1].count(b",")) + 1
+    return rows.count(b",", rows.rfind(b"\n", 0, -1) + 1) + 1
 
 
 def _read_updates(log: TrainingLog, block: bytes, lines_before: int) -> None:
