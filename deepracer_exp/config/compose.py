@@ -36,7 +36,7 @@ from .custom_files import FileOverrides, file_overrides, read_custom_files
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
 from .experiment import Experiment
-from .options import conf_dirs, find, groups, listed, options
+from .options import SWEEP, conf_dirs, find, groups, listed, options, sweep_files
 from .overrides import PLAIN_TEXT, line_for_hydra, override_line, parse_single, parse_sweep
 from .own_class import allow, allow_given, own_option
 from .parse import import_own_classes, parse_config, parse_experiment
@@ -230,7 +230,9 @@ class OptionFiles(FileConfigSource):
         return world_values(option.removesuffix(".yaml")) if group == TRACK else None
 
     def _file(self, config_path: str) -> Path:
-        return Path(self.path, self._normalize_file_name(config_path))
+        group, _, name = config_path.rpartition("/")
+        study = sweep_files().get(name.removesuffix(".yaml")) if group == SWEEP else None
+        return study or Path(self.path, self._normalize_file_name(config_path))
 
     @staticmethod
     def _is_below(config_path: str) -> bool:

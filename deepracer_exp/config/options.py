@@ -1,4 +1,4 @@
-"""Where option files are: the project's `conf/`, and `./conf` in the working directory."""
+"""Where option files are: `conf/` and `sweeps/` of the project, `./conf` and `./sweeps` of the working directory."""
 
 import re
 from collections.abc import Sequence
@@ -13,14 +13,21 @@ from deepracer_exp.files import read_bytes, read_text
 
 from .own_class import registered
 
+SWEEP = "sweep"
+"""The group whose options are the ready-made studies."""
 MOST_LISTED = 24
 """Most options that a message lists."""
 
 
+def project_dir(name: str) -> Path:
+    """Return a folder of the repository (`conf`, `reward_zoo`, `sweeps`); an installed wheel has a copy in `data/`."""
+    packed = Path(__file__).parents[1] / "data" / name
+    return packed if packed.is_dir() else Path(__file__).parents[2] / name
+
+
 def conf_dir() -> Path:
-    """Return the project's folder: beside the code in an installed wheel, else the repository's."""
-    packaged = Path(__file__).parents[1] / "conf"
-    return packaged if packaged.is_dir() else Path(__file__).parents[2] / "conf"
+    """Return the project's folder of options."""
+    return project_dir("conf")
 
 
 def conf_dirs() -> list[Path]:
@@ -46,6 +53,21 @@ def conf_dirs() -> list[Path]:
         ) from error
 
 
+def sweep_files() -> dict[str, Path]:
+    """Return the options of the group `sweep` by name: the studies in `sweeps/` and `./sweeps`, and those in `conf/`.
+
+    Raises:
+        BadInput: two of them have the same name and different contents.
+    """
+    files: dict[str, Path] = {}
+    for folder in (project_dir("sweeps"), conf_dir() / SWEEP, Path("sweeps"), Path("conf", SWEEP)):
+        for path in sorted(folder.glob("*.yaml")):
+            namesake = files.setdefault(path.stem, path)
+            if namesake != path and read_bytes(path, "an option") != read_bytes(namesake, "an option"):
+                raise BadInput(f"{path}: {namesake} has the same name; rename the file")
+    return files
+
+
 def find(name: str) -> str:
     """Return the path of a file among the options, e.g. ``reward/mine.py``, in the first folder that has it."""
     paths = [folder / name for folder in conf_dirs()]
@@ -62,6 +84,8 @@ def groups(entry: str = "train") -> list[str]:
 def options(group: str) -> list[str]:
     """Return the sorted names of a group's options; the service's worlds and entry points have no file."""
     files = {path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")}
+    if group == SWEEP:
+        files |= sweep_files().keys()
     return sorted(files | (worlds() if group == "track" else registered(group)).keys())
 
 

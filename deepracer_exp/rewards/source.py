@@ -4,10 +4,10 @@ import ast
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 from deepracer_exp.config.driving import RewardConfig
+from deepracer_exp.config.options import project_dir
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.files import read_bytes
 
@@ -27,6 +27,8 @@ class RewardSource:
     """The values that replace them."""
 
 
+_ZOO = "reward_zoo"
+
 NO_REWARD = RewardSource(
     name="none",
     path="none",
@@ -40,8 +42,7 @@ NO_REWARD = RewardSource(
 
 def zoo_names() -> list[str]:
     """Return the names of the reward functions that come with the project, sorted."""
-    files = (file.name for file in resources.files("reward_zoo").iterdir())
-    return sorted(name[:-3] for name in files if name.endswith(".py") and not name.startswith("_"))
+    return sorted(path.stem for path in project_dir(_ZOO).glob("*.py"))
 
 
 def load_reward_source(config: RewardConfig) -> RewardSource:
@@ -118,7 +119,7 @@ def _zoo_file(name: str) -> tuple[str, bytes]:
         raise BadInput(
             f"reward.name: {name!r} is not in the reward zoo{nearest(name, known)}: {', '.join(known)}"
         )
-    file = resources.files("reward_zoo") / f"{name}.py"
+    file = project_dir(_ZOO) / f"{name}.py"
     return str(file), file.read_bytes()
 
 

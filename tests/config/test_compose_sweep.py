@@ -1,5 +1,6 @@
 import dataclasses
 import re
+from pathlib import Path
 
 import pytest
 import yaml
@@ -9,13 +10,26 @@ from hypothesis import strategies as st
 from deepracer_exp.addresses import with_password
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.dimension import Choices, Range, as_override, dimension, override_value
-from deepracer_exp.config.options import conf_dir, options
+from deepracer_exp.config.options import conf_dir, options, project_dir, sweep_files
 from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.config.sweep import SweepConfig, SweepEntry, compose_sweep
 from tests.conftest import refused
 
 READY = [name for name in options("sweep") if name != "own"]
-FILES = ["sweep", *(f"sweep/{name}" for name in options("sweep")), "sweep/executor/local"]
+FILES = [conf_dir() / "sweep.yaml", *sweep_files().values(), conf_dir() / "sweep/executor/local.yaml"]
+
+
+@pytest.fixture
+def study(here):
+    """Write a study into the working folder."""
+
+    def write(name: str, text: str) -> Path:
+        path = here / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    return write
 
 
 def refusal(*overrides: str) -> str:
@@ -36,12 +50,49 @@ def test_every_ready_made_sweep_has_the_keys_of_its_dataclass(name):
     assert bool(request.space) == (name != "own")
 
 
-@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_every_key_is_explained(file):
-    lines = (conf_dir() / f"{file}.yaml").read_text().splitlines()
+    lines = file.read_text().splitlines()
     for above, line in zip(["", *lines], lines, strict=False):
         if re.match(r"(?!defaults)\w+:", line):
             assert above.startswith("#"), f"{file}: {line} has no comment above it"
+
+
+@pytest.mark.parametrize("name", READY)
+def test_every_ready_made_study_begins_with_the_question_that_it_answers(name):
+    comment = re.match(r"(?:#.*\n)+", sweep_files()[name].read_text())
+    assert "?" in comment.group()
+
+
+def test_a_study_of_the_working_folder_may_build_on_a_ready_made_one(study):
+    study("sweeps/mine.yaml", "defaults: [lr_entropy, _self_]\ntrials: 7\n")
+    study("conf/sweep/other.yaml", "defaults: [mine, _self_]\nseeds: 2\n")
+    ready, mine, other = (compose_sweep([f"sweep={name}"]) for name in ("lr_entropy", "mine", "other"))
+    assert mine.space == other.space == ready.space
+    assert mine.entry.sweep == dataclasses.replace(ready.entry.sweep, trials=7)
+    assert other.entry.sweep == dataclasses.replace(mine.entry.sweep, seeds=2)
+    assert (mine.study, other.study) == ("mine", "other")
+    assert options("sweep") == sorted([*READY, "own", "mine", "other"])
+
+
+@pytest.mark.parametrize("folder", ["sweeps", "conf/sweep"])
+@pytest.mark.parametrize("name", ["lr_entropy", "own"])
+def test_a_study_with_the_name_of_another_one_is_refused(study, folder, name):
+    text = sweep_files()[name].read_text()
+    file = study(f"{folder}/{name}.yaml", text)
+    compose_sweep(["sweep=network"])
+    file.write_text("trials: 3\n")
+    assert f"{folder}/{name}.yaml" in refusal("sweep=network")
+    file.unlink()
+    study("sweeps/mine.yaml", text)
+    study("conf/sweep/mine.yaml", "trials: 3\n")
+    assert "conf/sweep/mine.yaml: sweeps/mine.yaml has the same name" in refusal("sweep=network")
+
+
+def test_a_study_that_cannot_be_read_is_refused_by_its_file(study):
+    study("sweeps/mine.yaml", "trials: [\n")
+    assert "sweeps/mine.yaml" in refusal("sweep=mine")
+    compose_sweep(["sweep=network"])
 
 
 def test_trials_are_judged_by_twenty_laps_on_both_conditions():
@@ -79,7 +130,7 @@ def test_the_address_of_a_database_needs_no_quotes():
 
 
 def test_the_command_line_takes_the_place_of_what_a_ready_made_sweep_searches():
-    ready = yaml.safe_load((conf_dir() / "sweep/lr_entropy.yaml").read_text())["space"]
+    ready = yaml.safe_load((project_dir("sweeps") / "lr_entropy.yaml").read_text())["space"]
     request = compose_sweep(
         ["sweep=lr_entropy", "algorithm.lr=0.001", "algorithm.entropy_coeff=0.01,0.02", "budget=short"]
     )
