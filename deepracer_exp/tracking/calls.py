@@ -30,10 +30,6 @@ class StoreRefusedError(Exception):
     """The store refused the call: repeating it would change nothing."""
 
 
-class FileGoneError(StoreRefusedError):
-    """A file that was to be recorded no longer exists."""
-
-
 class BoundedClient:
     """A client of MLflow of which every call ends; in all they take at most `total_s`.
 
@@ -96,7 +92,7 @@ def store_errors() -> Iterator[None]:
             raise StoreRefusedError(_sentence(error)) from error
         raise StoreUnavailableError(_sentence(error)) from error
     except FileNotFoundError as error:
-        raise FileGoneError(str(error)) from error
+        raise StoreRefusedError(str(error)) from error
     except (OSError, SQLAlchemyError, ParseError) as error:
         raise StoreUnavailableError(_sentence(error)) from error
 

@@ -4,21 +4,18 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.files import METRICS, SUMMARY, TRACKING, read_metrics, read_object, read_run_id
-from deepracer_exp.runs.labels import USER_TAG, Labels, read_labels
+from deepracer_exp.runs.files import SUMMARY, TRACKING, read_object, read_run_id
+from deepracer_exp.runs.labels import USER_TAG, Labels
 from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
 
 from .calls import StoreRefusedError, StoreUnavailableError
-from .metadata import END_TAG, NAME, USER_NOTE, label_tags
-from .metrics import now_ms, points_at, points_of
-from .store import Store, has_store, open_client, resolve_store
-from .tracking_file import Status, TrackedRun, TrackingFile, read_tracked_run
-
-if TYPE_CHECKING:
-    from .mlflow_run import MLflowRun
+from .metadata import NAME, USER_NOTE, label_tags
+from .metrics import now_ms, points_at
+from .projection import Projection
+from .store import has_store, open_client, resolve_store
+from .tracking_file import Status, TrackingFile, read_tracked_run
 
 ENDS: dict[str, Status] = {FINISHED: "FINISHED", STOPPED_EARLY: "FINISHED", FAILED: "FAILED"}
 """MLflow's word for the `status` in a run's summary; any other is KILLED."""
@@ -43,33 +40,22 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
         raise BadInput(
             f"{run_dir}: has no summary.json, so the run has not ended; only ended runs can be recorded afterwards"
         )
-    metrics = run_dir / METRICS
-    rows = read_metrics(metrics) if metrics.exists() else []
     store = resolve_store(uri, runs_dir)
     file = TrackingFile.read(run_dir / TRACKING, store.shown)
+    if file.run.status is None:  # killed before it noted its end
+        file.change(status=ENDS.get(summary["status"], "KILLED"), end_ms=now_ms())
+    projection = Projection(store, file)
     try:
-        with _connected(store) as run:
-            run.reopen(file.run)
-            file.change(run_id=run.run_id)
-            run.log_params(file.run.params)
-            written = run.log_metrics(
-                [point for row in rows for point in points_of(row, row["env_steps"], file.run.start_ms)]
-            )
-            _log_files(run, run_dir, file.run)
-            run.conclude(file.run, summary)
-            run.set_tags(
-                {END_TAG: f"{summary['status']}: {summary['reason']}"} | label_tags(read_labels(run_dir))
-            )
-            run.end(file.run.status or ENDS.get(summary["status"], "KILLED"), file.run.end_ms or now_ms())
-            file.change(complete=True)
-    except StoreRefusedError as error:
-        raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused it: {error}") from error
+        refused = projection.update()
     except StoreUnavailableError as error:
         raise RunFailed(
             f"{run_dir}: MLflow ({store.shown}) does not answer; the run folder keeps what is missing there:"
             f" {error}"
         ) from error
-    return written
+    for what, reason in refused.items():
+        raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused {what}: {reason}")
+    file.change(complete=True)
+    return projection.written
 
 
 def deliver_evaluation(
@@ -92,11 +78,14 @@ def deliver_evaluation(
     try:
         if recorded is not None and not store.is_named(recorded):
             raise StoreRefusedError(f"its run is in {recorded}; give tracking.uri={recorded}")
-        with _connected(store) as run:
-            run.run_id = run_id
-            run.log_metrics(points_at(metrics, env_steps, now_ms()))
-            for file, folder in files.items():
-                run.log_artifact(file, folder)
+        from .mlflow_run import MLflowRun
+
+        run = MLflowRun(store)
+        run.connect()
+        run.run_id = run_id
+        run.log_metrics(points_at(metrics, env_steps, now_ms()))
+        for file, folder in files.items():
+            run.log_artifact(file, folder)
     except (StoreRefusedError, StoreUnavailableError) as error:
         _log.warning(
             "MLflow (%s): this evaluation was not recorded; evaluate again later: %s",
@@ -179,24 +168,3 @@ def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) 
     if is_active:
         with open_client(f"{run_dir}: deleted here, but not marked in MLflow", uri, runs_dir) as client:
             client.delete_run(run_id)
-
-
-@contextmanager
-def _connected(store: Store) -> "Iterator[MLflowRun]":
-    from .mlflow_run import MLflowRun
-
-    run = MLflowRun(store)
-    run.connect()
-    yield run
-
-
-def _log_files(run: "MLflowRun", run_dir: Path, tracked: TrackedRun) -> None:
-    for name, folder in tracked.files.items():
-        path = run_dir / name
-        if not path.resolve().is_relative_to(run_dir.resolve()):
-            # Files outside of the run folder may have changed since.
-            _log.warning("%s: is outside the run's folder and was not sent to MLflow", path)
-        elif path.exists():
-            run.log_artifact(path, folder)
-        else:
-            _log.warning("%s: no longer exists and was not sent to MLflow", path)

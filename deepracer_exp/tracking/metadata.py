@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -212,8 +212,8 @@ def race_result(metrics: Mapping[str, float | None]) -> str:
     return ", ".join(parts) or "no complete lap"
 
 
-def result_note(summary: Mapping[str, Any], run_id: str, files: Mapping[str, Any]) -> str:
-    """Return the result of a run, for the top of its description; `files` are those that MLflow has."""
+def result_note(summary: Mapping[str, Any], run_id: str, files: Collection[str]) -> str:
+    """Return the result of a run, for the top of its description; `files` are the names of those that MLflow has."""
     best = summary.get("best")
     lines = [f"**{summary['status']}**: {summary['reason']}"]
     if best is not None:

@@ -97,6 +97,11 @@ def best_metrics(summary: Mapping[str, Any]) -> dict[str, float | None]:
     }
 
 
+def without_evaluation(row: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Return a row of metrics.jsonl without the columns of an evaluation."""
+    return {key: value for key, value in row.items() if not metric_name(key).startswith("race/")}
+
+
 def evaluate_metric(column: str, track: str | None) -> str:
     """Return MLflow's name of a result of `deepracer-exp evaluate`, on one of several tracks or on all.
 

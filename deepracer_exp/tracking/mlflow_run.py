@@ -6,7 +6,7 @@ timestamp and value, and parameters, tags, files and the end status are the same
 request of a killed process that a slow server handles late does no harm either.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -20,7 +20,7 @@ from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_B
 
 from deepracer_exp.addresses import without_passwords
 
-from .calls import FileGoneError, StoreRefusedError, pages, store_errors
+from .calls import StoreRefusedError, pages, store_errors
 from .metadata import (
     END_TAG,
     EXPERIMENT_TAGS,
@@ -43,15 +43,22 @@ class MLflowRun:
     """A run in a store and the calls that record it.
 
     Every method raises StoreUnavailableError or StoreRefusedError.
+
+    Attributes:
+        run_id: MLflow's id, once the run is open.
+        metrics: the newest value of each metric.
     """
 
     def __init__(self, store: Store) -> None:
         self.run_id: str | None = None
+        self.metrics: dict[str, float] = {}
         self._store = store
         self._client: MlflowClient
-        self._params: Mapping[str, str] = {}
-        self._is_reopened = False
-        self._there: dict[str, set[int]] = {}
+        self._params: dict[str, str] = {}
+        self._tags: dict[str, str] = {}
+        self._is_new = True
+        self._steps: dict[str, set[int]] = {}
+        """Steps of the points that the store has, by metric."""
 
     def connect(self) -> None:
         """Open the store, creating it if necessary."""
@@ -60,79 +67,83 @@ class MLflowRun:
                 _create_whole(file)
             self._client = client_of(self._store)
 
-    def create(self, tracked: TrackedRun, *, again: bool) -> None:
-        """Create the run; with `again`, first look whether an earlier attempt created it without an answer."""
-        tags = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tracked.tags.items()}
+    def open(self, tracked: TrackedRun) -> None:
+        """Create the run, or continue it if the store has it already, with or without an answer that said so."""
+        self.run_id = tracked.run_id
         with store_errors():
-            experiment_id = self._experiment_id(tracked.experiment)
-            if again:
+            if self.run_id is None:
+                experiment_id = self._experiment_id(tracked.experiment)
                 self.run_id = self._find(experiment_id, tracked)
             if self.run_id is None:
-                run = self._client.create_run(experiment_id, tracked.start_ms, tags, tracked.run_name)
-                self.run_id = run.info.run_id
+                self.run_id = self._create(experiment_id, tracked)
+                return
+            run = self._client.get_run(self.run_id)
+            if run.info.lifecycle_stage != "active":
+                raise StoreRefusedError(f"run {self.run_id} was deleted in MLflow; restore it there")
+            self._client.update_run(self.run_id, status="RUNNING")
+            self._params, self._tags, self.metrics = run.data.params, run.data.tags, run.data.metrics
+            if END_TAG in self._tags and END_TAG not in tracked.tags:
+                self._client.delete_tag(self.run_id, END_TAG)
+                del self._tags[END_TAG]
+        self._is_new = False
 
-    def create_once(self, tracked: TrackedRun, mark: Sequence[str]) -> None:
-        """Create a run, or reopen the oldest one in its experiment that has the same values of the tags `mark`.
+    def open_only(self, tracked: TrackedRun, mark: Sequence[str]) -> None:
+        """Create a run, or continue the oldest one of its experiment that has the same values of the tags `mark`.
 
         Of two processes that create it at once, one sees the other's, continues that and deletes its own; MLflow has
         no way to be sure of it, so that rarely there may be two.
         """
         sought = {key: tracked.tags[key] for key in mark}
         with store_errors():
-            oldest = self._oldest(self._experiment_id(tracked.experiment), sought)
-        if oldest is None:
-            self.create(tracked, again=False)
-            with store_errors():
-                oldest = self._oldest(self._experiment_id(tracked.experiment), sought)
+            experiment_id = self._experiment_id(tracked.experiment)
+            oldest = self._oldest(experiment_id, sought)
+            if oldest is None:
+                self.run_id = self._create(experiment_id, tracked)
+                oldest = self._oldest(experiment_id, sought)
                 if oldest in (None, self.run_id):
                     return
                 self._client.delete_run(self.run_id)
-        self.reopen(replace(tracked, run_id=oldest))
-
-    def reopen(self, tracked: TrackedRun) -> None:
-        """Continue a run that another process recorded, whether or not MLflow has it already.
-
-        Parameters and points that the store already has are not written again.
-        """
-        self.run_id = tracked.run_id
-        if self.run_id is None:
-            self.create(tracked, again=True)
-        with store_errors():
-            run = self._client.get_run(self.run_id)
-            if run.info.lifecycle_stage != "active":
-                raise StoreRefusedError(f"run {self.run_id} was deleted in MLflow; restore it there")
-            self._client.update_run(self.run_id, status="RUNNING")
-            if END_TAG in run.data.tags and END_TAG not in tracked.tags:
-                self._client.delete_tag(self.run_id, END_TAG)
-        self._params = run.data.params
-        self._is_reopened = True
-        self._there = {}
-        # MLflow's own tags, such as the description, may have been edited in the UI.
-        self.set_tags({key: value for key, value in tracked.tags.items() if not key.startswith("mlflow.")})
+        self.open(replace(tracked, run_id=oldest))
 
     def log_params(self, params: Mapping[str, str]) -> None:
-        """Write the parameters."""
-        rest = iter((key, value) for key, value in params.items() if key not in self._params)
+        """Write the parameters that the store lacks."""
+        rest = iter([(key, value) for key, value in params.items() if key not in self._params])
         with store_errors():
-            while chunk := [Param(key, value) for key, value in islice(rest, MAX_PARAMS_TAGS_PER_BATCH)]:
-                self._client.log_batch(self.run_id, params=chunk)
+            while some := dict(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
+                self._client.log_batch(self.run_id, params=[Param(*item) for item in some.items()])
+                self._params |= some
 
-    def log_metrics(self, points: Sequence[Point]) -> int:
-        """Write points, for a reopened run only the missing ones, and return their number."""
+    def lacking(self, points: Sequence[Point]) -> list[Point]:
+        """Return the points of which the store has none of the same metric and step."""
         with store_errors():
-            missing = [point for point in points if not self._has(point)] if self._is_reopened else points
-            for start in range(0, len(missing), MAX_METRICS_PER_BATCH):
-                chunk = [Metric(*point) for point in missing[start : start + MAX_METRICS_PER_BATCH]]
-                self._client.log_batch(self.run_id, metrics=chunk)
-        return len(missing)
+            for key in {point[0] for point in points} - self._steps.keys():
+                history = [] if self._is_new else self._client.get_metric_history(self.run_id, key)
+                self._steps[key] = {point.step for point in history}
+        return [point for point in points if not self.has(point)]
+
+    def has(self, point: Point) -> bool:
+        """Return whether the store is known to have a point of this metric and step."""
+        key, _, _, step = point
+        return step in self._steps.get(key, ())
+
+    def log_metrics(self, points: Sequence[Point]) -> None:
+        """Write points."""
+        with store_errors():
+            for start in range(0, len(points), MAX_METRICS_PER_BATCH):
+                some = points[start : start + MAX_METRICS_PER_BATCH]
+                self._client.log_batch(self.run_id, metrics=[Metric(*point) for point in some])
+                for key, value, _, step in some:
+                    self._steps.setdefault(key, set()).add(step)
+                    self.metrics[key] = value
 
     def set_tags(self, tags: Mapping[str, str]) -> None:
-        """Write tags."""
-        rest = iter(tags.items())
+        """Write the tags that are not as they should be."""
+        whole = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tags.items()}
+        rest = iter([(key, value) for key, value in whole.items() if self._tags.get(key) != value])
         with store_errors():
-            while some := list(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
-                chunk = [RunTag(key, value[:MAX_TAG_VAL_LENGTH]) for key, value in some]
-                self._client.log_batch(self.run_id, tags=chunk)
+            while some := dict(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
+                self._client.log_batch(self.run_id, tags=[RunTag(*item) for item in some.items()])
+                self._tags |= some
 
     def set_experiment_tags(self, tags: Mapping[str, str]) -> None:
         """Write tags of the run's experiment."""
@@ -151,20 +162,19 @@ class MLflowRun:
                 if but not in run.data.tags and PARENT not in run.data.tags:
                     self._client.set_tag(run.info.run_id, PARENT, self.run_id)
 
-    def conclude(self, tracked: TrackedRun, summary: Mapping[str, Any]) -> None:
+    def conclude(self, tracked: TrackedRun, summary: Mapping[str, Any], files: Collection[str]) -> None:
         """Record the best checkpoint, in the metrics and the descriptions of the run and of its experiment.
 
-        An edited description is kept.
+        `files` are the names of those that the store has. An edited description is kept.
         """
         if best := summary.get("best"):
-            self.log_metrics(
-                points_at(best_metrics(summary), best["env_steps"], tracked.end_ms or tracked.start_ms)
-            )
+            end_ms = tracked.end_ms or tracked.start_ms
+            self.log_metrics(self.lacking(points_at(best_metrics(summary), best["env_steps"], end_ms)))
         with store_errors():
             run = self._client.get_run(self.run_id)
             begun, now = tracked.tags.get(NOTE, ""), run.data.tags.get(NOTE, "")
             if now.endswith(begun):
-                note = result_note(summary, run.info.run_id, tracked.files)
+                note = result_note(summary, run.info.run_id, files)
                 self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
             self._describe_experiment(run.info.experiment_id)
 
@@ -195,7 +205,7 @@ class MLflowRun:
         """Copy a file, or all files of a folder, to the run's artifacts under `folder`."""
         with store_errors():
             if not path.exists():
-                raise FileGoneError(f"{path} is gone")
+                raise StoreRefusedError(f"{path} is gone")
             if self._store.sqlite_file is not None:
                 self._refuse_far_files()
             copy = self._client.log_artifacts if path.is_dir() else self._client.log_artifact
@@ -231,6 +241,11 @@ class MLflowRun:
             )
         return found.experiment_id
 
+    def _create(self, experiment_id: str, tracked: TrackedRun) -> str:
+        self._tags = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tracked.tags.items()}
+        run = self._client.create_run(experiment_id, tracked.start_ms, self._tags, tracked.run_name)
+        return run.info.run_id
+
     def _find(self, experiment_id: str, tracked: TrackedRun) -> str | None:
         began = f"attributes.start_time = {tracked.start_ms}"
         wanted = (tracked.run_name, tracked.tags.get("run_dir"))
@@ -242,13 +257,6 @@ class MLflowRun:
     def _oldest(self, experiment_id: str, tags: Mapping[str, str]) -> str | None:
         runs = self._client.search_runs([experiment_id], _with(tags), ViewType.ACTIVE_ONLY)
         return min(((run.info.start_time, run.info.run_id) for run in runs), default=(0, None))[1]
-
-    def _has(self, point: Point) -> bool:
-        """Return whether the store has a point of this key and step; each key is looked up once."""
-        key, _, _, step = point
-        if key not in self._there:
-            self._there[key] = {found.step for found in self._client.get_metric_history(self.run_id, key)}
-        return step in self._there[key]
 
 
 def _with(tags: Mapping[str, str]) -> str:

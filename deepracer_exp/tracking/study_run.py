@@ -8,14 +8,15 @@ import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .calls import StoreRefusedError, StoreUnavailableError
+from .calls import StoreRefusedError, StoreUnavailableError, ended_within
 from .metadata import END_TAG, NOTE, PARENT, STUDY, param_text, study_view, user_tags
 from .metrics import now_ms, points_at, trial_metrics
 from .store import Store
-from .store_thread import StoreThread
+from .store_thread import StoreThread, refused_of
 from .tracking_file import Status, TrackedRun
 
 if TYPE_CHECKING:
@@ -83,74 +84,92 @@ class StudyRun:
         params = _params(space, base)
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
         tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE, **user_tags()}
+        self._store = store
         self._tracked = TrackedRun(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
-        self._lock = threading.Lock()
+        self._run: MLflowRun | None = None
         self._progress: Progress | None = None
-        self._last_metrics: Mapping[str, float | None] = {}
+        self._written: Progress | None = None
+        """Progress that MLflow has."""
+        self._files: list[Path] = []
+        self._status: Status | None = None
+        self._is_shown, self._is_ended = False, False
         self._is_late = False
         """Whether trials have started without the id of this run."""
         self._settled = threading.Event()
-        self._thread = StoreThread(store, "the sweep continues", self._settled.set)
-        self._thread.put("the study's run", self._begin, vital=True)
-        self._thread.put("the study's view", self._show_trials)
+        self._thread = StoreThread(self._update, store.shown, "the sweep continues")
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
         """Return the run's id in MLflow; None if the store refuses or does not answer in time."""
-        self._is_late |= not self._settled.wait(deadline_s)
+        self._settled.wait(deadline_s)
+        self._is_late |= self.run_id is None
         return self.run_id
 
     @property
     def run_id(self) -> str | None:
         """MLflow's id of the run, once it exists."""
-        run = self._thread.run
-        return None if run is None or self._thread.is_rejected or not self._settled.is_set() else run.run_id
+        return None if self._run is None else self._run.run_id
 
     def update(self, progress: Progress) -> None:
         """Record the progress of the study; returns at once."""
-        with self._lock:
-            self._progress = progress
-        self._thread.put("the study's progress", self._write_progress)
+        self._progress = progress
 
     def log_file(self, path: Path) -> None:
         """Store a file with the run, such as the report; it is read later, and replaces one of the same name."""
-        self._thread.put(f"file {path}", lambda run, _: run.log_artifact(path, None))
+        self._files.append(path)
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
         """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
-        is_ended = self._thread.finish(lambda run, _: _end(run, status, _ENDS[status]), deadline_s)
-        if not is_ended:
-            _log.warning("MLflow (%s): the study's run could not be marked %s", self._tracked.store, status)
-        return is_ended
+        self._status = status
+        self._thread.finish(deadline_s)
+        if not self._is_ended:
+            _log.warning("MLflow (%s): the study's run could not be marked %s", self._store.shown, status)
+        return self._is_ended
 
-    def _begin(self, run: "MLflowRun", _: bool) -> None:
-        run.create_once(self._tracked, (STUDY, SEARCH, KIND))
-        run.log_params(self._tracked.params)
-        self._settled.set()
+    def _update(self) -> Mapping[str, str]:
+        """Write what MLflow lacks; return what it refuses, with the reasons."""
+        try:
+            run = self._opened()
+        except StoreRefusedError as error:
+            self._settled.set()
+            return {"the study's run": str(error)}
+        return refused_of(
+            {
+                "the study's view": lambda: self._show_trials(run),
+                "the study's progress": lambda: self._write_progress(run),
+                **{f"file {path}": partial(self._write_file, run, path) for path in list(self._files)},
+                "the end": lambda: self._end(run),
+            }
+        )
 
-    def _show_trials(self, run: "MLflowRun", _: bool) -> None:
+    def _opened(self) -> "MLflowRun":
+        from .mlflow_run import MLflowRun
+
+        if self._run is None:
+            run = MLflowRun(self._store)
+            run.connect()
+            run.open_only(self._tracked, (STUDY, SEARCH, KIND))
+            run.log_params(self._tracked.params)
+            self._run = run
+            self._settled.set()
+        return self._run
+
+    def _show_trials(self, run: "MLflowRun") -> None:
+        if self._is_shown:
+            return
         self._adopt(run)
         study = self._tracked.tags[STUDY]
         run.set_experiment_tags({STUDY: study, **study_view(self._objectives, self._searched)})
+        self._is_shown = True
 
     def _adopt(self, run: "MLflowRun") -> None:
         run.adopt({STUDY: self._tracked.tags[STUDY]}, but=KIND)
 
-    def _write_progress(self, run: "MLflowRun", _: bool) -> None:
-        """Write the newest progress, unless an earlier call has written it."""
-        with self._lock:
-            progress, self._progress = self._progress, None
-        if progress is None:
+    def _write_progress(self, run: "MLflowRun") -> None:
+        progress = self._progress
+        if progress is None or progress is self._written:
             return
-        try:
-            self._write(run, progress)
-        except StoreUnavailableError:
-            with self._lock:
-                self._progress = self._progress or progress
-            raise
-
-    def _write(self, run: "MLflowRun", progress: Progress) -> None:
         tags = {"sweep.progress": str(progress), NOTE: self._note(progress)}
         if progress.best_trial is not None:
             tags["sweep.best_trial"] = str(progress.best_trial)
@@ -164,10 +183,20 @@ class StudyRun:
             run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
         if self._is_late:
             self._adopt(run)
+        points = points_at(metrics, progress.ended, now_ms())
         # Also when no trial has ended since: in the end another one may be the best.
-        if metrics != self._last_metrics:
-            run.log_metrics(points_at(metrics, progress.ended, now_ms()))
-            self._last_metrics = metrics
+        if any(run.metrics.get(key) != value for key, value, *_ in points):
+            run.log_metrics(points)
+        self._written = progress
+
+    def _write_file(self, run: "MLflowRun", path: Path) -> None:
+        run.log_artifact(path, None)
+        self._files.remove(path)
+
+    def _end(self, run: "MLflowRun") -> None:
+        if self._status is not None:
+            _end(run, self._status, _ENDS[self._status])
+            self._is_ended = True
 
     def _note(self, progress: Progress) -> str:
         """Return the description above the run, Markdown."""
@@ -199,7 +228,7 @@ def open_trial_run(
     tracked = TrackedRun(None, f"trial {trial}", study, now_ms(), store.shown, _params({}, base), tags)
 
     def open_run(run: "MLflowRun") -> None:
-        run.create_once(tracked, (STUDY, KIND, TRIAL, PARENT))
+        run.open_only(tracked, (STUDY, KIND, TRIAL, PARENT))
         run.log_params(tracked.params)
 
     return _within(deadline_s, store, f"trial {trial} has no run there", open_run)
@@ -211,8 +240,8 @@ def end_trial_run(
     """End the run of a trial with its values by metric; errors are logged."""
 
     def end_run(run: "MLflowRun") -> None:
-        run.reopen(TrackedRun(run_id, "", study, 0, store.shown))
-        run.log_metrics(points_at(values, 0, now_ms()))
+        run.open(TrackedRun(run_id, "", study, 0, store.shown))
+        run.log_metrics(run.lacking(points_at(values, 0, now_ms())))
         _end(run, status, reason)
 
     _within(30.0, store, f"run {run_id} was not ended there", end_run)
@@ -226,30 +255,22 @@ def _end(run: "MLflowRun", status: Status, reason: str) -> None:
 def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLflowRun], None]") -> str | None:
     """Return the id of the run after `call`; None, with a warning, if it failed or did not finish in time.
 
-    In a thread, because MLflow itself retries for more than a minute to open a database.
+    MLflow itself retries for more than a minute to open a database.
     """
-    done: list[str | None] = []
-    reasons: list[str] = []
 
-    def work() -> None:
+    def work() -> str | None:
         from .mlflow_run import MLflowRun
 
         run = MLflowRun(store)
-        try:
-            run.connect()
-            call(run)
-            done.append(run.run_id)
-        except (StoreRefusedError, StoreUnavailableError) as error:
-            reasons.append(str(error))
+        run.connect()
+        call(run)
+        return run.run_id
 
-    thread = threading.Thread(target=work, name="mlflow-trial", daemon=True)
-    thread.start()
-    thread.join(deadline_s)
-    if done:
-        return done[0]
-    reason = reasons[0] if reasons else f"no answer within {deadline_s:g} s"
-    _log.warning("MLflow (%s): %s: %s", store.shown, failure, reason)
-    return None
+    try:
+        return ended_within(deadline_s, work)
+    except (StoreRefusedError, StoreUnavailableError, TimeoutError) as error:
+        _log.warning("MLflow (%s): %s: %s", store.shown, failure, error)
+        return None
 
 
 def _params(space: Mapping[str, str], base: Sequence[str]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""`tracking.json`: the MLflow run of a run folder, and everything logged to it besides metrics."""
+"""`tracking.json`: the MLflow run of a run folder, and what the folder's other files do not say of it."""
 
 import json
 import logging
@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrackedRun:
-    """What a training has logged, whether or not MLflow has it yet; metrics.jsonl has the points."""
+    """Identity, parameters, tags and end of a run, whether or not MLflow has them yet."""
 
     run_id: str | None
     """In MLflow; None until the run is created there."""
@@ -31,8 +31,6 @@ class TrackedRun:
     """Where the run is recorded, without password."""
     params: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
-    files: dict[str, str | None] = field(default_factory=dict)
-    """Paths, relative to the run folder if inside, and their folders in MLflow."""
     status: Status | None = None
     """Of the ended run; None while it is running, or if it was killed."""
     end_ms: int | None = None
@@ -80,13 +78,6 @@ class TrackingFile:
         """Add a tag."""
         with self._lock:
             self.change(tags={**self.run.tags, key: value})
-
-    def add_file(self, path: Path, folder: str | None) -> None:
-        """Add a file or folder that is stored with the run."""
-        path, base = path.resolve(), self._path.parent.resolve()
-        shown = path.relative_to(base) if path.is_relative_to(base) else path
-        with self._lock:
-            self.change(files={**self.run.files, shown.as_posix(): folder})
 
 
 _TRACKED_RUN = TypeAdapter(TrackedRun)

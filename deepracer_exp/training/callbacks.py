@@ -14,21 +14,12 @@ from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
-from deepracer_exp.runs.checkpoint_files import LINKS
 from deepracer_exp.runs.convergence import Decision, StoppingRule, build_rule
 from deepracer_exp.runs.files import (
     BEST_LAP,
-    CHECKPOINTS,
-    CONFIG,
-    CRASH_DUMPS,
     LEARNING,
-    LOG,
     METRICS,
-    OVERRIDES,
-    PROVENANCE,
     REPORT,
-    REWARD,
-    SUMMARY,
     TRACE,
     read_config,
     sees_pictures,
@@ -37,6 +28,7 @@ from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
+from deepracer_exp.tracking.projection import files_to_keep
 from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 
 from .budget import Alerts
@@ -49,7 +41,6 @@ logger = logging.getLogger("deepracer_exp")
 
 _DRIVING = "driving"
 """What ranks a policy that is not evaluated: the training's own episodes."""
-_TRACKED_FILES = (CONFIG, OVERRIDES, PROVENANCE, REWARD, SUMMARY, METRICS, LOG, REPORT, BEST_LAP, LEARNING)
 
 
 def standard_callbacks(
@@ -271,13 +262,8 @@ class TrackingCallback(Callback):
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Log files and end the run in the store; the result says what was not recorded."""
-        path, checkpoints = trainer.folder.path, trainer.checkpoints.folder
-        files: list[tuple[Path, str | None]] = [(path / name, None) for name in _TRACKED_FILES]
-        files.append((path / CRASH_DUMPS, CRASH_DUMPS))
-        files += [((checkpoints / link).resolve(), f"{CHECKPOINTS}/{link}") for link in LINKS]
-        for file, folder in files:
-            if file.exists():
-                self._tracker.log_artifact(file, folder)
+        for file, folder in files_to_keep(trainer.folder.path):
+            self._tracker.log_artifact(file, folder)
         self._tracker.set_tag(END_TAG, f"{result.status}: {result.reason}")
         if self._tracker.outage is not None:
             line = f"{self._tracker.outage}; waiting for at most {FINISH_S:g} s"

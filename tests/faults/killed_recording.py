@@ -15,9 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.tracking import store_thread
 from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracker import MLflowTracker
 
 ITERATIONS = 160
 CHECKPOINT_EVERY = 12
@@ -30,35 +31,40 @@ def atomic_write(path: Path, text: str) -> None:
     aside.replace(path)
 
 
+def save(checkpoints: Path, iteration: int) -> None:
+    (checkpoints / f"{iteration:06d}").mkdir(parents=True, exist_ok=True)
+    aside = checkpoints / ".last"
+    aside.unlink(missing_ok=True)
+    aside.symlink_to(f"{iteration:06d}")
+    aside.replace(checkpoints / "last")
+
+
 def record(run_dir: Path, uri: str) -> None:
-    metrics, checkpoint, identity = (
-        run_dir / name for name in ("metrics.jsonl", "checkpoint.json", "tracking.json")
+    metrics, checkpoints, identity = (
+        run_dir / name for name in ("metrics.jsonl", "checkpoints", "tracking.json")
     )
+    store_thread.UPDATE_S = 0.02
     tracker = MLflowTracker(resolve_store(uri, run_dir))
-    kept = json.loads(checkpoint.read_text()) if checkpoint.exists() else 0
+    kept = int((checkpoints / "last").resolve().name) if (checkpoints / "last").exists() else 0
     rows = read_metrics(metrics)[:kept] if metrics.exists() else []
-    atomic_write(metrics, "".join(json.dumps(row) + "\n" for row in rows))
     if identity.exists():
         tracker.reopen(identity)
     else:
+        (run_dir / "config.yaml").write_text("checkpoints: {every: 1}\n")
         tracker.start("killed", "race", {"seed": 1}, {"run_dir": str(run_dir)}, identity)
-    for row in rows:
-        tracker.log(row, row["env_steps"])
-    tracker.safe_until(100 * kept)
+    atomic_write(metrics, "".join(json.dumps(row) + "\n" for row in rows))
     for iteration in range(kept + 1, ITERATIONS + 1):
         row = {"iteration": iteration, "env_steps": 100 * iteration, "wall_clock_s": time.monotonic()}
         row |= {key: random.random() for key in KEYS}
         with metrics.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        tracker.log(row, row["env_steps"])
         if iteration % CHECKPOINT_EVERY == 0:
             tracker.set_tag("half", str(2 * iteration // ITERATIONS))
-            atomic_write(checkpoint, str(iteration))
-            tracker.safe_until(100 * iteration)
-            while tracker.waiting:  # so that kills come while the tracker is recording, not later
+            save(checkpoints, iteration)
+            # So that kills come while the tracker is recording, not later.
+            while tracker._projection.written < (2 + len(KEYS)) * (iteration - kept):
                 time.sleep(0.001)
         time.sleep(0.01)
-    tracker.log_artifact(metrics)
     assert tracker.finish("FINISHED", 200) == 0
 
 

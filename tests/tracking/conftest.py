@@ -13,11 +13,12 @@ import yaml
 from mlflow import MlflowClient
 
 from deepracer_exp.runs.checkpoint_files import write_hashes
+from deepracer_exp.tracking import store_thread
 from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store
-from deepracer_exp.tracking.tracker import MLflowTracker
 from tests import waiting
 from tests.ports import find_port
 
@@ -54,6 +55,35 @@ def tracker(store: Store, identity: Path) -> MLflowTracker:
     tracker = MLflowTracker(store)
     tracker.start("run", "race", {}, {}, identity)
     return tracker
+
+
+@pytest.fixture(autouse=True)
+def prompt(monkeypatch) -> None:
+    """Let every tracker bring its store up to date without pauses."""
+    monkeypatch.setattr(store_thread, "UPDATE_S", 0.05)
+
+
+def write_rows(folder: Path, rows: list[dict], covered: int | None = None) -> None:
+    """Append rows to a run's metrics.jsonl, like a training whose last checkpoint covers all, or `covered` of them.
+
+    There is a row an iteration; a row without its number, env steps or clock gets them.
+    """
+    folder.mkdir(exist_ok=True)
+    (folder / "config.yaml").write_text("checkpoints: {every: 5}\n")
+    file = folder / "metrics.jsonl"
+    there = file.read_text().count("\n") if file.exists() else 0
+    with file.open("a") as lines:
+        for number, row in enumerate(rows, there + 1):
+            full = {"iteration": number, "env_steps": 100 * number, "wall_clock_s": number / 8} | row
+            lines.write(json.dumps(full) + "\n")
+    cover(folder, there + len(rows) if covered is None else covered)
+
+
+def cover(folder: Path, iteration: int) -> None:
+    """Make an iteration's checkpoint the last."""
+    (folder / "checkpoints" / f"{iteration:06d}").mkdir(parents=True, exist_ok=True)
+    (folder / "checkpoints" / "last").unlink(missing_ok=True)
+    (folder / "checkpoints" / "last").symlink_to(f"{iteration:06d}")
 
 
 def runs_of(client: MlflowClient, experiment: str = "race") -> list:

@@ -7,11 +7,12 @@ from functools import partialmethod
 import pytest
 
 from deepracer_exp.tracking import calls
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracker import MLflowTracker
 from tests.conftest import refused
 
+from .conftest import write_rows
 from .odd_servers import odd_server
 
 ODD = {
@@ -53,13 +54,12 @@ def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path):
     uri, words = odd
     tracker = MLflowTracker(resolve_store(uri, tmp_path))
     tracker.start("run", "race", {"seed": 1}, {}, tmp_path / "tracking.json")
-    tracker.safe_until(1)
-    tracker.log({"completion": 5.0}, 1)
+    write_rows(tmp_path, [{"completion": 5.0}])
     began = time.monotonic()
-    assert tracker.finish("FINISHED", deadline_s=8.0) == 1
+    assert tracker.finish("FINISHED", deadline_s=8.0) == 3
     assert time.monotonic() - began < 30
     assert tracker.failure is not None
-    assert tracker.failure.startswith(f"MLflow ({uri}): 1 of 1 metric points were not recorded: ")
+    assert tracker.failure.startswith(f"MLflow ({uri}): 3 of 3 metric points were not recorded: ")
     assert words in tracker.failure
 
 

@@ -11,36 +11,34 @@ from mlflow import MlflowClient
 
 from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.mlflow_run import MLflowRun
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.tracking_file import TrackedRun
 
-from .conftest import points
+from .conftest import points, write_rows
 
 
-def test_every_point_is_recorded_once_and_at_its_env_step(tracker, mlflow):
+def test_every_point_is_recorded_once_and_at_its_env_step(tracker, mlflow, tmp_path):
     steps = [8192 * iteration for iteration in range(1, 301)]
-    for step in steps:
-        tracker.log({"completion": step / 100, "lr": 1 / step, "iteration": step // 8192}, step)
-    for step, lap_time in enumerate([None, math.nan, 9.5, math.inf]):  # what is no number leaves a gap
-        tracker.log({"best_lap_time_s": lap_time, "kl": None}, step)
+    write_rows(tmp_path, [{"env_steps": step, "completion": step / 100, "lr": 1 / step} for step in steps])
+    more = [None, math.nan, 9.5, math.inf]  # what is no number leaves a gap
+    write_rows(tmp_path, [{"env_steps": 10**7 + n, "best_lap_time_s": lap_s} for n, lap_s in enumerate(more)])
     assert tracker.finish("FINISHED") == 0
-    assert points(mlflow, tracker.run_id, "best_lap_time_s") == [(2, 9.5)]
+    assert points(mlflow, tracker.run_id, "best_lap_time_s") == [(10**7 + 2, 9.5)]
     assert points(mlflow, tracker.run_id) == [(step, step / 100) for step in steps]
     assert points(mlflow, tracker.run_id, "lr") == [(step, 1 / step) for step in steps]
 
 
 def test_params_tags_and_files_are_found_by_name(store, mlflow, tmp_path, identity):
     (tmp_path / "config.yaml").write_text("seed: 1")
-    (tmp_path / "best").mkdir()
-    (tmp_path / "best" / "manifest.json").write_text("{}")
+    (tmp_path / "checkpoints" / "000007").mkdir(parents=True)
+    (tmp_path / "checkpoints" / "000007" / "manifest.json").write_text("{}")
+    (tmp_path / "checkpoints" / "best").symlink_to("000007")
     many = {f"group.key_{number}": number for number in range(250)}  # more than one call takes
     params = {"reward.file": None, "knots": "7" * 9000, **many}
     tracker = MLflowTracker(store)
     tracker.start("a run", "race", params, {"track": "oval"}, identity)
     tracker.set_tag("stopped_by", "reliable")
-    tracker.log_artifact(tmp_path / "config.yaml")
-    tracker.log_artifact(tmp_path / "best", "checkpoints/best")
     assert tracker.finish("FINISHED") == 0
     run = mlflow.get_run(tracker.run_id)
     assert run.info.run_name == "a run"
@@ -53,19 +51,18 @@ def test_params_tags_and_files_are_found_by_name(store, mlflow, tmp_path, identi
     assert Path(saved).read_text() == "{}"
 
 
-def test_a_busy_store_blocks_nothing_and_gets_every_point_later(store, tracker, mlflow, wait_until):
-    tracker.safe_until(100)
-    tracker.log({"completion": 0.0}, 0)
-    wait_until(lambda: tracker.waiting == 0)
+def test_a_busy_store_blocks_nothing_and_gets_every_point_later(store, tracker, mlflow, wait_until, tmp_path):
+    write_rows(tmp_path, [{"completion": 0.0}])
+    wait_until(lambda: tracker.run_id and points(mlflow, tracker.run_id))
     busy = sqlite3.connect(store.sqlite_file, isolation_level=None)
     busy.execute("BEGIN EXCLUSIVE")
-    for step in range(1, 101):
-        tracker.log({"completion": float(step)}, step)
-    assert tracker.waiting == 100
+    write_rows(tmp_path, [{"completion": float(number)} for number in range(1, 101)])
+    tracker.set_tag("half", "done")  # returns at once
     busy.execute("ROLLBACK")
     busy.close()
     assert tracker.finish("FINISHED") == 0
-    assert points(mlflow, tracker.run_id) == [(step, float(step)) for step in range(101)]
+    assert points(mlflow, tracker.run_id) == [(100 * number + 100, float(number)) for number in range(101)]
+    assert mlflow.get_run(tracker.run_id).data.tags["half"] == "done"
 
 
 def test_repeating_a_call_changes_nothing(store, mlflow):
@@ -73,7 +70,7 @@ def test_repeating_a_call_changes_nothing(store, mlflow):
     run, repeated = MLflowRun(store), MLflowRun(store)
     for one in (run, repeated):
         one.connect()
-        one.create(tracked, again=one is repeated)
+        one.open(tracked)
     assert repeated.run_id == run.run_id
     for _ in range(2):
         run.log_params({"seed": "1"})
@@ -82,32 +79,26 @@ def test_repeating_a_call_changes_nothing(store, mlflow):
     assert points(mlflow, run.run_id, "kl") == [(7, 0.5), (8, 0.25)]
 
 
-def test_a_missing_file_costs_one_line_and_nothing_else(tracker, tmp_path, caplog):
-    tracker.log_artifact(tmp_path / "gone")
-    tracker.log({"kl": 1.0}, 1)
-    assert tracker.finish("FINISHED") == 0
-    assert [record.name for record in caplog.records] == ["deepracer_exp.tracking.store_thread"]
-    assert str(tmp_path / "gone") in caplog.text
-
-
-def test_a_run_deleted_in_the_ui_costs_one_line_and_nothing_else(tracker, mlflow, caplog, wait_until):
-    tracker.safe_until(3)
-    tracker.log({"kl": 1.0}, 0)
-    wait_until(lambda: tracker.waiting == 0)
+def test_a_run_deleted_in_the_ui_costs_one_line_and_nothing_else(
+    tracker, mlflow, caplog, wait_until, tmp_path
+):
+    write_rows(tmp_path, [{"kl": 1.0}])
+    wait_until(lambda: tracker.run_id and points(mlflow, tracker.run_id, "kl"))
     mlflow.delete_run(tracker.run_id)
-    for step in range(1, 4):
-        tracker.log({"kl": 1.0}, step)
-        tracker.set_tag("last", str(step))  # keeps the points apart
-    assert tracker.finish("FINISHED") == 3
-    assert caplog.text.count("refused metrics") == 1
+    write_rows(tmp_path, [{"kl": 1.0}] * 3)
+    wait_until(lambda: "refused metrics" in caplog.text)
+    tracker.set_tag("last", "1")
+    # Of each row its number, its clock and `kl`.
+    assert tracker.finish("FINISHED") == 9
+    assert len(caplog.records) == 1
 
 
 def test_a_deleted_experiment_is_named_and_the_training_continues(store, mlflow, caplog, identity):
     mlflow.delete_experiment(mlflow.create_experiment("race"))
     tracker = MLflowTracker(store)
     tracker.start("run", "race", {}, {}, identity)
-    tracker.log({"kl": 1.0, "lr": 2.0}, 1)
-    assert tracker.finish("FINISHED") == 2
+    write_rows(identity.parent, [{"kl": 1.0, "lr": 2.0}])
+    assert tracker.finish("FINISHED") == 4
     assert "experiment 'race' was deleted in MLflow" in caplog.text
     assert len(caplog.records) == 1
 
@@ -117,12 +108,10 @@ def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
 ):
     tracker = MLflowTracker(resolve_store(f"http://me:s3cr3t@127.0.0.1:{free_port}", tmp_path))
     tracker.start("run", "race", {}, {}, identity)
-    tracker.safe_until(4)
-    for step in range(5):
-        tracker.log({"kl": 1.0}, step)
+    write_rows(tmp_path, [{"kl": 1.0}] * 6, covered=5)
     wait_until(lambda: "does not answer" in caplog.text)
-    assert tracker.finish("FAILED", deadline_s=1) == 5
-    for words in ("5 of 5 metric points were not recorded", f"http://127.0.0.1:{free_port}"):
+    assert tracker.finish("FAILED", deadline_s=1) == 15
+    for words in ("15 of 15 metric points were not recorded", f"http://127.0.0.1:{free_port}"):
         assert words in caplog.text
     assert tracker.failure is not None
     assert tracker.failure in caplog.text
@@ -133,13 +122,15 @@ def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
 def test_two_processes_that_begin_at_once_in_a_new_folder_lose_nothing(tmp_path):
     runs = tmp_path / "meine Läufe mit ß" / "50%#"
     code = (
-        "import sys; from pathlib import Path; from deepracer_exp.tracking.tracker import *\n"
+        "import json, sys; from pathlib import Path\n"
+        "from deepracer_exp.tracking.mlflow_tracker import MLflowTracker\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
         f"tracker = MLflowTracker(resolve_store(None, Path({str(runs)!r})))\n"
-        f"identity = Path({str(tmp_path)!r}) / sys.argv[1]\n"
+        f"identity = Path({str(tmp_path)!r}) / sys.argv[1] / 'tracking.json'\n"
+        "identity.parent.mkdir()\n"
         "tracker.start('run ' + sys.argv[1], 'race', {'seed': int(sys.argv[1])}, {}, identity)\n"
-        "for step in range(50): tracker.log({'kl': step + int(sys.argv[1]) / 8}, step)\n"
-        "tracker.log_artifact(Path(__import__('mlflow').__file__))\n"
+        "rows = [{'env_steps': step, 'kl': step + int(sys.argv[1]) / 8} for step in range(50)]\n"
+        "(identity.parent / 'metrics.jsonl').write_text(''.join(json.dumps(row) + '\\n' for row in rows))\n"
         "assert tracker.finish('FINISHED', 120) == 0\n"
         "print(tracker.run_id)"
     )
@@ -155,7 +146,7 @@ def test_two_processes_that_begin_at_once_in_a_new_folder_lose_nothing(tmp_path)
     for seed, (run_id, noise) in enumerate(ended):
         assert (both[seed].returncode, noise) == (0, "")
         assert points(client, run_id.strip(), "kl") == [(step, step + seed / 8) for step in range(50)]
-        assert [file.path for file in client.list_artifacts(run_id.strip())] == ["__init__.py"]
+        assert [file.path for file in client.list_artifacts(run_id.strip())] == ["metrics.jsonl"]
     assert {path.name for path in runs.iterdir()} == {"mlflow.db", "mlflow.db.lock", "mlflow-artifacts"}
 
 

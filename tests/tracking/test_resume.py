@@ -7,11 +7,11 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.tracking_file import read_tracked_run
 
-from .conftest import points, runs_of
+from .conftest import cover, points, runs_of, write_rows
 
 
 def rows_until(iteration: int) -> list[dict[str, float]]:
@@ -25,13 +25,6 @@ def logged_until(iteration: int) -> list[tuple[int, float]]:
     return [(row["env_steps"], row["completion"]) for row in rows_until(iteration)]
 
 
-def log(tracker, rows, safe: bool = True):
-    for one in rows:
-        tracker.log(one, one["env_steps"])
-        if safe:
-            tracker.safe_until(one["env_steps"])
-
-
 def reopened(store, identity) -> MLflowTracker:
     """Return a tracker that continues a run."""
     tracker = MLflowTracker(store)
@@ -40,13 +33,15 @@ def reopened(store, identity) -> MLflowTracker:
 
 
 @pytest.fixture
-def killed(store, identity, wait_until):
+def killed(store, mlflow, identity, wait_until):
     """Return the tracker of a run of ten iterations that was never finished."""
     tracker = MLflowTracker(store)
     params, tags = {"seed": 1}, {"track": "oval", "mlflow.note.content": "as it began"}
     tracker.start("run", "race", params, tags, identity)
-    log(tracker, rows_until(10))
-    wait_until(lambda: tracker.waiting == 0 and read_tracked_run(identity).run_id is not None)
+    write_rows(identity.parent, rows_until(10))
+    wait_until(lambda: tracker.run_id and len(points(mlflow, tracker.run_id)) == 10)
+    tracker._thread.finish(0)
+    tracker._thread._thread.join()
     return tracker
 
 
@@ -58,7 +53,7 @@ def resumed(store, identity, killed):
 
 def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, resumed):
     rows = rows_until(20)
-    log(resumed, rows)
+    write_rows(identity.parent, rows[10:])
     assert resumed.finish("FINISHED") == 0
     (run,) = runs_of(mlflow)
     assert run.info.run_id == resumed.run_id == killed.run_id
@@ -71,17 +66,39 @@ def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, r
     assert "env_steps" not in run.data.metrics
 
 
-def test_points_wait_for_a_checkpoint_and_block_nothing_else(tracker, mlflow, wait_until, caplog):
-    log(tracker, rows_until(10), safe=False)
+def test_points_wait_for_a_checkpoint_and_block_nothing_else(tracker, mlflow, wait_until, caplog, tmp_path):
+    write_rows(tmp_path, rows_until(10), covered=0)
     tracker.set_tag("budget", "50%")
     wait_until(lambda: bool(tracker.run_id) and "budget" in mlflow.get_run(tracker.run_id).data.tags)
     assert points(mlflow, tracker.run_id) == []
-    tracker.safe_until(400)
+    cover(tmp_path, 4)
     wait_until(lambda: len(points(mlflow, tracker.run_id)) == 4)
     tracker.set_tag("budget", "80%")
     assert tracker.finish("KILLED") == 0
     assert points(mlflow, tracker.run_id) == logged_until(4)
+    assert mlflow.get_run(tracker.run_id).data.tags["budget"] == "80%"
     assert not caplog.records
+
+
+@pytest.mark.parametrize(("status", "steps"), [("KILLED", [500]), ("FINISHED", [500, 700])])
+def test_an_evaluation_out_of_turn_counts_only_when_the_run_is_over(tracker, mlflow, tmp_path, status, steps):
+    # Every fifth policy is evaluated, and the last when the run ends, which rewrites the last row.
+    laps = {5: 9.5, 7: 9.25}
+    write_rows(tmp_path, [{"eval_lap_time_s": laps.get(number), "kl": 1.0} for number in range(1, 8)])
+    assert tracker.finish(status) == 0
+    assert [step for step, _ in points(mlflow, tracker.run_id, "eval_lap_time_s")] == steps
+    assert len(points(mlflow, tracker.run_id, "kl")) == 7
+
+
+def test_the_last_row_is_completed_when_the_run_is_over(tracker, mlflow, tmp_path, wait_until):
+    write_rows(tmp_path, [{"kl": 1.0}] * 3)
+    wait_until(lambda: tracker.run_id and len(points(mlflow, tracker.run_id, "kl")) == 3)
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    lines[-1] = json.dumps(json.loads(lines[-1]) | {"eval_lap_time_s": 9.5})
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    assert tracker.finish("FINISHED") == 0
+    assert points(mlflow, tracker.run_id, "eval_lap_time_s") == [(300, 9.5)]
+    assert len(points(mlflow, tracker.run_id, "kl")) == 3
 
 
 def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, identity, killed):
@@ -95,11 +112,11 @@ def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, identity, 
 def test_a_run_that_was_never_created_begins_when_it_began(store, mlflow, identity, free_port):
     away = MLflowTracker(type(store)(f"http://127.0.0.1:{free_port}", None))
     away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
-    log(away, rows_until(1))
+    write_rows(identity.parent, rows_until(1))
     away.finish("KILLED", deadline_s=0)
     tracked = read_tracked_run(identity)
     tracker = reopened(store, identity)
-    log(tracker, rows_until(2))
+    write_rows(identity.parent, rows_until(2)[1:])
     assert tracker.finish("FINISHED") == 0
     (run,) = runs_of(mlflow)
     assert (tracked.run_id, run.info.start_time, run.info.run_name) == (None, tracked.start_ms, "run")
@@ -114,7 +131,7 @@ def test_a_run_resumed_with_another_store_is_complete_there(
     shutil.copy(empty_database, tmp_path / "other" / "mlflow.db")
     other = resolve_store(None, tmp_path / "other")
     tracker = reopened(other, identity)
-    log(tracker, rows_until(12))
+    write_rows(identity.parent, rows_until(12)[10:])
     assert tracker.finish("FINISHED") == 0
     there = MlflowClient(tracking_uri=other.uri)
     assert [run.info.run_id for run in runs_of(there)] == [tracker.run_id]
@@ -126,7 +143,8 @@ def test_a_run_resumed_with_another_store_is_complete_there(
 
 def test_a_resumed_run_is_shown_as_running(store, mlflow, identity, killed, wait_until):
     killed.set_tag("end", "interrupted: by Ctrl-C")
-    killed.finish("KILLED")
+    mlflow.set_tag(killed.run_id, "end", "interrupted: by Ctrl-C")
+    mlflow.set_terminated(killed.run_id, "KILLED")
     mlflow.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
     tracker = reopened(store, identity)
     wait_until(lambda: mlflow.get_run(killed.run_id).info.status == "RUNNING")
@@ -144,16 +162,17 @@ def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
 ):
     mlflow.delete_run(killed.run_id)
     tracker = reopened(store, identity)
-    log(tracker, rows_until(20))
+    write_rows(identity.parent, rows_until(20)[10:])
     assert tracker.finish("FINISHED") > 0
     (record,) = caplog.records
     assert f"run {killed.run_id} was deleted in MLflow; restore it there" in record.message
     assert points(mlflow, killed.run_id) == logged_until(10)
 
 
-def test_a_repeated_iteration_that_differs_is_not_doubled(mlflow, killed, resumed):
+def test_a_repeated_iteration_that_differs_is_not_doubled(mlflow, killed, identity, resumed):
     *same, last = rows_until(10)
-    log(resumed, [*same, last | {"completion": 99.0}])
+    (identity.parent / "metrics.jsonl").unlink()
+    write_rows(identity.parent, [*same, last | {"completion": 99.0}])
     assert resumed.finish("FINISHED") == 0
     assert points(mlflow, killed.run_id) == logged_until(10)
 
@@ -188,7 +207,6 @@ def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(st
         tags = {"mlflow.note.content": "as it began"}
         tracker.start(name, "race", {}, tags, folder / "tracking.json")
         (folder / "best_lap.png").write_bytes(b"picture")
-        tracker.log_artifact(folder / "best_lap.png")
         best = {"iteration": 4, "env_steps": 400, "metric": "race_score", "rank": [1.0, -lap_s]}
         best |= {"eval_lap_time_s": lap_s, "eval_race_score_s": lap_s, "eval_completion": 100.0}
         summary = {"status": "finished", "reason": "converged: all", "best": best}

@@ -95,11 +95,11 @@ def test_trials_that_started_before_the_run_of_their_study_are_nested_under_it(s
     def trial(name, study, start_ms):
         run, tags = MLflowRun(store), {"sweep.study": study, "sweep.trial": "0"}
         run.connect()
-        run.create(TrackedRun(None, name, "spring", start_ms, store.shown, tags=tags), again=False)
+        run.open(TrackedRun(None, name, "spring", start_ms, store.shown, tags=tags))
         return run.run_id
 
     is_up.set()
-    early, other = trial("trial 0", "spring", 1000), trial("trial 0", "autumn", 1000)
+    early, other = trial("trial 0", "spring", 1000), trial("trial 0", "autumn", 1001)
     is_up.clear()
     study_run = begin(store)
     assert study_run.wait_for_id(0.1) is None
@@ -126,15 +126,16 @@ def test_of_two_runs_created_at_the_same_moment_the_older_one_stays(store, mlflo
     mine, theirs = MLflowRun(store), MLflowRun(store)
     mine.connect()
     theirs.connect()
-    create = MLflowRun.create
+    create = MLflowRun._create
 
-    def create_after_the_other(run, tracked, *, again):
+    def create_after_the_other(run, experiment_id, tracked):
         # The other one looked before this run was there, and created its own a little earlier.
-        create(theirs, TrackedRun(None, "sweep", "spring", 1000, store.shown, tags=tracked.tags), again=False)
-        create(run, tracked, again=again)
+        earlier = TrackedRun(None, "sweep", "spring", 1000, store.shown, tags=tracked.tags)
+        theirs.run_id = create(theirs, experiment_id, earlier)
+        return create(run, experiment_id, tracked)
 
-    monkeypatch.setattr(MLflowRun, "create", create_after_the_other)
-    mine.create_once(tracked, ["sweep.study"])
+    monkeypatch.setattr(MLflowRun, "_create", create_after_the_other)
+    mine.open_only(tracked, ["sweep.study"])
     assert mine.run_id == theirs.run_id
     assert [run.info.run_id for run in runs_of(mlflow, "spring")] == [theirs.run_id]
 
@@ -200,9 +201,9 @@ def test_the_experiment_names_the_winner_of_the_study_and_not_the_run_of_the_low
     lucky = MLflowRun(store)
     lucky.connect()
     tracked = TrackedRun(None, "lucky", "spring", 1, store.shown)
-    lucky.create(tracked, again=False)
+    lucky.open(tracked)
     best = {"iteration": 1, "env_steps": 1, "eval_race_score_s": 1.5}
-    lucky.conclude(tracked, {"status": "finished", "reason": "budget", "best": best})
+    lucky.conclude(tracked, {"status": "finished", "reason": "budget", "best": best}, [])
     note = mlflow.get_experiment_by_name("spring").tags["mlflow.note.content"]
     assert "trial 7, race score 9.50 s" in note
     assert "1.50" not in note

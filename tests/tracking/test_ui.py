@@ -1,3 +1,4 @@
+import json
 import signal
 import socket
 import subprocess
@@ -12,9 +13,9 @@ from mlflow import MlflowClient
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.metadata import VIEW, run_params, run_tags
 from deepracer_exp.tracking.metrics import METRICS
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import existing_store
-from deepracer_exp.tracking.tracker import MLflowTracker
 from deepracer_exp.tracking.ui import running_ui, runs_page, serve_ui
 from tests.waiting import PATIENCE_S
 
@@ -22,13 +23,14 @@ NAMES = {"track": "reinvent_base", "reward": "progress_per_step", "network": "ml
 
 
 def record(store, runs_dir: Path, seed: int) -> str:
-    tracker = MLflowTracker(store)
+    tracker, folder = MLflowTracker(store), runs_dir / str(seed)
+    folder.mkdir()
     params = run_params({}, NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}, [])
     tags = run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed))
-    tracker.start(f"progress_per_step s{seed}", "race", params, tags, runs_dir / "tracking.json")
-    tracker.log({key: float(seed) for key in reversed(METRICS)}, 8192)
-    (runs_dir / "notes.json").write_text('{"seed": 1}')
-    tracker.log_artifact(runs_dir / "notes.json", "reports")
+    tracker.start(f"progress_per_step s{seed}", "race", params, tags, folder / "tracking.json")
+    row = {**{key: float(seed) for key in reversed(METRICS)}, "env_steps": 8192}
+    (folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
+    (folder / "provenance.json").write_text('{"seed": 1}')
     assert tracker.finish("FINISHED") == 0
     assert tracker.run_id is not None
     return tracker.run_id
@@ -72,7 +74,7 @@ def test_the_ui_shows_runs_by_name_and_opens_their_files(store, tmp_path, free_p
             assert data.metrics == dict.fromkeys((name for name, _ in METRICS.values()), float(seed))
             assert data.params.items() >= {**NAMES, "seed": str(seed), "algorithm.lr": "0.0003"}.items()
             assert data.tags.items() >= {**NAMES, "git_commit": "0123abc"}.items()
-            file = f"{url}/get-artifact?run_id={run_id}&path=reports/notes.json"
+            file = f"{url}/get-artifact?run_id={run_id}&path=provenance.json"
             assert urllib.request.urlopen(file).read() == b'{"seed": 1}'
 
 

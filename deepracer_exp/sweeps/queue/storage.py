@@ -22,13 +22,13 @@ from sqlalchemy.exc import (
 )
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from tenacity import RetryCallState, Retrying, retry_if_exception, stop_after_delay
+from tenacity.wait import wait_exponential_jitter
 
 from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
 from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.tracking.calls import one_line
 from deepracer_exp.tracking.store import check_database_file
-from deepracer_exp.tracking.store_thread import PAUSES
 
 Result = TypeVar("Result")
 
@@ -36,6 +36,9 @@ DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInt
 """Errors of a database that is down or locked, among others; see `_may_pass`."""
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
 _SAY_AFTER_S = 5.0
+_PAUSES = wait_exponential_jitter(multiplier=0.1, max=10.0, jitter=0.1)
+"""Between calls of a database that does not answer: longer and longer, with jitter, so that processes that began to
+wait together do not return together."""
 
 _KINDS = ("sqlite", "postgresql")
 _ACCEPTED = "accepted: sqlite:////path/sweeps.db, postgresql+psycopg://user@host/name"
@@ -189,7 +192,7 @@ def _waiting(call: Callable[[], Result], patience_s: float) -> Result:
 
     return Retrying(
         retry=retry_if_exception(_may_pass),
-        wait=PAUSES,
+        wait=_PAUSES,
         stop=stop_after_delay(patience_s),
         before_sleep=say,
         reraise=True,

@@ -1,0 +1,172 @@
+"""A run's MLflow run as a projection of the run's folder: one function brings it up to date."""
+
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.checkpoint_files import LINKS, restore_links
+from deepracer_exp.runs.files import (
+    BEST_LAP,
+    CHECKPOINTS,
+    CONFIG,
+    CRASH_DUMPS,
+    LEARNING,
+    LOG,
+    METRICS,
+    OVERRIDES,
+    PROVENANCE,
+    REPORT,
+    REWARD,
+    SUMMARY,
+    read_config,
+    read_metrics,
+    read_object,
+)
+from deepracer_exp.runs.labels import read_labels
+
+from .calls import StoreRefusedError
+from .metadata import END_TAG, label_tags
+from .metrics import Point, now_ms, points_of, without_evaluation
+from .store import Store
+from .store_thread import refused_of
+from .tracking_file import TrackingFile
+
+if TYPE_CHECKING:
+    from .mlflow_run import MLflowRun
+
+_FILES = (CONFIG, OVERRIDES, PROVENANCE, REWARD, SUMMARY, METRICS, LOG, REPORT, BEST_LAP, LEARNING)
+
+
+def files_to_keep(run_dir: Path) -> list[tuple[Path, str | None]]:
+    """Return the files and folders of an ended run that a tracker keeps, each with its folder there."""
+    files: list[tuple[Path, str | None]] = [(run_dir / name, None) for name in _FILES]
+    files.append((run_dir / CRASH_DUMPS, CRASH_DUMPS))
+    files += [((run_dir / CHECKPOINTS / link).resolve(), f"{CHECKPOINTS}/{link}") for link in LINKS]
+    return [(path, folder) for path, folder in files if path.exists()]
+
+
+class Projection:
+    """The MLflow run of a run folder.
+
+    A row of metrics.jsonl is written once a checkpoint covers it, so that no resumed run contradicts it, or once the
+    run is over. MLflow is asked which points it has of a run that another process recorded.
+
+    Attributes:
+        beside: points that no file has, such as the use of the machine; they leave the list when they are written.
+        written: number of points of metrics.jsonl that were written.
+    """
+
+    def __init__(self, store: Store, file: TrackingFile) -> None:
+        """Project the folder of a tracking.json to a store."""
+        self.beside: list[Point] = []
+        self.written = 0
+        self._store, self._file, self._folder = store, file, file.folder
+        self._run: MLflowRun | None = None
+        self._rows = 0
+        """Number of rows of metrics.jsonl that MLflow has."""
+        self._files: set[tuple[Path, str | None]] = set()
+        """Files that it has."""
+
+    def update(self) -> Mapping[str, str]:
+        """Write what MLflow lacks; return what it refuses, with the reasons.
+
+        This may be done at any time, by any process, and again after any failure.
+
+        Raises:
+            StoreUnavailableError: MLflow does not answer.
+        """
+        try:
+            run = self._opened()
+        except StoreRefusedError as error:
+            return {"the run": str(error)}
+        tracked = self._file.run
+        writes: dict[str, Callable[[], object]] = {
+            "the parameters": lambda: run.log_params(tracked.params),
+            "metrics": lambda: self._write_metrics(run),
+            "the tags": lambda: run.set_tags(self._tags()),
+        }
+        if tracked.status is not None:
+            files = files_to_keep(self._folder)
+            writes |= {f"file {path}": partial(self._write_file, run, path, folder) for path, folder in files}
+            writes["the result"] = lambda: self._conclude(run, {path.name for path, _ in files})
+            writes["the end"] = partial(run.end, tracked.status, tracked.end_ms or now_ms())
+        return refused_of(writes)
+
+    def lost(self) -> tuple[int, int]:
+        """Return the number of points of metrics.jsonl that MLflow is not known to have, and the number of all.
+
+        Both are 0 if the file cannot be read.
+        """
+        try:
+            points = self._points(0)
+        except BadInput:
+            return 0, 0
+        return sum(self._run is None or not self._run.has(point) for point in points), len(points)
+
+    def _opened(self) -> "MLflowRun":
+        from .mlflow_run import MLflowRun
+
+        if self._run is None:
+            run = MLflowRun(self._store)
+            run.connect()
+            run.open(self._file.run)
+            self._file.change(run_id=run.run_id)
+            self._run = run
+        return self._run
+
+    def _write_metrics(self, run: "MLflowRun") -> None:
+        beside = list(self.beside)
+        run.log_metrics(run.lacking(beside))
+        del self.beside[: len(beside)]
+        covered = self._covered()
+        if covered <= self._rows and not self._is_over:
+            return
+        # The last row is read again: it gets an evaluation when the run ends.
+        lacking = run.lacking(self._points(max(self._rows - 1, 0)))
+        run.log_metrics(lacking)
+        self._rows = covered
+        self.written += len(lacking)
+
+    def _points(self, first: int) -> list[Point]:
+        """Return the points of the rows of metrics.jsonl from `first` that no resumed run will change."""
+        file, start_ms = self._folder / METRICS, self._file.run.start_ms
+        rows = read_metrics(file) if file.exists() else []
+        if not self._is_over:
+            # The last policy of an interrupted run is evaluated out of turn, and a resumed run removes that again.
+            every = read_config(self._folder)["checkpoints"]["every"]
+            rows = [
+                row if every is not None and row["iteration"] % every == 0 else without_evaluation(row)
+                for row in rows[: self._covered()]
+            ]
+        return [point for row in rows[first:] for point in points_of(row, row["env_steps"], start_ms)]
+
+    @property
+    def _is_over(self) -> bool:
+        return self._file.run.status == "FINISHED"
+
+    def _covered(self) -> int:
+        """Return the number of rows, one an iteration, that the last checkpoint covers."""
+        restore_links(self._folder / CHECKPOINTS)
+        name = (self._folder / CHECKPOINTS / "last").resolve().name
+        return int(name) if name.isdecimal() else 0
+
+    def _tags(self) -> dict[str, str]:
+        tracked = self._file.run
+        # MLflow's own tags, such as the description, may have been edited in the UI.
+        tags = {key: value for key, value in tracked.tags.items() if not key.startswith("mlflow.")}
+        if tracked.status is not None:
+            tags |= label_tags(read_labels(self._folder))
+            if END_TAG not in tags and (summary := read_object(self._folder / SUMMARY)):
+                tags[END_TAG] = f"{summary['status']}: {summary['reason']}"
+        return tags
+
+    def _write_file(self, run: "MLflowRun", path: Path, folder: str | None) -> None:
+        if (path, folder) not in self._files:
+            run.log_artifact(path, folder)
+            self._files.add((path, folder))
+
+    def _conclude(self, run: "MLflowRun", files: Collection[str]) -> None:
+        if summary := read_object(self._folder / SUMMARY):
+            run.conclude(self._file.run, summary, files)
