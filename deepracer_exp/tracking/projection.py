@@ -54,7 +54,8 @@ class Projection:
     run is over. MLflow is asked which points it has of a run that another process recorded.
 
     Attributes:
-        beside: points that no file has, such as the use of the machine; they leave the list when they are written.
+        beside: points that no file has, such as the use of the machine; they are written with the next rows, and leave
+            the list then.
         written: number of points of metrics.jsonl that were written.
     """
 
@@ -117,15 +118,13 @@ class Projection:
         return self._run
 
     def _write_metrics(self, run: "MLflowRun") -> None:
-        beside = list(self.beside)
-        run.log_metrics(run.lacking(beside))
-        del self.beside[: len(beside)]
-        covered = self._covered()
+        covered, beside = self._covered(), list(self.beside)
         if covered <= self._rows and not self._is_over:
             return
         # The last row is read again: it gets an evaluation when the run ends.
         lacking = run.lacking(self._points(max(self._rows - 1, 0)))
-        run.log_metrics(lacking)
+        run.log_metrics([*lacking, *run.lacking(beside)])
+        del self.beside[: len(beside)]
         self._rows = covered
         self.written += len(lacking)
 
