@@ -42,8 +42,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
 from deepracer_exp.runs.files import read_record
+from deepracer_exp.stopping.replay import replay
 from deepracer_exp.training.metrics import NOT_EVALUATED
-from deepracer_exp.training.stopping_replay import replay
 
 from .command import at_once, read_metrics, read_summary, trained
 from .fresh import TRIALS, Driven, drive

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .env.race_env import RaceEnv
     from .errors import BadInput, RunFailed
     from .evaluation.result import Evaluation
-    from .runs.convergence import Decision, StoppingRule
+    from .stopping.rules import Decision, StoppingRule
     from .tracking.tracker import Tracker
     from .training.trainer import Callback, Trainer, TrainResult
 
@@ -60,7 +60,7 @@ _MODULES = {
     "env.race_env": ("RaceEnv",),
     "errors": ("BadInput", "RunFailed"),
     "evaluation.result": ("Evaluation",),
-    "runs.convergence": ("Decision", "StoppingRule"),
+    "stopping.rules": ("Decision", "StoppingRule"),
     "tracking.tracker": ("Tracker",),
     "training.trainer": ("Callback", "Trainer", "TrainResult"),
 }

@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from deepracer_exp.errors import count
-from deepracer_exp.runs.convergence import POOR, convergence, convergence_rule, overfitting
 from deepracer_exp.runs.result import RunResult
+from deepracer_exp.stopping.judge import POOR, convergence, convergence_rule, overfitting
 
 from . import off_track
 from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView
@@ -92,7 +92,7 @@ def _converged(view: LogView, overfits: Finding | None) -> Finding:
         "completion_best": found.completion_best,
         "patience": found.patience,
     }
-    if math.isfinite(found.entropy_change):
+    if found.entropy_change is not None:
         values["entropy_change"] = found.entropy_change
     if found.iteration is not None:
         values["iteration"] = found.iteration

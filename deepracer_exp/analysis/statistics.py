@@ -12,6 +12,12 @@ MOST_ROWS = 200_000
 CONFIDENCE = 0.95
 
 
+def moving_average(values: Values) -> Values:
+    """Return for each value the mean of the known ones among the last three; NaN where the value itself is NaN."""
+    series = pd.Series(values, dtype=np.float64)
+    return series.rolling(3, min_periods=1).mean().where(series.notna()).to_numpy()
+
+
 @dataclass(frozen=True, eq=False)
 class Histogram:
     """Counts of values in bins of one width."""

@@ -343,7 +343,7 @@ def _replay(args: argparse.Namespace) -> int:
         overrides.insert(0, "stopping=entropy")
     records = [read_record(resolve(run, stores.runs_dir, stores.uri).path) for run in runs]
 
-    from deepracer_exp.training.stopping_replay import replay, table
+    from deepracer_exp.stopping.replay import replay, table
 
     rules = [
         (" ".join(line.removeprefix("stopping").lstrip(".=") for line in lines), compose_experiment(lines)[0])

@@ -14,7 +14,6 @@ from deepracer_exp.env.setup import Course, RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import Rank
-from deepracer_exp.runs.convergence import Decision, StoppingRule, build_rule
 from deepracer_exp.runs.files import (
     BEST_LAP,
     LEARNING,
@@ -26,6 +25,7 @@ from deepracer_exp.runs.files import (
 )
 from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import read_trace
+from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
 from deepracer_exp.tracking.projection import files_to_keep

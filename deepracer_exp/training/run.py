@@ -31,7 +31,6 @@ from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
-from deepracer_exp.runs.convergence import UNDECIDED
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
     CONFIG,
@@ -49,6 +48,7 @@ from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.result import FINISHED, INTERRUPTED
 from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.stopping.rules import UNDECIDED
 from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.tracker import Tracker, open_tracker

@@ -16,8 +16,8 @@ from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.runs.convergence import LOG_RULE
 from deepracer_exp.runs.result import RunResult
+from deepracer_exp.stopping.judge import LOG_RULE
 
 from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording
@@ -55,7 +55,7 @@ LEARNED = [*RISING, *[1.0] * (LOG_RULE.patience + 4)]
         (LEARNED, list(np.linspace(1.7, 0.2, len(LEARNED))), "but the entropy still changes"),
         ([*RISING, 1.0], [], "Not converged yet: completion grew"),
         ([*LEARNED, 0.4, 0.4, 0.4], [], "Not converged: completion fell back from 100 to 4"),
-        ([0.2] * 30, [], "Converged at iteration 0"),
+        ([0.2] * 30, [], "Converged at iteration 2"),
         ([0.2] * 30, [], "do not train longer"),
         ([0.2] * LOG_RULE.patience, [], "Too short"),
     ],

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepracer_exp.analysis.statistics import histogram, means, quantiles, totals, wilson
-from deepracer_exp.runs.convergence import moving_average
+from deepracer_exp.analysis.statistics import histogram, means, moving_average, quantiles, totals, wilson
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3).map(lambda v: round(v, 3)), min_size=1, max_size=200)
 

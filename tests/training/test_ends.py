@@ -15,8 +15,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.stopping.replay import replay
 from deepracer_exp.training.callbacks import write_pictures
-from deepracer_exp.training.stopping_replay import replay
 from tests.waiting import wait_until
 
 NOT_LEARNING = (

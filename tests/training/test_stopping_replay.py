@@ -7,7 +7,7 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import read_record
-from deepracer_exp.training.stopping_replay import Replay, replay
+from deepracer_exp.stopping.replay import Replay, replay
 
 LENGTH = 200
 LEARNED_AT = 30

@@ -11,9 +11,8 @@ import pandas as pd
 
 from deepracer_exp.analysis.evidence import iqm_band
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.analysis.statistics import Values
+from deepracer_exp.analysis.statistics import Values, moving_average
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.convergence import moving_average
 from deepracer_exp.runs.files import EVALUATIONS, METRICS
 from deepracer_exp.runs.lineage import read_lineage
 

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.analysis.statistics import histogram, quantiles, subsample
-from deepracer_exp.runs.convergence import convergence, moving_average
+from deepracer_exp.analysis.statistics import histogram, moving_average, quantiles, subsample
+from deepracer_exp.stopping.judge import convergence
 
 from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
 from .style import BLUE, FAINT, GREEN, ORANGE, PURPLE, SKY, VERMILION

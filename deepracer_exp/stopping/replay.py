@@ -10,12 +10,13 @@ from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.convergence import Decision, Row, StoppingRule, build_rule
 from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.runs.result import with_unit
 
-from .display import NOTHING
+from .rules import Decision, Row, StoppingRule, build_rule
+
+_NOTHING = "\N{EN DASH}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,25 +107,25 @@ def table(replays: Sequence[Replay]) -> Table:
             f"{one.rule}\n{one.decision or 'continues to the end'}",
             f"{one.iteration} of {one.iterations}",
             f"{one.env_steps:,}",
-            f"{one.saved:.0%}, {one.saved_s:.0f} s" if one.decision else NOTHING,
+            f"{one.saved:.0%}, {one.saved_s:.0f} s" if one.decision else _NOTHING,
             _of(one.completion, one.completion_whole, "{:.1f}", "%"),
             _of(one.lap_time_s, one.lap_time_whole_s, "{:.2f}", "s") + " exploring" * (not one.evaluated),
-            NOTHING if one.lap_loss is None else f"{one.lap_loss:.1%}",
+            _NOTHING if one.lap_loss is None else f"{one.lap_loss:.1%}",
         )
     for rule in dict.fromkeys(one.rule for one in replays):
         of_rule = [one for one in replays if one.rule == rule]
         losses = [one.lap_loss for one in of_rule if one.lap_loss is not None]
         if len(of_rule) > 1:
             saved = f"{sum(one.saved for one in of_rule) / len(of_rule):.0%}"
-            lost = f"{sum(losses) / len(losses):.1%}" if losses else NOTHING
+            lost = f"{sum(losses) / len(losses):.1%}" if losses else _NOTHING
             grid.add_row("mean", rule, "", "", saved, "", "", lost)
     return grid
 
 
 def _of(value: float | None, whole: float | None, number: str, unit: str) -> str:
     if whole is None:
-        return NOTHING
-    return f"{NOTHING if value is None else number.format(value)} of {with_unit(number.format(whole), unit)}"
+        return _NOTHING
+    return f"{_NOTHING if value is None else number.format(value)} of {with_unit(number.format(whole), unit)}"
 
 
 def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) -> Decision | None:

@@ -4,7 +4,7 @@ import math
 
 from deepracer_exp.config.stopping import CollapsedRule, LapsSlowerRule, NotLearningRule, OverfittingRule
 
-Found = tuple[str, dict[str, float]]
+Reason = tuple[str, dict[str, float]]
 """Why a rule applies, in words, and what it compared."""
 
 
@@ -54,13 +54,24 @@ class Average:
         """Return the averages of the last rows."""
         return [average for average in self._averages[-rows:] if average is not None]
 
+    def change(self, patience: int) -> float | None:
+        """Return the range of the averages in the last `patience` rows, None where there is none before them."""
+        if not self.known(patience):
+            return None
+        last = self.last(patience)
+        return max(last) - min(last)
+
+    def row_of_best(self) -> int:
+        """Return the number of the first row with the highest average, which must be known."""
+        return self._averages.index(self.best)
+
     def bests(self, patience: int) -> tuple[float, float]:
         """Return the highest average before the last `patience` rows, and within them."""
         before = (average for average in self._averages[:-patience] if average is not None)
         return max(before), max(self.last(patience))
 
 
-def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Found | None:
+def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Reason | None:
     """Return why a policy that has become almost deterministic and drives badly should end."""
     highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
     if highest >= rule.entropy_floor or best >= rule.completion_poor:
@@ -69,7 +80,7 @@ def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Fou
     return why, {"entropy": highest, "completion": best}
 
 
-def not_learning(rule: NotLearningRule, entropy: Average, completion: Average) -> Found | None:
+def not_learning(rule: NotLearningRule, entropy: Average, completion: Average) -> Reason | None:
     """Return why a policy that has hardly changed since the start should end."""
     lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
     start = completion.first
@@ -79,7 +90,7 @@ def not_learning(rule: NotLearningRule, entropy: Average, completion: Average) -
     return why, {"entropy": lowest, "completion_start": start, "completion": best}
 
 
-def overfits(rule: OverfittingRule, held_out: Average, returns: Average) -> Found | None:
+def overfits(rule: OverfittingRule, held_out: Average, returns: Average) -> Reason | None:
     """Return why a policy that improves on the training's conditions only should end."""
     before, since = held_out.bests(rule.patience)
     lowest_return = returns.best - rule.return_drop * returns.range
@@ -90,7 +101,7 @@ def overfits(rule: OverfittingRule, held_out: Average, returns: Average) -> Foun
     return why, completions | {"return": returns.now, "return_best": returns.best}
 
 
-def laps_slower(rule: LapsSlowerRule, speed: Average, returns: Average) -> Found | None:
+def laps_slower(rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:
     """Return why a policy whose evaluated laps have become slower while its return holds should end.
 
     `speed` is 1 / lap time, 1/s, of evaluations that completed `RELIABLE` of their laps.

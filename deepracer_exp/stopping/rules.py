@@ -1,65 +1,33 @@
-"""Convergence and overfitting: the rules by which a run stops, and by which a report judges a training.
-
-A `StoppingRule` decides row by row while a run is trained. `convergence` and `overfitting` judge a whole table of
-iterations, for reports: of a run of ours with the values of its own rule, of other logs with `LOG_RULE`.
-"""
+"""The rules by which a run stops: a `StoppingRule` decides after each row of metrics.jsonl."""
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from typing import Any
 
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.stopping import (
     ConvergedRule,
     EntropyStopping,
     LapsSlowerRule,
-    OverfittingRule,
     PlateauStopping,
     ReliableStopping,
     StoppingConfig,
 )
 from deepracer_exp.errors import count
+from deepracer_exp.runs.result import reliable_lap_s
 
 from . import trends
-from .result import reliable_lap_s
-from .trends import Average, Found
-
-if TYPE_CHECKING:
-    import pandas as pd
+from .trends import Average, Reason
 
 Row = Mapping[str, Any]
 """One line of metrics.jsonl."""
 
 EVALUATED = ("eval_completion", "held_out_completion")
 """Columns that only the rows of evaluated iterations have."""
-_ALWAYS = ("completion", "mean_return", "laps_per_1000_steps", "entropy")
+_GROWTH = ("completion", "mean_return", "laps_per_1000_steps")
 _LAP_SPEED = "evaluated_laps_per_s"
 _STEPS = 1000  # control steps per which laps are counted, because iterations differ in length
-
-
-LOG_RULE = ConvergedRule(
-    warmup=0,
-    patience=10,
-    completion_near=5.0,
-    completion_gain=2.0,
-    return_gain=0.05,
-    laps_gain=0.05,
-    entropy_change=0.1,
-    best_patience=60,
-    best_gain=0.01,
-)
-"""The values of `conf/stopping/entropy.yaml`, with the warm-up and patience that suit the shorter logs of others."""
-PATIENCE_SHARE = 0.2
-"""Share of all iterations of such a log that must be without growth."""
-POOR = 50.0
-"""Completion below which a training that no longer grows has not learned to drive, per cent."""
-LOG_OVERFITTING = OverfittingRule(warmup=0, patience=3, held_out_drop=10.0, return_drop=0.05)
-"""Likewise; such a log has an evaluation after each iteration."""
 UNDECIDED = {"stopping.rule": "none", "stopping.stopped_early": "false"}
 """Tags of a run that is resumed after a rule had ended it; the values by which it did stay beside them."""
 
@@ -96,8 +64,8 @@ class Decision:
             "stopping.stopped_early": str(self.stopped_early).lower(),
             **{
                 f"stopping.{kind}.{key}": f"{value:.4g}" if isinstance(value, float) else str(value)
-                for kind, found in numbers
-                for key, value in found.items()
+                for kind, items in numbers
+                for key, value in items.items()
             },
         }
 
@@ -160,7 +128,9 @@ class TrendRule(StoppingRule):
         self._action_count = action_count
         self._entropy_at_start: float | None = None
         self._before = (0, 0)
-        self._seen = {name: Average(config.window) for name in (*_ALWAYS, *EVALUATED, _LAP_SPEED)}
+        self.averages = {
+            name: Average(config.window) for name in (*_GROWTH, "entropy", *EVALUATED, _LAP_SPEED)
+        }
         self._race_scores_s: list[float] = []  # infinite where none is known
         self._rows = 0
 
@@ -169,7 +139,7 @@ class TrendRule(StoppingRule):
         config = self._config
         self._rows += 1
         for name, value in self._watched(row).items():
-            self._seen[name].add(value)
+            self.averages[name].add(value)
         score_s = row.get("eval_race_score_s")
         self._race_scores_s.append(math.inf if score_s is None else score_s)
         return self._plateau(config) if isinstance(config, PlateauStopping) else self._entropy(config)
@@ -190,7 +160,7 @@ class TrendRule(StoppingRule):
         }
 
     def _plateau(self, config: PlateauStopping) -> Decision | None:
-        series = self._seen[config.metric]
+        series = self.averages[config.metric]
         if self._rows <= max(config.warmup, config.patience) or not series.known(config.patience):
             return None
         before, since = series.bests(config.patience)
@@ -201,23 +171,25 @@ class TrendRule(StoppingRule):
         return _decision("plateau", why, values, config)
 
     def _entropy(self, config: EntropyStopping) -> Decision | None:
-        rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., Found | None]], ...] = (
+        rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., Reason | None]], ...] = (
             ("collapsed", config.collapsed, ("entropy", "completion"), trends.collapsed),
             ("not_learning", config.not_learning, ("entropy", "completion"), trends.not_learning),
             ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), trends.overfits),
             ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), self._laps_slower),
-            ("converged", config.converged, _ALWAYS, self._converged),
+            ("converged", config.converged, _GROWTH, self._converged),
         )
         for name, rule, columns, judge in rules:
             # Patience begins with the first average, so that there is something before it to compare with.
             if rule is None or self._rows <= max(rule.warmup, rule.patience):
                 continue
-            averages = [self._seen[column] for column in columns]
-            if all(one.known(rule.patience) for one in averages) and (found := judge(rule, *averages)):
-                return _decision(name, *found, rule)
+            averages = [self.averages[column] for column in columns]
+            if all(average.known(rule.patience) for average in averages) and (
+                reason := judge(rule, *averages)
+            ):
+                return _decision(name, *reason, rule)
         return None
 
-    def _laps_slower(self, rule: LapsSlowerRule, speed: Average, returns: Average) -> Found | None:
+    def _laps_slower(self, rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:
         scores_s = self._race_scores_s
         # A policy that gives up some speed for laps on held-out conditions may still become the best one.
         improves = min(scores_s[-rule.patience :]) < min(scores_s[: -rule.patience], default=math.inf)
@@ -227,18 +199,17 @@ class TrendRule(StoppingRule):
             else trends.laps_slower(rule, speed, returns)
         )
 
-    def _converged(self, rule: ConvergedRule, *averages: Average) -> Found | None:
-        completion, returns, laps, entropy = averages
-        flat = entropy.last(rule.patience)
-        values = {
-            "completion": completion.now,
-            "completion_best": completion.best,
-            "entropy": entropy.now,
-            "entropy_change": max(flat) - min(flat),
-        }
+    def _converged(self, rule: ConvergedRule, *averages: Average) -> Reason | None:
+        completion, returns, laps = averages
+        values = {"completion": completion.now, "completion_best": completion.best}
+        entropy, at_entropy = self.averages["entropy"], ""
+        change = entropy.change(rule.patience)
+        if change is not None:  # the logs of others may have no entropy
+            values |= {"entropy": entropy.now, "entropy_change": change}
+            at_entropy = f", entropy {entropy.now:.1%}"
         grew = False
         gains = (rule.completion_gain, rule.return_gain * returns.range, rule.laps_gain * laps.best)
-        for name, series, enough in zip(_ALWAYS[:3], averages[:3], gains, strict=True):
+        for name, series, enough in zip(_GROWTH, averages, gains, strict=True):
             before, since = series.bests(rule.patience)
             values |= {f"{name}_before": before, f"{name}_since": since}
             grew = grew or since > before + enough
@@ -251,11 +222,11 @@ class TrendRule(StoppingRule):
             grew
             or since_s < before_s * (1 - rule.best_gain)
             or completion.now < completion.best - rule.completion_near
-            or values["entropy_change"] > rule.entropy_change
+            or (change or 0.0) > rule.entropy_change
         ):
             return None
         idle = count(rule.patience, "iteration")
-        return f"{completion.now:.1f}% completion, entropy {entropy.now:.1%}, no growth for {idle}", values
+        return f"{completion.now:.1f}% completion{at_entropy}, no growth for {idle}", values
 
 
 def build_rule(config: StoppingConfig, action_count: int | None) -> StoppingRule:
@@ -285,160 +256,3 @@ def _decision(rule: str, why: str, values: dict[str, float], config: Any) -> Dec
         thresholds=thresholds,
         stopped_early=rule in ("collapsed", "not_learning"),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Convergence:
-    """Since when nothing has grown."""
-
-    iteration: int | None
-    """None: not converged."""
-    completion: float
-    """Moving average at the end, per cent."""
-    completion_before: float
-    """Highest one before the last `patience` iterations."""
-    completion_best: float
-    entropy_change: float
-    """Over the last `patience` iterations; NaN where not logged."""
-    patience: int
-    iterations: int
-    entropy_flat: bool
-
-
-def convergence(
-    iterations: "pd.DataFrame", action_count: int | None, stopping: Mapping[str, Any] | None = None
-) -> Convergence | None:
-    """Find the iteration from which on a training no longer grew, None where it is too short to say.
-
-    All series are moving averages of three iterations. Converged since the earliest iteration k, at least `patience`
-    before the end, after which completion, reward and the share of complete laps stay within what counts as growth
-    of their best up to k; completion ends near its best; entropy, where logged, is flat over the last `patience`.
-
-    Args:
-        iterations: a row each, with `episodes`, `completion_mean`, `reward_mean`, `lap_share` and `entropy`.
-        action_count: of a discrete policy, None of a continuous one.
-        stopping: of a run of ours, its group `stopping`, whose rule of convergence is applied if it has one; None:
-            LOG_RULE.
-    """
-    table = iterations[iterations["episodes"] > 0]
-    rows = len(table)
-    rule = convergence_rule(stopping)
-    patience = max(rule.patience, math.ceil(PATIENCE_SHARE * rows) if rule is LOG_RULE else 0)
-    if rows <= patience:
-        return None
-    grown = ("completion_mean", "reward_mean", "lap_share")
-    series = {name: moving_average(table[name].to_numpy(np.float64)) for name in grown}
-    completion = series["completion_mean"]
-    gains = {
-        "completion_mean": rule.completion_gain,
-        "reward_mean": rule.return_gain * float(np.ptp(series["reward_mean"])),
-        "lap_share": rule.laps_gain,
-    }
-    still = np.ones(rows, bool)
-    for name, gain in gains.items():
-        best = np.maximum.accumulate(series[name])
-        still &= best[-1] <= best + gain
-    change = _entropy_change(table["entropy"].to_numpy(np.float64), action_count, patience)
-    flat = not change > rule.entropy_change
-    since = int(still.argmax())
-    near = completion[-1] >= completion.max() - rule.completion_near
-    converged = flat and near and since <= rows - 1 - patience
-    return Convergence(
-        iteration=int(table["iteration"].iloc[since]) if converged else None,
-        completion=float(completion[-1]),
-        completion_before=float(completion[:-patience].max()),
-        completion_best=float(completion.max()),
-        entropy_change=change,
-        patience=patience,
-        iterations=rows,
-        entropy_flat=flat,
-    )
-
-
-def _entropy_change(entropy: NDArray[np.float64], action_count: int | None, patience: int) -> float:
-    known = moving_average(entropy)
-    known = known[np.isfinite(known)]
-    if len(known) <= patience:
-        return math.nan
-    # Of a continuous policy exp((a - b) / 2) is the ratio of two spreads, as in `entropy_share`.
-    scale = 2.0 if action_count is None else math.log(max(action_count, 2))
-    return float(np.ptp(known[-patience:])) / scale
-
-
-@dataclass(frozen=True, kw_only=True)
-class Overfitting:
-    """How the evaluations of a training went, and whether its rule calls that overfitting."""
-
-    decision: Decision | None
-    """Of the stopping rule after the last iteration; None: no sign of overfitting."""
-    evaluated: str
-    """`held-out evaluation` or `evaluation`."""
-    best: float
-    """Completion, per cent, mean of three evaluations."""
-    best_iteration: int
-    now: float
-    rule: OverfittingRule
-
-
-def overfitting(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None = None) -> Overfitting | None:
-    """Apply the stopping rule of overfitting to a table of iterations; None with fewer than six evaluations.
-
-    Evaluations on held-out conditions count; in logs without them the others do.
-
-    Args:
-        iterations: a row each, with `reward_mean`, `held_out_completion` and `eval_completion`.
-        stopping: of a run of ours, its group `stopping`, whose rule is applied if it has one; None: LOG_OVERFITTING.
-    """
-    own = _entropy_stopping(stopping)
-    rule = (own and own.overfitting) or LOG_OVERFITTING
-    for column, name in (("held_out_completion", "held-out evaluation"), ("eval_completion", "evaluation")):
-        known = iterations[iterations[column].notna()]
-        if len(known) < 6:
-            continue
-        only = EntropyStopping(
-            kind="entropy",
-            window=3,
-            converged=None,
-            overfitting=rule,
-            collapsed=None,
-            not_learning=None,
-            laps_slower=None,
-        )
-        judge, decision = TrendRule(only, None), None
-        for returned, completion in zip(iterations["reward_mean"], iterations[column], strict=True):
-            row = {"mean_return": returned, "held_out_completion": completion, "laps": 0, "env_steps": 0}
-            decision = judge.observe(row)
-        averages = moving_average(known[column].to_numpy(np.float64))
-        best = 2 + int(averages[2:].argmax())  # the first two are of fewer than three
-        return Overfitting(
-            decision=decision,
-            evaluated=name,
-            best=float(averages[best]),
-            best_iteration=int(known["iteration"].iloc[best]),
-            now=float(averages[-1]),
-            rule=rule,
-        )
-    return None
-
-
-def convergence_rule(stopping: Mapping[str, Any] | None) -> ConvergedRule:
-    """Return the rule of convergence of a group `stopping`, LOG_RULE if it has none."""
-    own = _entropy_stopping(stopping)
-    return (own and own.converged) or LOG_RULE
-
-
-def _entropy_stopping(stopping: Mapping[str, Any] | None) -> EntropyStopping | None:
-    adapter: TypeAdapter[StoppingConfig] = TypeAdapter(StoppingConfig)
-    try:
-        config = adapter.validate_python(stopping)
-    except ValidationError:  # none, or of another version
-        return None
-    return config if isinstance(config, EntropyStopping) else None
-
-
-def moving_average(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return for each value the mean of the known ones among the last three; NaN where the value itself is NaN."""
-    import pandas as pd  # takes half a second, and only reports need it
-
-    series = pd.Series(values, dtype=np.float64)
-    return series.rolling(3, min_periods=1).mean().where(series.notna()).to_numpy()
