@@ -1,46 +1,35 @@
-"""Override expressions to a validated experiment; Hydra composes here and nowhere else."""
+"""Override expressions to a validated experiment."""
 
-import copy
 import difflib
-import functools
 import itertools
-import json
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from hydra import compose, initialize_config_dir
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
-from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, RangeSweep
-from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
-from hydra.plugins.config_source import ConfigResult
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.files import read_yaml
 
 from . import acting, custom_files
 from .custom_files import FileOverrides, file_overrides, read_custom_files
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
 from .experiment import Experiment
-from .options import SWEEP, conf_dirs, find, groups, listed, options, sweep_files
-from .overrides import PLAIN_TEXT, line_for_hydra, override_line, parse_single, parse_sweep
+from .option_files import composed, composed_option, first_line, plain, remove_key, set_value
+from .options import groups, listed, options
+from .overrides import PLAIN_TEXT, may_be_new, override_line, parse_single, parse_sweep
 from .own_class import allow, allow_given, own_option
 from .parse import import_own_classes, parse_config, parse_experiment
-from .track_options import ALL, by_world_name, complete, several_tracks, without_placeholders, world_values
+from .track_options import ALL, by_world_name, complete, several_tracks, world_values
 from .track_options import GROUP as TRACK
 
 Config = TypeVar("Config")
@@ -50,9 +39,6 @@ MOST_RUNS = 1000
 
 _FILES = (".json", ".npy", ".py", ".yaml", ".yml")
 _NO_EXPERIMENT = ("experiment", None)
-
-# Lets option files refer to files beside them, whatever the working directory: ${conf:'reward/mine.py'}.
-OmegaConf.register_new_resolver("conf", find, replace=True)
 
 
 @dataclass(frozen=True)
@@ -139,33 +125,32 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
         _check_key(entry, override)
     files = _files(given, {one.key_or_group: text for one, text in zip(given, overrides, strict=True)})
     own = [*map(parse_single, files.lines), *own]
-    has_tracks = TRACK in groups(entry)
-    several = several_tracks(own) if has_tracks else None
+    chosen = [override for override in own if override.key_or_group in groups(entry)]
+    changing = [override for override in own if override.key_or_group not in groups(entry)]
+    several = several_tracks(chosen, changing) if TRACK in groups(entry) else None
     if several is not None:
-        rest = [override for override in own if override.key_or_group.partition(".")[0] != TRACK]
-        own = [*map(parse_single, several.choosing), *rest, *several.changing]
+        chosen = [override for override in chosen if override.key_or_group != TRACK]
+        changing = list(several.changing)
     with reading(" ".join(overrides) or entry):
+        config, choices = composed(entry, [_choice(override) for override in chosen])
+        if several is not None:
+            config[TRACK] = {name: _track(name) for name in several.names}
+            choices[TRACK] = f"[{','.join(several.names)}]"
         try:
-            config = _composed(entry, [line_for_hydra(override) for override in own])
-            choices = {
-                str(group): str(option).removesuffix(".yaml")
-                for group, option in config.hydra.runtime.choices.items()
-                if option is not None
-            }
-            with open_dict(config):
-                del config["hydra"]
-            mapping = _plain(config)
-        except (HydraException, OmegaConfBaseException) as error:
-            raise BadInput(_explain(entry, own, error)) from error
-    if has_tracks and TRACK in mapping and TRACK not in choices:
-        raise BadInput(
-            "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"
-        )
-    if several is None and has_tracks and isinstance(mapping.get(TRACK), dict):
-        mapping[TRACK] = complete(choices[TRACK], mapping[TRACK])
-    elif several is not None:
-        several.move_to_track(mapping)
-        choices[TRACK] = f"[{','.join(several.names)}]"
+            for override in changing:
+                _change(entry, config, choices, override)
+            mapping = plain(config)
+        except OmegaConfBaseException as error:
+            raise BadInput(f"{error.full_key or entry}: {first_line(error)}") from error
+    if TRACK in mapping and TRACK in groups(entry):
+        if TRACK not in choices:
+            raise BadInput(
+                "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"
+            )
+        if several is not None:
+            mapping[TRACK] = {name: complete(name, values) for name, values in mapping[TRACK].items()}
+        elif isinstance(mapping[TRACK], dict):
+            mapping[TRACK] = complete(choices[TRACK], mapping[TRACK])
     # Option files of the user may contain addresses, too.
     mapping, left_out = without_passwords(mapping), list[str]()
     if stored:
@@ -181,79 +166,29 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
     )
 
 
-@functools.lru_cache(maxsize=512)
-def _parsed(text: str) -> DictConfig:
-    """Parse an option; most are composed again and again, and parsing was a third of the work."""
-    config = OmegaConf.load(StringIO(text))
-    if not isinstance(config, DictConfig):
-        raise ValueError("has no keys")
-    return config
+def _choice(override: Override) -> str:
+    """Return the expression that chooses an option, or none with `~GROUP`."""
+    if override.is_delete():
+        return override.get_key_element()
+    return override_line(override.key_or_group, override.value())
 
 
-class OptionFiles(FileConfigSource):
-    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
-
-    It has the worlds, too: all that is in Hydra's `ConfigStore` is copied at each composition, and 120 worlds there
-    were a fifth of the work.
-    """
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        """Read an option.
-
-        Raises:
-            BadInput: the file cannot be read, or is not YAML with keys and values.
-        """
-        if (world := self._world(config_path)) is not None:
-            return ConfigResult(
-                self.provider, f"{self.scheme()}://{self.path}", OmegaConf.create(world), {"package": None}
-            )
-
-        def load(text: str) -> ConfigResult:
-            config, header = copy.deepcopy(_parsed(text)), self._get_header_dict(text[:512])
-            return ConfigResult(self.provider, f"{self.scheme()}://{self.path}", config, header)
-
-        return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
-
-    def is_config(self, config_path: str) -> bool:
-        """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
-        path = self._file(config_path)
-        is_file = self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
-        return is_file or self._world(config_path) is not None
-
-    def is_group(self, config_path: str) -> bool:
-        """Return whether there is such a folder."""
-        return self._is_below(config_path) and super().is_group(config_path)
-
-    @staticmethod
-    def _world(config_path: str) -> dict[str, Any] | None:
-        group, _, option = config_path.rpartition("/")
-        return world_values(option.removesuffix(".yaml")) if group == TRACK else None
-
-    def _file(self, config_path: str) -> Path:
-        group, _, name = config_path.rpartition("/")
-        study = sweep_files().get(name.removesuffix(".yaml")) if group == SWEEP else None
-        return study or Path(self.path, self._normalize_file_name(config_path))
-
-    @staticmethod
-    def _is_below(config_path: str) -> bool:
-        # Names in `defaults:` of an option file must not lead out of the folder either.
-        return not Path(config_path).is_absolute() and ".." not in Path(config_path).parts
+def _track(name: str) -> DictConfig:
+    """Return the values of one track of several."""
+    world = world_values(name)
+    return composed_option(TRACK, name) if world is None else OmegaConf.create(world)
 
 
-def register_option_files() -> None:
-    """Replace the one reader of files that Hydra has by `OptionFiles`."""
-    Plugins.instance()  # registers Hydra's own reader
-    SourcesRegistry.instance().types[OptionFiles.scheme()] = OptionFiles
-
-
-def _composed(name: str | None, lines: list[str]) -> DictConfig:
-    """Let Hydra compose a file of `conf/`, or the overrides alone; the result includes Hydra's own settings."""
-    project, *more = conf_dirs()
-    register_option_files()
-    if more:
-        lines = [*lines, override_line("hydra.searchpath", [f"file://{folder}" for folder in more])]
-    with initialize_config_dir(str(project), version_base="1.3"):
-        return compose(name, overrides=lines, return_hydra_config=True)
+def _change(entry: str, config: DictConfig, choices: Mapping[str, str], override: Override) -> None:
+    """Set or remove the value that an override names."""
+    key = override.key_or_group
+    done = (
+        remove_key(config, key)
+        if override.is_delete()
+        else set_value(config, key, override.value(), is_new=may_be_new(override))
+    )
+    if not done:
+        raise BadInput(_unknown_key(entry, key, config, choices))
 
 
 def compose_option(group: str, option: str, kind: type[Config]) -> Config:
@@ -264,7 +199,7 @@ def compose_option(group: str, option: str, kind: type[Config]) -> Config:
     """
     check_option(group, option)
     with reading(f"{group}={option}"):
-        mapping = _plain(_composed(None, [f"+{override_line(group, option)}"])[group])
+        mapping = plain(composed_option(group, option))
     try:
         return parse_config(mapping, kind)
     except BadInput as error:
@@ -320,13 +255,6 @@ def _check_names(evaluation: EvaluationConfig) -> None:
             check_option("randomization", name, f"evaluation.{key}")
 
 
-def _plain(config: DictConfig) -> dict[str, Any]:
-    """Return composed values as plain Python: text for all keys, and for values that JSON does not have."""
-    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    plain: dict[str, Any] = json.loads(json.dumps(values, default=str))
-    return plain
-
-
 def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
     """Return one list of overrides per combination of the sweeps in them (``seed=0,1``, ``range(1,4)``).
 
@@ -378,38 +306,15 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
             yield from _dotted(value, f"{prefix}{key}.")
 
 
-def _explain(entry: str, parsed: Sequence[Override], error: Exception) -> str:
-    """Return one line for an error message of Hydra, which has several."""
-    text = without_placeholders(str(error))
-    missing = re.search(r"Could not find '([^']*)'", text)
-    groups_within = [group for group in groups(entry) if missing and missing[1].startswith(f"{group}/")]
-    if missing and groups_within:
-        group = max(groups_within, key=len)  # sweep/executor rather than sweep
-        option = missing[1].removeprefix(f"{group}/")
-        return f"{group}={option}: no such {group}{nearest(option, options(group))}"
-    unknown = re.search(r"Could not override '([^']+)'", text)
-    if unknown:
-        known = groups(entry)
-        chosen = [
-            o.input_line or ""
-            for o in parsed
-            if o.key_or_group in known and o.package is None and o.key_or_group != unknown[1]
-        ]
-        return _unknown_key(entry, unknown.group(1), compose_entry(entry, chosen))
-    loaded = re.search(r"in the defaults list", text)
-    if loaded:
-        key = next((o.key_or_group for o in parsed if o.key_or_group in text), parsed[0].key_or_group)
+def _unknown_key(entry: str, key: str, config: DictConfig, choices: Mapping[str, str]) -> str:
+    """Return the message for an unknown key of composed values."""
+    if "/" in key:
         return f"{key}: no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
-    return f"{getattr(error, 'full_key', None) or entry}: {text.partition('full_key:')[0]}"
-
-
-def _unknown_key(entry: str, key: str, chosen: Composition) -> str:
-    """Return the message for an unknown key; `chosen` is composed without the overrides of single values."""
     parent, _, leaf = key.rpartition(".")
-    keys = list(_dotted(chosen.mapping))
+    keys = list(_dotted(OmegaConf.to_container(config)))
     siblings = [k.rpartition(".")[2] for k in keys if parent and k.rpartition(".")[0] == parent]
     if siblings:
-        option = f" with {parent}={chosen.choices[parent]}" if parent in chosen.choices else ""
+        option = f" with {parent}={choices[parent]}" if parent in choices else ""
         return f"{key}: no such key{option}{nearest(leaf, siblings)}; known: {', '.join(siblings)}"
     within = [k for k in keys if k.startswith(f"{key}.")]
     if within:

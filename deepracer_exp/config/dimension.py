@@ -15,6 +15,7 @@ from hydra.core.override_parser.types import (
     QuotedString,
     RangeSweep,
     Sweep,
+    Transformer,
 )
 
 from deepracer_exp.errors import BadInput, nearest
@@ -150,8 +151,10 @@ def _choices(line: str, elements: Sequence[Any]) -> Choices:
 
 def _expression(element: str | QuotedString | list[Any] | dict[Any, Any]) -> str:
     """Return an element as the value of an override; choice() has removed the quotes of its texts."""
-    words, plain = Override._get_value_element_as_str(element), Override._convert_value(element)
-    return words if override_value(f"key={words}") == plain else override_line("", plain)[1:]
+    words: str = Transformer.str(element)
+    if isinstance(element, str) and override_value(f"key={words}") != element:
+        return override_line("", element)[1:]
+    return words
 
 
 def _interval(line: str, low: Number, high: Number, log: bool) -> Range:

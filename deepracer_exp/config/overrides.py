@@ -15,7 +15,7 @@ from .own_class import GROUPS
 # An override may add keys to these mappings.
 OPEN_MAPPINGS = ("reward.constants", *(f"{group}.kwargs" for group in GROUPS))
 # Options of these groups may omit keys, which are filled in and checked after Hydra.
-COMPLETED = ("track", "several_tracks")
+COMPLETED = ("track",)
 # Values of these keys are taken literally: without quotes, Hydra's grammar accepts no umlaut, bracket or second
 # equals sign in a value, and a comma makes a sweep.
 PLAIN_TEXT = (
@@ -25,7 +25,7 @@ PLAIN_TEXT = (
     # Of sweeps.
     *("study", "parent", "sweep.storage"),
 )
-_KEYS = "|".join((*map(re.escape, PLAIN_TEXT), r"(?:track|several_tracks)\.[\w-]+\.file"))
+_KEYS = "|".join((*map(re.escape, PLAIN_TEXT), r"track\.[\w-]+\.file"))
 _PLAIN = re.compile(rf"(\+{{0,2}}(?:{_KEYS})=)(.+)", re.DOTALL)
 _LONGEST = 20_000
 """Most characters of an override; Hydra's parser takes a minute for many more."""
@@ -63,13 +63,10 @@ def parse_sweep(override: str) -> Override:
         return _parse(plain[1] + ",".join(_quoted(part) for part in plain[2].split(",")))
 
 
-def line_for_hydra(override: Override) -> str:
-    """Return the expression to pass to Hydra."""
-    line = override.input_line or ""
+def may_be_new(override: Override) -> bool:
+    """Return whether an override may add a key that the chosen options do not have."""
     inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in (*OPEN_MAPPINGS, *COMPLETED))
-    if inside and not override.is_add() and not override.is_force_add() and not override.is_delete():
-        return f"++{line}"
-    return line
+    return inside or override.is_add() or override.is_force_add()
 
 
 def override_line(key: str, value: object) -> str:

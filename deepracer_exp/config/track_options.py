@@ -2,15 +2,12 @@
 
 Worlds need no files: Hydra finds them by name. Keys that an option omits have the values of
 `conf/track/reinvent_base.yaml`, so that a track of your own needs `knots` and `width_m` only.
-
-Several tracks (`track=[A,B]`, `track=all`) are composed by Hydra under the placeholder keys `several_tracks.place_0`,
-`place_1`, ...; afterwards they are moved to `track`, by their names.
 """
 
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -26,7 +23,6 @@ from .track import TrackConfig
 
 GROUP = "track"
 ALL = "all"
-PLACE = "several_tracks"
 BASE = "reinvent_base"
 """The option with the default values of all others."""
 
@@ -72,15 +68,8 @@ class SeveralTracks:
     """Several chosen tracks, and the overrides of their values."""
 
     names: tuple[str, ...]
-    choosing: tuple[str, ...]
-    """Expressions that choose the options."""
     changing: tuple[Override, ...]
-    """Overrides of their values: first those of all tracks, so that those of a single track have priority."""
-
-    def move_to_track(self, mapping: dict[Any, Any]) -> None:
-        """Move the composed tracks to `track`, by their names."""
-        places = mapping.pop(PLACE)
-        mapping[GROUP] = {name: complete(name, places[_place(at)]) for at, name in enumerate(self.names)}
+    """All overrides of values: those of all tracks before those of single ones, which have priority."""
 
 
 def world_values(option: str) -> dict[str, Any] | None:
@@ -129,13 +118,17 @@ def by_world_name(override: Override) -> Override:
     return override if named == value else parse_single(override_line(GROUP, named))
 
 
-def several_tracks(own: Sequence[Override]) -> SeveralTracks | None:
-    """Return the several tracks that the overrides choose; None if they choose one, or none.
+def several_tracks(choosing: Sequence[Override], changing: Sequence[Override]) -> SeveralTracks | None:
+    """Return the several tracks that overrides choose; None if they choose one, or none.
+
+    Args:
+        choosing: overrides of groups.
+        changing: overrides of values.
 
     Raises:
         BadInput: a track is unknown or chosen twice, the list is empty, or a value is set for a track not chosen.
     """
-    chosen = [override for override in own if override.key_or_group == GROUP and not override.is_delete()]
+    chosen = [one for one in choosing if one.key_or_group == GROUP and not one.is_delete()]
     value = chosen[-1].value() if chosen else None
     known = options(GROUP)
     if value == ALL and ALL not in known:
@@ -145,36 +138,22 @@ def several_tracks(own: Sequence[Override]) -> SeveralTracks | None:
         names = tuple(str(name) for name in value)
         _check(chosen[-1].input_line or "", names, known)
     else:
-        _check_single(own, known)
+        _check_single(changing, known)
         return None
-    choosing = [f"{GROUP}={names[0]}"]
-    choosing += [f"+{GROUP}@{PLACE}.{_place(at)}={name}" for at, name in enumerate(names)]
+    others: list[Override] = []
     of_all: list[Override] = []
     of_one: list[Override] = []
-    for override in own:
-        if override.key_or_group.startswith(f"{GROUP}."):
-            first, *_ = override.key_or_group.removeprefix(f"{GROUP}.").split(".")
-            if first in names:
-                of_one.append(_moved(override, f"{GROUP}.{first}", names.index(first)))
-            else:
-                _check_first(override, first, names)
-                of_all += [_moved(override, GROUP, at) for at in range(len(names))]
-    return SeveralTracks(names, tuple(choosing), (*of_all, *of_one))
-
-
-def without_placeholders(text: str) -> str:
-    """Return a message of Hydra with placeholder keys replaced by `track`."""
-    return re.sub(rf"\b{PLACE}\.\w+\b", GROUP, text)
-
-
-def _place(at: int) -> str:
-    # Not its name: keys of Hydra begin with a letter.
-    return f"place_{at}"
-
-
-def _moved(override: Override, prefix: str, at: int) -> Override:
-    line = override.input_line or ""
-    return parse_single(line.replace(prefix, f"{PLACE}.{_place(at)}", 1))
+    for override in changing:
+        group, _, key = override.key_or_group.partition(".")
+        first = key.partition(".")[0]
+        if group != GROUP:
+            others.append(override)
+        elif first in names:
+            of_one.append(override)
+        else:
+            _check_first(override, first, names)
+            of_all += [replace(override, key_or_group=f"{GROUP}.{name}.{key}") for name in names]
+    return SeveralTracks(names, (*others, *of_all, *of_one))
 
 
 def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
@@ -191,8 +170,8 @@ def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
             raise BadInput(f"{line}: {name} is listed twice; {GROUP}.{name}.weight=2 gives it twice the cars")
 
 
-def _check_single(own: Sequence[Override], known: Sequence[str]) -> None:
-    for override in own:
+def _check_single(changing: Sequence[Override], known: Sequence[str]) -> None:
+    for override in changing:
         group, _, key = override.key_or_group.partition(".")
         name, _, key = key.partition(".")
         if group == GROUP and name in known:

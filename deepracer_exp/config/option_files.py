@@ -1,0 +1,212 @@
+"""Option files composed by Hydra: the only place that runs it, through its public plugins and `hydra.compose`.
+
+Hydra has no public way to compose from folders with a reader of our own alone: `initialize_config_dir` wants a folder
+that it reads itself. It gets the folder of this module, in which it finds no option, and our plugin adds the real ones.
+"""
+
+import copy
+import functools
+import os
+import re
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, MissingConfigException
+from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.files import read_yaml
+
+from .options import SWEEP, conf_dirs, find, groups, options, sweep_files
+from .overrides import override_line
+from .track_options import GROUP as TRACK
+from .track_options import world_values
+
+_EMPTY = str(Path(__file__).parent)
+_PACKAGE = re.compile(r"(?:\s*#.*\n)*?\s*#\s*@package\s+(\S+)")
+
+# Lets option files refer to files beside them, whatever the working directory: ${conf:'reward/mine.py'}.
+OmegaConf.register_new_resolver("conf", find, replace=True)
+
+
+@functools.lru_cache(maxsize=512)
+def _parsed(text: str) -> DictConfig:
+    """Parse an option; most are composed again and again, and parsing was a third of the work."""
+    config = OmegaConf.load(StringIO(text))
+    if not isinstance(config, DictConfig):
+        raise ValueError("has no keys")
+    return config
+
+
+class OptionFiles(ConfigSource):
+    """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
+
+    It has the worlds, too: all that is in Hydra's `ConfigStore` is copied at each composition, and 120 worlds there
+    were a fifth of the work.
+    """
+
+    @staticmethod
+    def scheme() -> str:
+        """Return what stands before a folder in Hydra's search path."""
+        return "options"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read an option.
+
+        Raises:
+            BadInput: the file cannot be read, or is not YAML with keys and values.
+        """
+        if (world := self._world(config_path)) is not None:
+            return ConfigResult(self.provider, self.full_path(), OmegaConf.create(world), {"package": None})
+
+        def load(text: str) -> ConfigResult:
+            config, package = copy.deepcopy(_parsed(text)), _PACKAGE.match(text)
+            return ConfigResult(self.provider, self.full_path(), config, {"package": package and package[1]})
+
+        return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
+
+    def is_config(self, config_path: str) -> bool:
+        """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
+        path = self._file(config_path)
+        is_file = self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
+        return is_file or self._world(config_path) is not None
+
+    def is_group(self, config_path: str) -> bool:
+        """Return whether there is such a folder."""
+        return self._is_below(config_path) and Path(self.path, config_path).is_dir()
+
+    def available(self) -> bool:
+        """Return whether the folder is there."""
+        return Path(self.path).is_dir()
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Return the names of the options and groups in a folder, for Hydra's own messages."""
+        files = [path.stem for path in Path(self.path, config_path).glob("*.yaml")]
+        folders = [path.name for path in Path(self.path, config_path).glob("*/")]
+        kinds = {ObjectType.CONFIG: files, ObjectType.GROUP: folders, None: files + folders}
+        return sorted(kinds.get(results_filter, []))
+
+    @staticmethod
+    def _world(config_path: str) -> dict[str, Any] | None:
+        group, _, option = config_path.rpartition("/")
+        return world_values(option.removesuffix(".yaml")) if group == TRACK else None
+
+    def _file(self, config_path: str) -> Path:
+        group, _, name = config_path.removesuffix(".yaml").rpartition("/")
+        study = sweep_files().get(name) if group == SWEEP else None
+        return study or Path(self.path, group, f"{name}.yaml")
+
+    @staticmethod
+    def _is_below(config_path: str) -> bool:
+        # Names in `defaults:` of an option file must not lead out of the folder either.
+        return not Path(config_path).is_absolute() and ".." not in Path(config_path).parts
+
+
+class OptionFolders(SearchPathPlugin):
+    """Lets Hydra search our folders of options, in compositions of ours only."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add the folders."""
+        if any(element.path == _EMPTY for element in search_path.get_path()):
+            for folder in conf_dirs():
+                search_path.append("deepracer_exp", f"{OptionFiles.scheme()}://{folder}")
+
+
+def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """Let Hydra compose a file of `conf/`, or options alone.
+
+    Args:
+        entry: name of the file; None: there is none.
+        lines: choose an option of a group each, in Hydra's grammar.
+
+    Returns:
+        The values, without Hydra's own settings; the option chosen in each group.
+
+    Raises:
+        BadInput: an option that another one names is not there, or a file cannot be used.
+    """
+    for plugin in (OptionFiles, OptionFolders):
+        Plugins.instance().register(plugin)
+    try:
+        with initialize_config_dir(_EMPTY, version_base="1.3"):
+            config = compose(entry, overrides=list(lines), return_hydra_config=True)
+    except MissingConfigException as error:
+        raise BadInput(_missing(entry or "train", error.missing_cfg_file or "")) from error
+    except (HydraException, OmegaConfBaseException) as error:
+        raise BadInput(f"{entry or ' '.join(lines)}: {first_line(error)}") from error
+    chosen = config.hydra.runtime.choices.items()
+    choices = {str(key): str(option).removesuffix(".yaml") for key, option in chosen if option is not None}
+    with open_dict(config):
+        del config["hydra"]
+    return config, choices
+
+
+def composed_option(group: str, option: str) -> DictConfig:
+    """Let Hydra compose an option by itself; raises as `composed`."""
+    values = composed(None, [f"+{override_line(group, option)}"])[0][group]
+    assert isinstance(values, DictConfig)
+    return values
+
+
+def set_value(config: DictConfig, key: str, value: Any, *, is_new: bool) -> bool:
+    """Set a dotted key; return False if there is no such key and it `is_new` is not meant."""
+    try:
+        OmegaConf.update(config, key, value, merge=True, force_add=is_new)
+    except (ConfigAttributeError, ConfigKeyError):
+        return False
+    return True
+
+
+def remove_key(config: DictConfig, key: str) -> bool:
+    """Remove a dotted key; return False if there is none."""
+    above, _, leaf = key.rpartition(".")
+    node = OmegaConf.select(config, above) if above else config
+    if not isinstance(node, DictConfig) or leaf not in node:
+        return False
+    with open_dict(node):
+        del node[leaf]
+    return True
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Return composed values as plain Python: text for all keys, and for values that JSON does not have.
+
+    Raises:
+        OmegaConfBaseException: an interpolation leads nowhere, or a value is missing.
+    """
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    return _plain(values)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return value if value is None or isinstance(value, str | int | float) else str(value)
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error of Hydra or OmegaConf; an empty one of Hydra's has it in its cause."""
+    text = str(error) or str(error.__cause__ or type(error).__name__)
+    return text.splitlines()[0]
+
+
+def _missing(entry: str, path: str) -> str:
+    """Return the message for an option that an option file names and that is not there."""
+    within = [group for group in groups(entry) if path.startswith(f"{group}/")]
+    if not within:
+        return f"{path}: no such option file"
+    group = max(within, key=len)  # sweep/executor rather than sweep
+    option = path.removeprefix(f"{group}/")
+    return f"{group}={option}: no such {group}{nearest(option, options(group))}"
