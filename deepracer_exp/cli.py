@@ -39,11 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             reward functions does so in a child process.
     """
     args = argparse.Namespace()
+    given = without_passwords(list(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:
         guard_imports()
-        sys.argv[1:] = without_passwords(sys.argv[1:])  # the run's folder keeps them
+        sys.argv[1:] = given  # the run's folder keeps them
     try:
-        args = parse(sys.argv[1:] if arguments is None else arguments)
+        args = parse(given)
     except BadInput as error:
         sys.exit(_fail(error, BadInput.exit_code, args))
     if arguments is None:
@@ -68,8 +69,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if not arguments:
         parser.print_help()
         raise SystemExit(0)
-    given = without_passwords(list(arguments))
-    args, rest = parser.parse_known_args(runs.with_default_action(given))
+    args, rest = parser.parse_known_args(runs.with_default_action(list(arguments)))
     if any(argument.startswith("-") for argument in rest) or (rest and "overrides" not in args):
         raise BadInput(f"unrecognized arguments: {' '.join(rest)}; see `{args.prog} --help`")
     if rest:  # argparse accepts no positional arguments after an option between them

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 
@@ -146,7 +145,7 @@ def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
         else:
             config[group] = {**config[group], key: {"kind": "local"} if key == "executor" else None}
         left_out.append(
-            f"{one.key}={without_passwords(one.text)}: not taken over from {where}, because you have not used it "
+            f"{one.key}={one.text}: not taken over from {where}, because you have not used it "
             f"before; {advice}"
         )
     return left_out

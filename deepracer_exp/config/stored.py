@@ -1,6 +1,5 @@
 """The stored configuration of a run: changed by overrides, compared with others."""
 
-import copy
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -42,7 +41,7 @@ def with_overrides(
     if not stored:
         allow_given(parts)
     parsed = [parse_single(override) for override in overrides if override not in parts]
-    values = copy.deepcopy(dict(config))
+    values = without_passwords(dict(config))
     left_out = acting.leave_out_foreign(values, "the stored run")
     chosen = [one for one in parsed if one.key_or_group in groups() and not one.is_delete()]
     for one in parsed:
