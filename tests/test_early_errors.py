@@ -187,7 +187,7 @@ def refused(tmp_path_factory, call_at):
     write_run(runs / "ended", config, status="finished", reason="budget reached: env_steps", env_steps=spent)
     write_run(recorded / "stopped", config, status="stopped early", reason="converged", env_steps=9)
     store = f"sqlite:///{folder / 'recorded' / 'mlflow.db'}"
-    tracked = TrackedRun("id", "a", "a", 0, store, complete=True)
+    tracked = TrackedRun("a", "a", 0, store=store, run_id="id", complete=True)
     (recorded / "stopped" / "tracking.json").write_text(json.dumps(asdict(tracked)))
     code = f"""
 import contextlib, io, json, sys

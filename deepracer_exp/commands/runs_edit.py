@@ -141,7 +141,8 @@ class _Target:
         except BadInput as error:
             if self.folder is None:
                 raise
-            TrackingFile.read(self.folder / TRACKING, store.shown).change(complete=False)
+            recorded = read_tracked_run(self.folder / TRACKING)
+            TrackingFile(self.folder, recorded, store.shown).change(complete=False)
             print(f"warning: {error}\n  send it later: deepracer-exp runs send {self.name}", file=sys.stderr)
 
 

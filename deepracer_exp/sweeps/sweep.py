@@ -174,7 +174,7 @@ def _run(
             return interruption.exit_code
         track(patiently(claims.all, patience_s))
     if study_run is not None:
-        study_run.log_file(worker_config.folder / REPORT)
+        study_run.log_report(worker_config.folder / REPORT)
     return 0
 
 

@@ -41,7 +41,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             f"{run_dir}: has no summary.json, so the run has not ended; only ended runs can be recorded afterwards"
         )
     store = resolve_store(uri, runs_dir)
-    file = TrackingFile.read(run_dir / TRACKING, store.shown)
+    file = TrackingFile(run_dir, read_tracked_run(run_dir / TRACKING), store.shown)
     if file.run.status is None:  # killed before it noted its end
         file.change(status=ENDS.get(summary["status"], "KILLED"), end_ms=now_ms())
     projection = Projection(store, file)
@@ -81,7 +81,6 @@ def deliver_evaluation(
         from .mlflow_run import MLflowRun
 
         run = MLflowRun(store)
-        run.connect()
         run.run_id = run_id
         run.log_metrics(points_at(metrics, env_steps, now_ms()))
         for file, folder in files.items():

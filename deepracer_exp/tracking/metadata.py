@@ -147,7 +147,7 @@ _COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.cons
 
 def run_params(
     choices: Mapping[str, str], names: Mapping[str, str], config: Mapping[str, Any], overrides: Sequence[str]
-) -> dict[str, Scalar]:
+) -> dict[str, str]:
     """Return the parameters by which runs are compared; the run's config.yaml has all values.
 
     These are the choices, by readable names where there are some, what racers vary, and the keys of the overrides.
@@ -158,7 +158,7 @@ def run_params(
         for key, value in flatten(config).items()
         if any(f"{key}.".startswith(f"{one}.") for one in compared)
     }
-    return {**values, **choices, **names}
+    return {key: param_text(value) for key, value in {**values, **choices, **names}.items()}
 
 
 def run_tags(

@@ -50,22 +50,22 @@ class MLflowRun:
     """
 
     def __init__(self, store: Store) -> None:
+        """Open the store, creating it if necessary."""
         self.run_id: str | None = None
         self.metrics: dict[str, float] = {}
         self._store = store
-        self._client: MlflowClient
+        self._client = self._connect()
         self._params: dict[str, str] = {}
         self._tags: dict[str, str] = {}
         self._is_new = True
         self._steps: dict[str, set[int]] = {}
         """Steps of the points that the store has, by metric."""
 
-    def connect(self) -> None:
-        """Open the store, creating it if necessary."""
+    def _connect(self) -> MlflowClient:
         with store_errors(), self._store.creation_lock():
             if (file := self._store.sqlite_file) is not None and not file.exists():
                 _create_whole(file)
-            self._client = client_of(self._store)
+            return client_of(self._store)
 
     def open(self, tracked: TrackedRun) -> None:
         """Create the run, or continue it if the store has it already, with or without an answer that said so."""
@@ -119,12 +119,7 @@ class MLflowRun:
             for key in {point[0] for point in points} - self._steps.keys():
                 history = [] if self._is_new else self._client.get_metric_history(self.run_id, key)
                 self._steps[key] = {point.step for point in history}
-        return [point for point in points if not self.has(point)]
-
-    def has(self, point: Point) -> bool:
-        """Return whether the store is known to have a point of this metric and step."""
-        key, _, _, step = point
-        return step in self._steps.get(key, ())
+        return [point for point in points if point[-1] not in self._steps[point[0]]]
 
     def log_metrics(self, points: Sequence[Point]) -> None:
         """Write points."""

@@ -2,11 +2,12 @@
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from typing_extensions import override
 
-from .metadata import END_TAG, Scalar, param_text
+from .metadata import END_TAG
 from .metrics import now_ms, points_of
 from .projection import Projection
 from .store import Store
@@ -30,8 +31,8 @@ class MLflowTracker(Tracker):
         self._thread: StoreThread
 
     @property
-    @override
     def run_id(self) -> str | None:
+        """Id of the run in MLflow, once it exists."""
         return self._file.run.run_id
 
     @property
@@ -41,24 +42,12 @@ class MLflowTracker(Tracker):
         return None if reason is None else f"MLflow ({self._store.shown}): {reason}"
 
     @override
-    def start(
-        self,
-        run_name: str,
-        experiment: str,
-        params: Mapping[str, Scalar],
-        tags: Mapping[str, str],
-        identity: Path,
-    ) -> None:
-        texts = {key: param_text(value) for key, value in params.items()}
-        tracked = TrackedRun(None, run_name, experiment, now_ms(), self._store.shown, texts, dict(tags))
-        self._begin(TrackingFile(identity, tracked))
-
-    @override
-    def reopen(self, identity: Path) -> None:
-        file = TrackingFile.read(identity, self._store.shown)
-        tags = {key: value for key, value in file.run.tags.items() if key != END_TAG}
-        file.change(status=None, end_ms=None, complete=False, tags=tags)
-        self._begin(file)
+    def open(self, folder: Path, run: TrackedRun) -> None:
+        tags = {key: value for key, value in run.tags.items() if key != END_TAG}
+        again = replace(run, status=None, end_ms=None, complete=False, tags=tags)
+        self._file = TrackingFile(folder, again, self._store.shown)
+        self._projection = Projection(self._store, self._file)
+        self._thread = StoreThread(self._projection.update, self._store.shown, "the training continues")
 
     @override
     def log_machine(self, use: Mapping[str, float], step: int) -> None:
@@ -69,20 +58,12 @@ class MLflowTracker(Tracker):
         self._file.add_tag(key, value)
 
     @override
-    def finish(self, status: Status, deadline_s: float = FINISH_S) -> int:
+    def finish(self, status: Status, deadline_s: float = FINISH_S) -> None:
         self._file.change(status=status, end_ms=now_ms())
         complete = self._thread.finish(deadline_s) and self._thread.refusal is None
-        lost = 0
+        self._file.change(complete=complete)
         if not complete:
-            lost, points = self._projection.lost()
             reason = self._thread.refusal or self._thread.outage or f"no answer within {deadline_s:g} s"
-            what = f"{lost:,} of {points:,} metric points were" if lost else "some of this run was"
-            self.failure = f"MLflow ({self._store.shown}): {what} not recorded: {reason}"
+            self.failure = f"MLflow ({self._store.shown}): some of this run was not recorded: {reason}"
             if self._thread.refusal is None:  # which was logged
                 _log.warning("%s; the run folder has everything", self.failure)
-        self._file.change(complete=complete)
-        return lost
-
-    def _begin(self, file: TrackingFile) -> None:
-        self._file, self._projection = file, Projection(self._store, file)
-        self._thread = StoreThread(self._projection.update, self._store.shown, "the training continues")

@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import LINKS, restore_links
 from deepracer_exp.runs.files import (
     BEST_LAP,
@@ -95,23 +94,11 @@ class Projection:
             writes["the end"] = partial(run.end, tracked.status, tracked.end_ms or now_ms())
         return refused_of(writes)
 
-    def lost(self) -> tuple[int, int]:
-        """Return the number of points of metrics.jsonl that MLflow is not known to have, and the number of all.
-
-        Both are 0 if the file cannot be read.
-        """
-        try:
-            points = self._points(0)
-        except BadInput:
-            return 0, 0
-        return sum(self._run is None or not self._run.has(point) for point in points), len(points)
-
     def _opened(self) -> "MLflowRun":
         from .mlflow_run import MLflowRun
 
         if self._run is None:
             run = MLflowRun(self._store)
-            run.connect()
             run.open(self._file.run)
             self._file.change(run_id=run.run_id)
             self._run = run

@@ -8,7 +8,6 @@ import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,25 +84,22 @@ class StudyRun:
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
         tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE, **user_tags()}
         self._store = store
-        self._tracked = TrackedRun(None, f"sweep {study}", study, now_ms(), store.shown, params, tags)
+        self._tracked = TrackedRun(f"sweep {study}", study, now_ms(), params, tags)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
         self._run: MLflowRun | None = None
         self._progress: Progress | None = None
         self._written: Progress | None = None
         """Progress that MLflow has."""
-        self._files: list[Path] = []
+        self._report: Path | None = None
         self._status: Status | None = None
         self._is_shown, self._is_ended = False, False
-        self._is_late = False
-        """Whether trials have started without the id of this run."""
         self._settled = threading.Event()
         self._thread = StoreThread(self._update, store.shown, "the sweep continues")
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
         """Return the run's id in MLflow; None if the store refuses or does not answer in time."""
         self._settled.wait(deadline_s)
-        self._is_late |= self.run_id is None
         return self.run_id
 
     @property
@@ -115,9 +111,9 @@ class StudyRun:
         """Record the progress of the study; returns at once."""
         self._progress = progress
 
-    def log_file(self, path: Path) -> None:
-        """Store a file with the run, such as the report; it is read later, and replaces one of the same name."""
-        self._files.append(path)
+    def log_report(self, file: Path) -> None:
+        """Store the study's page with the run at its end."""
+        self._report = file
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
         """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
@@ -134,21 +130,23 @@ class StudyRun:
         except StoreRefusedError as error:
             self._settled.set()
             return {"the study's run": str(error)}
-        return refused_of(
-            {
-                "the study's view": lambda: self._show_trials(run),
-                "the study's progress": lambda: self._write_progress(run),
-                **{f"file {path}": partial(self._write_file, run, path) for path in list(self._files)},
-                "the end": lambda: self._end(run),
-            }
-        )
+        writes: dict[str, Callable[[], object]] = {
+            "the study's view": lambda: self._show_trials(run),
+            "the study's progress": lambda: self._write_progress(run),
+        }
+        if (status := self._status) is not None:
+            # Also trials that began before this run did.
+            writes["the trials"] = lambda: self._adopt(run)
+            if (report := self._report) is not None:
+                writes[f"file {report}"] = lambda: run.log_artifact(report, None)
+            writes["the end"] = lambda: self._end(run, status)
+        return refused_of(writes)
 
     def _opened(self) -> "MLflowRun":
         from .mlflow_run import MLflowRun
 
         if self._run is None:
             run = MLflowRun(self._store)
-            run.connect()
             run.open_only(self._tracked, (STUDY, SEARCH, KIND))
             run.log_params(self._tracked.params)
             self._run = run
@@ -181,22 +179,15 @@ class StudyRun:
         run.set_tags(tags)
         if progress.best_trial is not None:
             run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
-        if self._is_late:
-            self._adopt(run)
         points = points_at(metrics, progress.ended, now_ms())
         # Also when no trial has ended since: in the end another one may be the best.
         if any(run.metrics.get(key) != value for key, value, *_ in points):
             run.log_metrics(points)
         self._written = progress
 
-    def _write_file(self, run: "MLflowRun", path: Path) -> None:
-        run.log_artifact(path, None)
-        self._files.remove(path)
-
-    def _end(self, run: "MLflowRun") -> None:
-        if self._status is not None:
-            _end(run, self._status, _ENDS[self._status])
-            self._is_ended = True
+    def _end(self, run: "MLflowRun", status: Status) -> None:
+        _end(run, status, _ENDS[status])
+        self._is_ended = True
 
     def _note(self, progress: Progress) -> str:
         """Return the description above the run, Markdown."""
@@ -225,7 +216,7 @@ def open_trial_run(
     None if the store refuses or does not answer; the seeds are then nested under the study itself.
     """
     tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE, **user_tags()}
-    tracked = TrackedRun(None, f"trial {trial}", study, now_ms(), store.shown, _params({}, base), tags)
+    tracked = TrackedRun(f"trial {trial}", study, now_ms(), _params({}, base), tags)
 
     def open_run(run: "MLflowRun") -> None:
         run.open_only(tracked, (STUDY, KIND, TRIAL, PARENT))
@@ -240,7 +231,7 @@ def end_trial_run(
     """End the run of a trial with its values by metric; errors are logged."""
 
     def end_run(run: "MLflowRun") -> None:
-        run.open(TrackedRun(run_id, "", study, 0, store.shown))
+        run.open(TrackedRun("", study, 0, run_id=run_id))
         run.log_metrics(run.lacking(points_at(values, 0, now_ms())))
         _end(run, status, reason)
 
@@ -262,7 +253,6 @@ def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLfl
         from .mlflow_run import MLflowRun
 
         run = MLflowRun(store)
-        run.connect()
         call(run)
         return run.run_id
 

@@ -8,9 +8,8 @@ from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.running import MLflowTracking, TensorBoardTracking, TrackingConfig, TrackingOff
 from deepracer_exp.errors import BadInput
 
-from .metadata import Scalar
 from .store import resolve_store
-from .tracking_file import Status
+from .tracking_file import Status, TrackedRun
 
 FINISH_S = 30.0
 """How long the end of a run waits for its store."""
@@ -20,49 +19,27 @@ class Tracker:
     """Records one run. This base class of all trackers, yours included, records nothing (`tracking=off`).
 
     No method waits for a store, except `finish`. Each metric is recorded once per step, even if processes are killed
-    and resumed: points wait until a checkpoint covers them (`safe_until`), so that no resumed run contradicts them,
-    and a resumed run (`reopen`) logs all rows of its metrics.jsonl again, of which only the missing ones are written.
+    and resumed: a tracker that cannot change what it has recorded holds points back until a checkpoint covers them
+    (`safe_until`), and a resumed run logs all rows of its metrics.jsonl again.
     """
 
     failure: str | None = None
     """After `finish`: what was not recorded, and why, in one sentence; None: everything was."""
 
     @property
-    def run_id(self) -> str | None:
-        """Id of the run in MLflow, once it exists."""
-        return None
-
-    @property
     def outage(self) -> str | None:
         """Why the store does not answer at the moment, for which `finish` waits; None: it does."""
         return None
 
-    def start(
-        self,
-        run_name: str,
-        experiment: str,
-        params: Mapping[str, Scalar],
-        tags: Mapping[str, str],
-        identity: Path,
-    ) -> None:
-        """Start a new run; either this or `reopen` is called first, once.
+    def open(self, folder: Path, run: TrackedRun) -> None:
+        """Begin to record a new or resumed run; this is called first, once.
 
         Args:
-            run_name: shown for the run.
-            experiment: that the run belongs to.
-            params: by which runs are compared.
-            tags: of the run.
-            identity: its `tracking.json`, which is written.
+            folder: that of the run.
+            run: its name, experiment, parameters and tags.
 
         Raises:
             BadInput: the run cannot be recorded.
-        """
-
-    def reopen(self, identity: Path) -> None:
-        """Continue the run of `identity`, its `tracking.json`.
-
-        Raises:
-            BadInput: the file is missing or invalid, or the run cannot be recorded.
         """
 
     def log(self, metrics: Mapping[str, float | None], step: int) -> None:
@@ -83,12 +60,11 @@ class Tracker:
     def set_tag(self, key: str, value: str) -> None:
         """Set a tag of the run."""
 
-    def finish(self, status: Status, deadline_s: float = FINISH_S) -> int:
-        """Write what is left for at most `deadline_s`, end the run and return the number of lost points.
+    def finish(self, status: Status, deadline_s: float = FINISH_S) -> None:
+        """Write what is left for at most `deadline_s`, and end the run.
 
         A failed or killed run may be resumed from its last checkpoint: later points are not written.
         """
-        return 0
 
 
 def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:

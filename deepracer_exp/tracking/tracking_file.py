@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_json_as
+from deepracer_exp.runs.files import TRACKING
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
@@ -21,16 +22,16 @@ _log = logging.getLogger(__name__)
 class TrackedRun:
     """Identity, parameters, tags and end of a run, whether or not MLflow has them yet."""
 
-    run_id: str | None
-    """In MLflow; None until the run is created there."""
     run_name: str
     experiment: str
     start_ms: int
     """Since 1970. With name and experiment it identifies a run whose id was never received."""
-    store: str
-    """Where the run is recorded, without password."""
     params: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
+    store: str = ""
+    """Address of the MLflow that records the run, without password."""
+    run_id: str | None = None
+    """Its id there; None until it is created."""
     status: Status | None = None
     """Of the ended run; None while it is running, or if it was killed."""
     end_ms: int | None = None
@@ -41,38 +42,25 @@ class TrackedRun:
 class TrackingFile:
     """`tracking.json` of a run folder, written atomically by the threads of the training and the tracker."""
 
-    def __init__(self, path: Path, run: TrackedRun) -> None:
-        """Write the file."""
-        self._path = path
-        self._lock = threading.RLock()
-        self.run = run
-        self.change()
-
-    @classmethod
-    def read(cls, path: Path, store: str) -> "TrackingFile":
-        """Read an earlier run's file, to continue recording in `store` (without password).
+    def __init__(self, folder: Path, run: TrackedRun, store: str) -> None:
+        """Write the file of a run, to record it in `store` (without password).
 
         For another store the id is dropped, because the run may have another one there, or none yet.
         """
-        run = read_tracked_run(path)
-        return cls(
-            path, run if run.store == store else replace(run, run_id=None, store=store, complete=False)
-        )
-
-    @property
-    def folder(self) -> Path:
-        """The run folder."""
-        return self._path.parent
+        self.folder = folder
+        self._lock = threading.RLock()
+        self.run = run if run.store == store else replace(run, run_id=None, store=store, complete=False)
+        self.change()
 
     def change(self, **changes: Any) -> None:
         """Set fields of the run."""
         with self._lock:
             self.run = replace(self.run, **changes)
             try:
-                atomic_write(self._path, json.dumps(asdict(self.run), indent=1) + "\n")
+                atomic_write(self.folder / TRACKING, json.dumps(asdict(self.run), indent=1) + "\n")
             except OSError as error:
                 # Only needed after a kill; a full disk ends the training elsewhere.
-                _log.warning("%s: cannot be written: %s", self._path, error.strerror)
+                _log.warning("%s: cannot be written: %s", self.folder / TRACKING, error.strerror)
 
     def add_tag(self, key: str, value: str) -> None:
         """Add a tag."""

@@ -49,9 +49,10 @@ from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.result import FINISHED, INTERRUPTED
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.stopping.rules import UNDECIDED
-from deepracer_exp.tracking import tracking_file
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
-from deepracer_exp.tracking.tracker import Tracker, open_tracker
+from deepracer_exp.tracking.metrics import now_ms
+from deepracer_exp.tracking.tracker import open_tracker
+from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
 from .budget import refuse_ended, refuse_spent
 from .callbacks import standard_callbacks
@@ -157,7 +158,7 @@ def copy_run(run_dir: Path, attempt: int) -> Path:
     aside = target.with_name(f".{target.name}.{os.getpid()}")
     shutil.copytree(run_dir, aside, symlinks=True, ignore=left_out)
     if (aside / TRACKING).exists():
-        tracking_file.begin_again(aside / TRACKING, target)
+        begin_again(aside / TRACKING, target)
     aside.replace(target)
     return target
 
@@ -266,20 +267,19 @@ def _begin(
         logger.info(note)
     if teacher is not None:
         logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
-    _track(tracker, trainer, composition, names, commit, run_name, tags)
+    tracker.open(folder.path, _described(trainer, composition, names, commit, run_name, tags))
     return trainer
 
 
-def _track(
-    tracker: Tracker,
+def _described(
     trainer: Trainer,
     composition: Composition,
     names: Mapping[str, str],
     commit: str | None,
     run_name: str | None,
     tags: Mapping[str, str],
-) -> None:
-    """Start to record a run that the tracker does not know."""
+) -> TrackedRun:
+    """Return the name, parameters and tags that a run is recorded with."""
     folder, experiment = trainer.folder, trainer.experiment
     lineage = read_lineage(folder.path)
     own = run_tags(names, commit, trainer.setup.reward.sha256, folder.path.resolve())
@@ -287,12 +287,12 @@ def _track(
         own |= lineage_tags(lineage)
     # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
     what = names["reward"] if lineage is None else f"clone {lineage.generation}"
-    tracker.start(
-        run_name or f"{what} s{experiment.seed} {time.strftime('%H:%M:%S')}",
-        experiment.name,
-        run_params(composition.choices, names, composition.mapping, composition.overrides),
-        {**own, **tags},
-        identity=folder.path / TRACKING,
+    return TrackedRun(
+        run_name=run_name or f"{what} s{experiment.seed} {time.strftime('%H:%M:%S')}",
+        experiment=experiment.name,
+        start_ms=now_ms(),
+        params=run_params(composition.choices, names, composition.mapping, composition.overrides),
+        tags={**own, **tags},
     )
 
 
@@ -336,9 +336,11 @@ def _reopen(
             )
         trainer.load(checkpoint, state)
         if (folder.path / TRACKING).exists():
-            tracker.reopen(folder.path / TRACKING)
+            recorded = read_tracked_run(folder.path / TRACKING)
         else:  # killed before it was recorded, or trained with tracking=off
-            _track(tracker, trainer, composition, names, provenance.get("git_commit"), run_name, tags)
+            commit = provenance.get("git_commit")
+            recorded = _described(trainer, composition, names, commit, run_name, tags)
+        tracker.open(folder.path, recorded)
     except BadInput:
         folder.release()
         raise

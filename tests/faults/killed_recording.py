@@ -16,9 +16,11 @@ from pathlib import Path
 
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.tracking import store_thread
+from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracking_file import TrackedRun, read_tracked_run
 
 ITERATIONS = 160
 CHECKPOINT_EVERY = 12
@@ -48,10 +50,11 @@ def record(run_dir: Path, uri: str) -> None:
     kept = int((checkpoints / "last").resolve().name) if (checkpoints / "last").exists() else 0
     rows = read_metrics(metrics)[:kept] if metrics.exists() else []
     if identity.exists():
-        tracker.reopen(identity)
+        tracker.open(run_dir, read_tracked_run(identity))
     else:
         (run_dir / "config.yaml").write_text("checkpoints: {every: 1}\n")
-        tracker.start("killed", "race", {"seed": 1}, {"run_dir": str(run_dir)}, identity)
+        described = {"params": {"seed": "1"}, "tags": {"run_dir": str(run_dir)}}
+        tracker.open(run_dir, TrackedRun("killed", "race", now_ms(), **described))
     atomic_write(metrics, "".join(json.dumps(row) + "\n" for row in rows))
     for iteration in range(kept + 1, ITERATIONS + 1):
         row = {"iteration": iteration, "env_steps": 100 * iteration, "wall_clock_s": time.monotonic()}
@@ -65,7 +68,8 @@ def record(run_dir: Path, uri: str) -> None:
             while tracker._projection.written < (2 + len(KEYS)) * (iteration - kept):
                 time.sleep(0.001)
         time.sleep(0.01)
-    assert tracker.finish("FINISHED", 200) == 0
+    tracker.finish("FINISHED", 200)
+    assert tracker.failure is None
 
 
 def fork(do: Callable[[], None]) -> int:
@@ -86,7 +90,7 @@ def lines(path: Path) -> int:
 
 def main(run_dir: Path, uri: str, kills: int) -> None:
     metrics = run_dir / "metrics.jsonl"
-    os.waitpid(fork(lambda: MLflowRun(resolve_store(uri, run_dir)).connect()), 0)  # makes the tables
+    os.waitpid(fork(lambda: MLflowRun(resolve_store(uri, run_dir))), 0)  # makes the tables
     for number in range(kills + 1):
         before = lines(metrics)
         child = fork(lambda: record(run_dir, uri))

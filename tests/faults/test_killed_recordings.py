@@ -38,7 +38,7 @@ from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import resolve_store
 
 print("begins", flush=True)
-MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1]))).connect()
+MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1])))
 """
 
 

@@ -14,11 +14,13 @@ from mlflow import MlflowClient
 
 from deepracer_exp.runs.checkpoint_files import write_hashes
 from deepracer_exp.tracking import store_thread
-from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.tracking.metrics import metric_name, now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store
+from deepracer_exp.tracking.tracker import Tracker
+from deepracer_exp.tracking.tracking_file import TrackedRun
 from tests import waiting
 from tests.ports import find_port
 
@@ -27,7 +29,7 @@ from tests.ports import find_port
 def empty_database(tmp_path_factory) -> Path:
     """A database with tables and no runs; creating the tables takes a second or two each time."""
     runs = tmp_path_factory.mktemp("template")
-    MLflowRun(resolve_store(None, runs)).connect()
+    MLflowRun(resolve_store(None, runs))
     return runs / "mlflow.db"
 
 
@@ -50,11 +52,16 @@ def identity(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def tracker(store: Store, identity: Path) -> MLflowTracker:
+def tracker(store: Store, tmp_path: Path) -> MLflowTracker:
     """The tracker of a run that has just begun."""
     tracker = MLflowTracker(store)
-    tracker.start("run", "race", {}, {}, identity)
+    begin(tracker, tmp_path)
     return tracker
+
+
+def begin(tracker: Tracker, folder: Path, name: str = "run", **described: dict[str, str]) -> None:
+    """Let a tracker record a new run of a folder, with `params` and `tags`."""
+    tracker.open(folder, TrackedRun(name, "race", now_ms(), **described))
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import resolve_store
 from tests.conftest import refused
 
-from .conftest import write_rows
+from .conftest import begin, write_rows
 from .odd_servers import odd_server
 
 ODD = {
@@ -53,13 +53,13 @@ def test_looking_up_an_alias_ends_in_one_sentence(odd, tmp_path):
 def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path):
     uri, words = odd
     tracker = MLflowTracker(resolve_store(uri, tmp_path))
-    tracker.start("run", "race", {"seed": 1}, {}, tmp_path / "tracking.json")
+    begin(tracker, tmp_path, params={"seed": "1"})
     write_rows(tmp_path, [{"completion": 5.0}])
     began = time.monotonic()
-    assert tracker.finish("FINISHED", deadline_s=8.0) == 3
+    tracker.finish("FINISHED", deadline_s=8.0)
     assert time.monotonic() - began < 30
     assert tracker.failure is not None
-    assert tracker.failure.startswith(f"MLflow ({uri}): 3 of 3 metric points were not recorded: ")
+    assert tracker.failure.startswith(f"MLflow ({uri}): some of this run was not recorded: ")
     assert words in tracker.failure
 
 

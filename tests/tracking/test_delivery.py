@@ -12,7 +12,7 @@ from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracking_file import TrackedRun, read_tracked_run
 
-from .conftest import points, runs_of, write_rows
+from .conftest import begin, points, runs_of, write_rows
 
 
 @pytest.fixture
@@ -28,12 +28,13 @@ def run_dir(tmp_path, away):
     (folder / "checkpoints" / "000003" / "manifest.json").write_text("{}")
     (folder / "checkpoints" / "best").symlink_to("000003")
     tracker = MLflowTracker(Store(away, None))
-    tracker.start("run", "race", {"seed": 1}, {"track": "oval"}, folder / "tracking.json")
+    begin(tracker, folder, params={"seed": "1"}, tags={"track": "oval"})
     write_rows(folder, [{"wall_clock_s": n / 2, "completion": n / 3, "kl": None} for n in range(1, 4)])
     (folder / "summary.json").write_text(json.dumps({"status": "stopped early", "reason": "collapsed"}))
     tracker.set_tag("stopping.rule", "collapsed")
     tracker.set_tag("end", "stopped early: collapsed")
-    assert tracker.finish("FINISHED", deadline_s=0) == 9
+    tracker.finish("FINISHED", deadline_s=0)
+    assert tracker.failure is not None
     return folder
 
 
@@ -109,8 +110,7 @@ def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, mlfl
 def test_no_file_goes_to_a_machine_that_only_a_database_file_names(store, mlflow, tmp_path, place):
     mlflow.create_experiment("race", place)
     run = MLflowRun(store)
-    run.connect()
-    run.open(TrackedRun(None, "run", "race", 1, store.shown))
+    run.open(TrackedRun("run", "race", 1))
     file = tmp_path / "summary.json"
     file.write_text("{}")
     with pytest.raises(StoreRefusedError, match="another machine"):

@@ -9,6 +9,7 @@ from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 from deepracer_exp.tracking.metrics import METRICS, metric_name
 from deepracer_exp.tracking.tracker import Tracker, open_tracker
+from deepracer_exp.tracking.tracking_file import TrackedRun
 from tests.conftest import IN_PROCESS
 
 ROWS = [
@@ -18,7 +19,8 @@ ROWS = [
 
 
 def record(tracker: Tracker, identity, rows, safe: int, status="FINISHED") -> None:
-    tracker.start("progress_delta s1", "tiny", {"seed": 1}, {"reward": "progress_delta"}, identity)
+    described = {"params": {"seed": "1"}, "tags": {"reward": "progress_delta"}}
+    tracker.open(identity.parent, TrackedRun("progress_delta s1", "tiny", 1, **described))
     for row in rows:
         tracker.log(row, step=row["env_steps"])
     tracker.safe_until(safe)

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
+from deepracer_exp.tracking.metadata import param_text
 from deepracer_exp.tracking.metrics import metric_name
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracking_file import TrackedRun
 
-from .conftest import points, write_rows
+from .conftest import begin, points, write_rows
 
 
 def test_every_point_is_recorded_once_and_at_its_env_step(tracker, mlflow, tmp_path):
@@ -23,23 +24,26 @@ def test_every_point_is_recorded_once_and_at_its_env_step(tracker, mlflow, tmp_p
     write_rows(tmp_path, [{"env_steps": step, "completion": step / 100, "lr": 1 / step} for step in steps])
     more = [None, math.nan, 9.5, math.inf]  # what is no number leaves a gap
     write_rows(tmp_path, [{"env_steps": 10**7 + n, "best_lap_time_s": lap_s} for n, lap_s in enumerate(more)])
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     assert points(mlflow, tracker.run_id, "best_lap_time_s") == [(10**7 + 2, 9.5)]
     assert points(mlflow, tracker.run_id) == [(step, step / 100) for step in steps]
     assert points(mlflow, tracker.run_id, "lr") == [(step, 1 / step) for step in steps]
 
 
-def test_params_tags_and_files_are_found_by_name(store, mlflow, tmp_path, identity):
+def test_params_tags_and_files_are_found_by_name(store, mlflow, tmp_path):
     (tmp_path / "config.yaml").write_text("seed: 1")
     (tmp_path / "checkpoints" / "000007").mkdir(parents=True)
     (tmp_path / "checkpoints" / "000007" / "manifest.json").write_text("{}")
     (tmp_path / "checkpoints" / "best").symlink_to("000007")
     many = {f"group.key_{number}": number for number in range(250)}  # more than one call takes
-    params = {"reward.file": None, "knots": "7" * 9000, **many}
+    values = {"reward.file": None, "knots": "7" * 9000, **many}
+    params = {key: param_text(value) for key, value in values.items()}
     tracker = MLflowTracker(store)
-    tracker.start("a run", "race", params, {"track": "oval"}, identity)
+    begin(tracker, tmp_path, "a run", params=params, tags={"track": "oval"})
     tracker.set_tag("stopped_by", "reliable")
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     run = mlflow.get_run(tracker.run_id)
     assert run.info.run_name == "a run"
     assert mlflow.get_experiment(run.info.experiment_id).name == "race"
@@ -60,16 +64,16 @@ def test_a_busy_store_blocks_nothing_and_gets_every_point_later(store, tracker, 
     tracker.set_tag("half", "done")  # returns at once
     busy.execute("ROLLBACK")
     busy.close()
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     assert points(mlflow, tracker.run_id) == [(100 * number + 100, float(number)) for number in range(101)]
     assert mlflow.get_run(tracker.run_id).data.tags["half"] == "done"
 
 
 def test_repeating_a_call_changes_nothing(store, mlflow):
-    tracked = TrackedRun(None, "run", "race", 1234, store.shown)
+    tracked = TrackedRun("run", "race", 1234)
     run, repeated = MLflowRun(store), MLflowRun(store)
     for one in (run, repeated):
-        one.connect()
         one.open(tracked)
     assert repeated.run_id == run.run_id
     for _ in range(2):
@@ -88,30 +92,31 @@ def test_a_run_deleted_in_the_ui_costs_one_line_and_nothing_else(
     write_rows(tmp_path, [{"kl": 1.0}] * 3)
     wait_until(lambda: "refused metrics" in caplog.text)
     tracker.set_tag("last", "1")
-    # Of each row its number, its clock and `kl`.
-    assert tracker.finish("FINISHED") == 9
+    tracker.finish("FINISHED")
+    assert tracker.failure is not None
     assert len(caplog.records) == 1
 
 
-def test_a_deleted_experiment_is_named_and_the_training_continues(store, mlflow, caplog, identity):
+def test_a_deleted_experiment_is_named_and_the_training_continues(store, mlflow, caplog, tmp_path):
     mlflow.delete_experiment(mlflow.create_experiment("race"))
     tracker = MLflowTracker(store)
-    tracker.start("run", "race", {}, {}, identity)
-    write_rows(identity.parent, [{"kl": 1.0, "lr": 2.0}])
-    assert tracker.finish("FINISHED") == 4
+    begin(tracker, tmp_path)
+    write_rows(tmp_path, [{"kl": 1.0, "lr": 2.0}])
+    tracker.finish("FINISHED")
+    assert tracker.failure is not None
     assert "experiment 'race' was deleted in MLflow" in caplog.text
     assert len(caplog.records) == 1
 
 
 def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
-    tmp_path, free_port, caplog, wait_until, identity
+    tmp_path, free_port, caplog, wait_until
 ):
     tracker = MLflowTracker(resolve_store(f"http://me:s3cr3t@127.0.0.1:{free_port}", tmp_path))
-    tracker.start("run", "race", {}, {}, identity)
+    begin(tracker, tmp_path)
     write_rows(tmp_path, [{"kl": 1.0}] * 6, covered=5)
     wait_until(lambda: "does not answer" in caplog.text)
-    assert tracker.finish("FAILED", deadline_s=1) == 15
-    for words in ("15 of 15 metric points were not recorded", f"http://127.0.0.1:{free_port}"):
+    tracker.finish("FAILED", deadline_s=1)
+    for words in ("some of this run was not recorded", f"http://127.0.0.1:{free_port}"):
         assert words in caplog.text
     assert tracker.failure is not None
     assert tracker.failure in caplog.text
@@ -126,12 +131,14 @@ def test_two_processes_that_begin_at_once_in_a_new_folder_lose_nothing(tmp_path)
         "from deepracer_exp.tracking.mlflow_tracker import MLflowTracker\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
         f"tracker = MLflowTracker(resolve_store(None, Path({str(runs)!r})))\n"
-        f"identity = Path({str(tmp_path)!r}) / sys.argv[1] / 'tracking.json'\n"
-        "identity.parent.mkdir()\n"
-        "tracker.start('run ' + sys.argv[1], 'race', {'seed': int(sys.argv[1])}, {}, identity)\n"
+        "from deepracer_exp.tracking.tracking_file import TrackedRun\n"
+        f"folder = Path({str(tmp_path)!r}) / sys.argv[1]\n"
+        "folder.mkdir()\n"
+        "tracker.open(folder, TrackedRun('run ' + sys.argv[1], 'race', 1))\n"
         "rows = [{'env_steps': step, 'kl': step + int(sys.argv[1]) / 8} for step in range(50)]\n"
-        "(identity.parent / 'metrics.jsonl').write_text(''.join(json.dumps(row) + '\\n' for row in rows))\n"
-        "assert tracker.finish('FINISHED', 120) == 0\n"
+        "(folder / 'metrics.jsonl').write_text(''.join(json.dumps(row) + '\\n' for row in rows))\n"
+        "tracker.finish('FINISHED', 120)\n"
+        "assert tracker.failure is None\n"
         "print(tracker.run_id)"
     )
     both = [

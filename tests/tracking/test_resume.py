@@ -11,7 +11,7 @@ from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracking_file import read_tracked_run
 
-from .conftest import cover, points, runs_of, write_rows
+from .conftest import begin, cover, points, runs_of, write_rows
 
 
 def rows_until(iteration: int) -> list[dict[str, float]]:
@@ -28,7 +28,7 @@ def logged_until(iteration: int) -> list[tuple[int, float]]:
 def reopened(store, identity) -> MLflowTracker:
     """Return a tracker that continues a run."""
     tracker = MLflowTracker(store)
-    tracker.reopen(identity)
+    tracker.open(identity.parent, read_tracked_run(identity))
     return tracker
 
 
@@ -36,8 +36,8 @@ def reopened(store, identity) -> MLflowTracker:
 def killed(store, mlflow, identity, wait_until):
     """Return the tracker of a run of ten iterations that was never finished."""
     tracker = MLflowTracker(store)
-    params, tags = {"seed": 1}, {"track": "oval", "mlflow.note.content": "as it began"}
-    tracker.start("run", "race", params, tags, identity)
+    params, tags = {"seed": "1"}, {"track": "oval", "mlflow.note.content": "as it began"}
+    begin(tracker, identity.parent, params=params, tags=tags)
     write_rows(identity.parent, rows_until(10))
     wait_until(lambda: tracker.run_id and len(points(mlflow, tracker.run_id)) == 10)
     tracker._thread.finish(0)
@@ -54,7 +54,8 @@ def resumed(store, identity, killed):
 def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, resumed):
     rows = rows_until(20)
     write_rows(identity.parent, rows[10:])
-    assert resumed.finish("FINISHED") == 0
+    resumed.finish("FINISHED")
+    assert resumed.failure is None
     (run,) = runs_of(mlflow)
     assert run.info.run_id == resumed.run_id == killed.run_id
     assert run.info.status == "FINISHED"
@@ -74,7 +75,8 @@ def test_points_wait_for_a_checkpoint_and_block_nothing_else(tracker, mlflow, wa
     cover(tmp_path, 4)
     wait_until(lambda: len(points(mlflow, tracker.run_id)) == 4)
     tracker.set_tag("budget", "80%")
-    assert tracker.finish("KILLED") == 0
+    tracker.finish("KILLED")
+    assert tracker.failure is None
     assert points(mlflow, tracker.run_id) == logged_until(4)
     assert mlflow.get_run(tracker.run_id).data.tags["budget"] == "80%"
     assert not caplog.records
@@ -85,7 +87,8 @@ def test_an_evaluation_out_of_turn_counts_only_when_the_run_is_over(tracker, mlf
     # Every fifth policy is evaluated, and the last when the run ends, which rewrites the last row.
     laps = {5: 9.5, 7: 9.25}
     write_rows(tmp_path, [{"eval_lap_time_s": laps.get(number), "kl": 1.0} for number in range(1, 8)])
-    assert tracker.finish(status) == 0
+    tracker.finish(status)
+    assert tracker.failure is None
     assert [step for step, _ in points(mlflow, tracker.run_id, "eval_lap_time_s")] == steps
     assert len(points(mlflow, tracker.run_id, "kl")) == 7
 
@@ -96,7 +99,8 @@ def test_the_last_row_is_completed_when_the_run_is_over(tracker, mlflow, tmp_pat
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     lines[-1] = json.dumps(json.loads(lines[-1]) | {"eval_lap_time_s": 9.5})
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + "\n")
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     assert points(mlflow, tracker.run_id, "eval_lap_time_s") == [(300, 9.5)]
     assert len(points(mlflow, tracker.run_id, "kl")) == 3
 
@@ -104,20 +108,22 @@ def test_the_last_row_is_completed_when_the_run_is_over(tracker, mlflow, tmp_pat
 def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, identity, killed):
     identity.write_text(json.dumps({**json.loads(identity.read_text()), "run_id": None}))
     tracker = reopened(store, identity)
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
     assert read_tracked_run(identity).run_id == killed.run_id
 
 
 def test_a_run_that_was_never_created_begins_when_it_began(store, mlflow, identity, free_port):
     away = MLflowTracker(type(store)(f"http://127.0.0.1:{free_port}", None))
-    away.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
+    begin(away, identity.parent, params={"seed": "1"}, tags={"track": "oval"})
     write_rows(identity.parent, rows_until(1))
     away.finish("KILLED", deadline_s=0)
     tracked = read_tracked_run(identity)
     tracker = reopened(store, identity)
     write_rows(identity.parent, rows_until(2)[1:])
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     (run,) = runs_of(mlflow)
     assert (tracked.run_id, run.info.start_time, run.info.run_name) == (None, tracked.start_ms, "run")
     assert (run.data.params, run.data.tags["track"]) == ({"seed": "1"}, "oval")
@@ -132,12 +138,14 @@ def test_a_run_resumed_with_another_store_is_complete_there(
     other = resolve_store(None, tmp_path / "other")
     tracker = reopened(other, identity)
     write_rows(identity.parent, rows_until(12)[10:])
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     there = MlflowClient(tracking_uri=other.uri)
     assert [run.info.run_id for run in runs_of(there)] == [tracker.run_id]
     assert points(there, tracker.run_id) == logged_until(12)
     tracker = reopened(store, identity)
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
 
 
@@ -154,7 +162,8 @@ def test_a_resumed_run_is_shown_as_running(store, mlflow, identity, killed, wait
     assert "end" not in data.tags
     assert data.tags["mlflow.note.content"] == "edited in the UI"
     assert (data.params, data.tags["track"]) == ({"seed": "1"}, "oval")
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
 
 
 def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
@@ -163,7 +172,8 @@ def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
     mlflow.delete_run(killed.run_id)
     tracker = reopened(store, identity)
     write_rows(identity.parent, rows_until(20)[10:])
-    assert tracker.finish("FINISHED") > 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is not None
     (record,) = caplog.records
     assert f"run {killed.run_id} was deleted in MLflow; restore it there" in record.message
     assert points(mlflow, killed.run_id) == logged_until(10)
@@ -173,7 +183,8 @@ def test_a_repeated_iteration_that_differs_is_not_doubled(mlflow, killed, identi
     *same, last = rows_until(10)
     (identity.parent / "metrics.jsonl").unlink()
     write_rows(identity.parent, [*same, last | {"completion": 99.0}])
-    assert resumed.finish("FINISHED") == 0
+    resumed.finish("FINISHED")
+    assert resumed.failure is None
     assert points(mlflow, killed.run_id) == logged_until(10)
 
 
@@ -186,7 +197,7 @@ TRACKED = {"run_id": None, "run_name": "a", "experiment": "b", "start_ms": 2, "s
         (None, "is missing"),
         ("{", "Invalid JSON"),
         ("[]", "accepted: what a tracker writes there"),
-        ("{}", "run_id: Field required"),
+        ("{}", "run_name: Field required"),
         (json.dumps(TRACKED | {"run_id": 1}), "run_id: Input should be"),
         (json.dumps(TRACKED | {"start_ms": "x"}), "start_ms: Input should be"),
     ],
@@ -205,13 +216,14 @@ def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(st
         folder.mkdir()
         tracker = MLflowTracker(store)
         tags = {"mlflow.note.content": "as it began"}
-        tracker.start(name, "race", {}, tags, folder / "tracking.json")
+        begin(tracker, folder, name, tags=tags)
         (folder / "best_lap.png").write_bytes(b"picture")
         best = {"iteration": 4, "env_steps": 400, "metric": "race_score", "rank": [1.0, -lap_s]}
         best |= {"eval_lap_time_s": lap_s, "eval_race_score_s": lap_s, "eval_completion": 100.0}
         summary = {"status": "finished", "reason": "converged: all", "best": best}
         (folder / "summary.json").write_text(json.dumps(summary))
-        assert tracker.finish("FINISHED", 60) == 0
+        tracker.finish("FINISHED", 60)
+        assert tracker.failure is None
         return str(tracker.run_id)
 
     def note_of_experiment() -> str:

@@ -15,17 +15,15 @@ from mlflow import MlflowClient
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 
-from .conftest import points, runs_of, write_rows
+from .conftest import begin, points, runs_of, write_rows
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("away", ["killed", "hanging"])
-def test_a_server_that_is_away_blocks_nothing_and_gets_everything_once(
-    server, tmp_path, wait_until, identity, away
-):
+def test_a_server_that_is_away_blocks_nothing_and_gets_everything_once(server, tmp_path, wait_until, away):
     tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
-    tracker.start("run", "race", {"seed": 1}, {"track": "oval"}, identity)
+    begin(tracker, tmp_path, params={"seed": "1"}, tags={"track": "oval"})
     write_rows(tmp_path, [{"completion": float(number)} for number in range(20)])
     client = MlflowClient(tracking_uri=server.uri)
     wait_until(lambda: tracker.run_id and len(points(client, tracker.run_id)) == 20)
@@ -36,7 +34,8 @@ def test_a_server_that_is_away_blocks_nothing_and_gets_everything_once(
         wait_until(lambda: tracker.outage is not None)
     finally:
         server.start() if away == "killed" else server.signal(signal.SIGCONT)
-    assert tracker.finish("KILLED", deadline_s=60) == 0
+    tracker.finish("KILLED", deadline_s=60)
+    assert tracker.failure is None
     assert points(client, tracker.run_id) == [(100 * number + 100, float(number)) for number in range(220)]
     assert client.get_run(tracker.run_id).info.status == "KILLED"
     assert "summary.json" in [file.path for file in client.list_artifacts(tracker.run_id)]

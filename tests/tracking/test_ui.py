@@ -19,6 +19,8 @@ from deepracer_exp.tracking.store import existing_store
 from deepracer_exp.tracking.ui import running_ui, runs_page, serve_ui
 from tests.waiting import PATIENCE_S
 
+from .conftest import begin
+
 NAMES = {"track": "reinvent_base", "reward": "progress_per_step", "network": "mlp_small"}
 
 
@@ -27,11 +29,12 @@ def record(store, runs_dir: Path, seed: int) -> str:
     folder.mkdir()
     params = run_params({}, NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}, [])
     tags = run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed))
-    tracker.start(f"progress_per_step s{seed}", "race", params, tags, folder / "tracking.json")
+    begin(tracker, folder, f"progress_per_step s{seed}", params=params, tags=tags)
     row = {**{key: float(seed) for key in reversed(METRICS)}, "env_steps": 8192}
     (folder / "metrics.jsonl").write_text(json.dumps(row) + "\n")
     (folder / "provenance.json").write_text('{"seed": 1}')
-    assert tracker.finish("FINISHED") == 0
+    tracker.finish("FINISHED")
+    assert tracker.failure is None
     assert tracker.run_id is not None
     return tracker.run_id
 
