@@ -121,9 +121,9 @@ class Projection:
         rows = read_metrics(file) if file.exists() else []
         if not self._is_over:
             # The last policy of an interrupted run is evaluated out of turn, and a resumed run removes that again.
-            every = read_config(self._folder)["checkpoints"]["every"]
+            every = (read_config(self._folder).get("checkpoints") or {}).get("every")
             rows = [
-                row if every is not None and row["iteration"] % every == 0 else without_evaluation(row)
+                row if every and row["iteration"] % every == 0 else without_evaluation(row)
                 for row in rows[: self._covered()]
             ]
         return [point for row in rows[first:] for point in points_of(row, row["env_steps"], start_ms)]

@@ -41,17 +41,17 @@ class Progress:
     env_steps: int
     """Control steps of all trials together."""
     best_trial: int | None = None
-    """Its number; None until a trial is complete, like the fields below."""
+    """Number of the best trial; None until a trial is complete, like the fields below."""
     best_values: Mapping[str, float] = field(default_factory=dict)
-    """By objective."""
+    """Values of the best trial by objective."""
     best_shown: str | None = None
-    """The same in words: ``race score 9.84 s``."""
+    """These values in words: ``race score 9.84 s``."""
     best_line: str | None = None
-    """The command that trains it."""
+    """The command that trains the best trial."""
     lap_time_s: float | None = None
-    """Of the best trial."""
+    """Lap time of the best trial."""
     completion: float | None = None
-    """Of the best trial, per cent."""
+    """Progress of the best trial in per cent of the lap."""
 
     @property
     def ended(self) -> int:

@@ -25,7 +25,7 @@ class TrackedRun:
     run_name: str
     experiment: str
     start_ms: int
-    """Since 1970. With name and experiment it identifies a run whose id was never received."""
+    """Milliseconds since 1970. With name and experiment they identify a run whose id was never received."""
     params: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
     store: str = ""
@@ -33,7 +33,7 @@ class TrackedRun:
     run_id: str | None = None
     """Its id there; None until it is created."""
     status: Status | None = None
-    """Of the ended run; None while it is running, or if it was killed."""
+    """How the run ended; None while it is running, or if it was killed."""
     end_ms: int | None = None
     complete: bool = False
     """Whether the run has ended and the store has been given all of it."""
