@@ -78,8 +78,8 @@ def test_every_column_has_a_name_of_its_own_in_a_section_and_race_is_the_first()
     ("overrides", "more"),
     [
         ([], {}),
-        (["car.tyre_friction=0.5", "seed=7"], {"car.tyre_friction": 0.5, "seed": 7}),
-        (["network=mlp", "reward.constants.X=2"], {"network": "mlp", "reward.constants.X": 2}),
+        (["car.tyre_friction=0.5", "seed=7"], {"car.tyre_friction": "0.5", "seed": "7"}),
+        (["network=mlp", "reward.constants.X=2"], {"network": "mlp", "reward.constants.X": "2"}),
     ],
 )
 def test_parameters_are_what_was_chosen_and_what_racers_vary(overrides, more):
