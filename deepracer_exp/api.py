@@ -21,7 +21,7 @@ from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
-from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.training.run import resume as resume_run
 from deepracer_exp.training.run import run_training
 from deepracer_exp.training.trainer import Callback, TrainResult
@@ -163,7 +163,7 @@ class RunTables:
     @cached_property
     def steps(self) -> pd.DataFrame:
         """One row per control step of the trace, columns `aws.logs.recording.STEP_COLUMNS`."""
-        return read_own_recording(self.path).steps
+        return read_run_recording(self.path).recording.steps
 
 
 def read_run(run: str | Path, runs_dir: str | Path = "runs") -> RunTables:

@@ -73,11 +73,11 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
 
 
 def _converged(view: LogView, overfits: Finding | None) -> Finding:
-    decision = view.recording.decision
+    decision = view.decision
     if decision is not None:
         return _decided(decision)
-    found = convergence(view.judged, view.action_count, view.recording.stopping)
-    rule = convergence_rule(view.recording.stopping)
+    found = convergence(view.judged, view.action_count, view.stopping)
+    rule = convergence_rule(view.stopping)
     if found is None:
         driven = int((view.judged["episodes"] > 0).sum())
         sentence = (
@@ -154,8 +154,8 @@ def _race_with(best: RunResult) -> Finding:
 
 
 def _submit(view: LogView) -> Finding:
-    if view.recording.best is not None:
-        return _race_with(view.recording.best)
+    if view.run is not None:
+        return _race_with(view.run.best)
     best = view.candidates
     thresholds = {"least_laps": CANDIDATE_LAPS, "dense": DENSE}
     if not len(best):
@@ -397,8 +397,8 @@ def _in(sectors: Sequence[Sector], place: OffTrackPlace) -> str:
 
 
 def _overfits(view: LogView) -> Finding | None:
-    decision = view.recording.decision
-    found = overfitting(view.judged, view.recording.stopping)
+    decision = view.decision
+    found = overfitting(view.judged, view.stopping)
     if found is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
     values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
@@ -419,7 +419,7 @@ def _overfits(view: LogView) -> Finding | None:
 
 
 def _laps_slower(view: LogView) -> Finding | None:
-    decision = view.recording.decision
+    decision = view.decision
     found = slower_laps(view.judged)
     if found is None or (decision is not None and decision["rule"] == "laps_slower"):  # reported already
         return None
@@ -431,8 +431,8 @@ def _laps_slower(view: LogView) -> Finding | None:
 
 def _instead(view: LogView) -> str:
     """Return which checkpoint to take instead of the last: the one that `_submit` names."""
-    best = view.recording.best
-    if best is not None:
+    if view.run is not None:
+        best = view.run.best
         if best.iteration is None:
             return "one of the kept checkpoints"
         return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"

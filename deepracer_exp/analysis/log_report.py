@@ -12,6 +12,7 @@ from deepracer_exp.aws.logs.recording import Recording, readable
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.files import read_head
+from deepracer_exp.runs.recording import RunRecording
 
 from .charts import actions, against_fastest, driving_line, laps, mistakes, rewards, training, zigzag
 from .charts.figure import Chart
@@ -88,14 +89,14 @@ class LogPage:
     """What the best policy sees along a lap."""
 
 
-def write_report(recording: Recording, path: Path) -> Path:
+def write_report(log: Recording | RunRecording, path: Path) -> Path:
     """Write the page of a recording atomically.
 
     Raises:
         BadInput: the recording has no steps.
         OSError: the page cannot be written.
     """
-    view = prepare(recording)
+    view = prepare(log)
     return write_page(path, LogPage(view, findings(view)))
 
 

@@ -139,7 +139,7 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     if recording.metadata is not None:
         actions = recording.metadata.actions
         space = "continuous" if not actions else f"{len(actions)} actions"
-        if recording.best is None:  # a run of ours has default sensors there, whatever its policy sees
+        if view.run is None:  # a run of ours has default sensors there, whatever its policy sees
             space += f"; sensors {', '.join(recording.metadata.sensor) or NONE}"
         found.append(("Action space", space))
     driven = view.evaluation_episodes

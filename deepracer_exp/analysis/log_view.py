@@ -1,8 +1,9 @@
 """A recording on one course, prepared for figures and findings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from deepracer_exp.aws.logs.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.aws.models.hyperparameters import Hyperparameters
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.tracks.track import Track
 
 from .log_course import (
@@ -74,6 +76,18 @@ class LogView:
     """Those of the recording and of its courses."""
     discount: float
     """Factor on the reward of the next step, in `discounted_future_reward`."""
+    run: RunRecording | None = None
+    """What is recorded of a run of ours alone; None: a log of the service."""
+
+    @property
+    def stopping(self) -> Mapping[str, Any] | None:
+        """The group `stopping` of a run of ours."""
+        return None if self.run is None else self.run.stopping
+
+    @property
+    def decision(self) -> Mapping[str, Any] | None:
+        """The decision of the stopping rule that ended a run of ours."""
+        return None if self.run is None else self.run.decision
 
     @property
     def action_count(self) -> int | None:
@@ -111,8 +125,7 @@ class LogView:
         Findings, tables and figures quote this choice. There are none of our own runs, which keep few checkpoints and
         have evaluated them.
         """
-        own = self.recording.best is not None
-        return candidates(self.recording, self.judged).iloc[: 0 if own else None]
+        return candidates(self.recording, self.judged).iloc[: None if self.run is None else 0]
 
     @property
     def waypoint_count(self) -> int:
@@ -183,11 +196,11 @@ def closest_waypoints(steps: pd.DataFrame) -> NDArray[np.intp]:
     return np.maximum(steps["closest_waypoint"].to_numpy(np.intp), -1)
 
 
-def prepare(recording: Recording, track: str | None = None) -> LogView:
+def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
     """Prepare one course of a recording.
 
     Args:
-        recording: of any format.
+        log: the recording, of any format.
         track: a course of its steps; None: the one with the most training steps (of races: with the most steps). If
             the log's own name of the course is unknown, a name of the catalogue or a file (.npy route, .yaml knots)
             replaces it.
@@ -195,6 +208,8 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     Raises:
         BadInput: the recording has no steps on the course.
     """
+    run = log if isinstance(log, RunRecording) else None
+    recording = log.recording if isinstance(log, RunRecording) else log
     steps = recording.steps
     if not len(steps):
         raise BadInput(f"{recording.name}: no control steps; accepted: a training or a race with its trace")
@@ -221,8 +236,11 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
     trained, episodes, timed = _episodes(recording, here & training, course, discount)
     driven, raced, races_timed = _episodes(recording, here & ~training, course, discount)
     raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
-    iterations = iteration_table(recording, trained, episodes)
-    judged = _judged(recording, trained, episodes, iterations)
+    evaluations = None if run is None else run.evaluations
+    iterations = judged = iteration_table(recording, trained, episodes, evaluations=evaluations)
+    usual = iterations["episodes"][iterations["episodes"] > 0].median()
+    if run is None and usual < LEAST_EPISODES:
+        judged = iteration_table(recording, trained, episodes, LEAST_EPISODES)
     if not (here & training).any():
         trained = driven.assign(episode=np.cumsum(first_rows(driven)) - 1)
         episodes = raced.assign(episode=np.arange(len(raced)))
@@ -241,17 +259,8 @@ def prepare(recording: Recording, track: str | None = None) -> LogView:
         laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,
+        run=run,
     )
-
-
-def _judged(
-    recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame, iterations: pd.DataFrame
-) -> pd.DataFrame:
-    """Return the iterations, put together to blocks of `LEAST_EPISODES` where most have fewer."""
-    usual = iterations["episodes"][iterations["episodes"] > 0].median()
-    if recording.best is not None or not usual < LEAST_EPISODES:
-        return iterations
-    return iteration_table(recording, steps, episodes, LEAST_EPISODES)
 
 
 def _episodes(

@@ -353,7 +353,11 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
 
 
 def iteration_table(
-    recording: Recording, steps: pd.DataFrame, episodes: pd.DataFrame, least_episodes: int = 0
+    recording: Recording,
+    steps: pd.DataFrame,
+    episodes: pd.DataFrame,
+    least_episodes: int = 0,
+    evaluations: pd.DataFrame | None = None,
 ) -> pd.DataFrame:
     """Summarise each iteration in one row, `ITERATION_COLUMNS`, also those without an episode.
 
@@ -365,11 +369,12 @@ def iteration_table(
         episodes: theirs.
         least_episodes: consecutive iterations are put together until each row has as many; it has the number of the
             last of them.
+        evaluations: those of a run of ours, `runs.recording.EVALUATION_COLUMNS`.
     """
     ended = pd.concat([episodes[episodes["ended"]], _from_metrics_only(recording, episodes)])
     driven = steps.groupby("iteration").size()
     updates = recording.updates.groupby("iteration")[list(_REPORTED)].mean()
-    evaluated = _evaluated(recording)
+    evaluated = _evaluated(recording, evaluations)
     if least_episodes:
         known = driven.index.union(ended["iteration"].unique()).union(updates.index).union(evaluated.index)
         row_of = _put_together(known, ended["iteration"], least_episodes)
@@ -425,17 +430,17 @@ def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataF
     return rows[columns].astype({"complete": bool})
 
 
-def _evaluated(recording: Recording) -> pd.DataFrame:
+def _evaluated(recording: Recording, evaluations: pd.DataFrame | None) -> pd.DataFrame:
     """Return the means of each iteration's evaluation: of our own runs, or of the service's metrics.
 
     The zig-zag in it is that of our own runs only: in the service's traces evaluations have no iteration.
     """
-    if len(recording.evaluations):
-        own = recording.evaluations.groupby("iteration").last()
+    if evaluations is not None and len(evaluations):
+        means = evaluations.groupby("iteration").last()
         if recording.track is None:  # a mean over whichever tracks have a lap
-            own["lap_time_s"] = np.nan
+            means["lap_time_s"] = np.nan
         names = ("completion", "lap_share", "lap_time_s", "zigzag_per_m")
-        return own.rename(columns={name: f"eval_{name}" for name in names})
+        return means.rename(columns={name: f"eval_{name}" for name in names})
     rows = _evaluation_rows(recording)
     groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
     means = groups["completion"].mean().to_frame("eval_completion")

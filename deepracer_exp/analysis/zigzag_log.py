@@ -27,10 +27,9 @@ def zigzag_now(view: LogView) -> tuple[Figures | None, str]:
     evaluations and races. Where these have no steps it is the training now, in which actions are drawn: the policy that
     races swerves less than that. None without enough straights.
     """
-    tried = view.recording.evaluations.dropna(subset="zigzag_per_m")
-    best = view.recording.best
-    if len(tried):
-        of_best = tried[tried["iteration"] == (None if best is None else best.iteration)]
+    tried = None if view.run is None else view.run.evaluations.dropna(subset="zigzag_per_m")
+    if view.run is not None and tried is not None and len(tried):
+        of_best = tried[tried["iteration"] == view.run.best.iteration]
         row = (of_best if len(of_best) else tried).iloc[-1]
         figures = row["zigzag_per_m"], row["zigzag_deg"], row["zigzag_lost_s"]
         return figures, f"evaluation after iteration {row['iteration']:.0f}"

@@ -96,15 +96,15 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
     from deepracer_exp.runs.files import read_config, sees_pictures
-    from deepracer_exp.runs.own_recording import is_own_run, read_log
+    from deepracer_exp.runs.recording import is_traced_run, read_log
 
-    recording = read_log(place)
+    log = read_log(place)
     try:
-        config = read_config(place) if is_own_run(place) else {}
+        config = read_config(place) if is_traced_run(place) else {}
     except BadInput:  # the page lists which files could not be read
         config = {}
     car = _car(config)
-    view, terms = run_terms(prepare(recording, args.track), car)
+    view, terms = run_terms(prepare(log, args.track), car)
     line = None if args.line is None else recorded_line(view, episode)
     strip: list[Glimpse] = []
     if sees_pictures(config):
@@ -115,7 +115,7 @@ def _analyze(args: argparse.Namespace) -> int:
         _find_fastest(view, place)
     laps = None if args.replay is None else laps_of_log(view, None)
     replay = None if reward is None else replay_reward(view, reward, car)
-    default = place / REPORT if is_own_run(place) else page_name("analysis", recording.name)
+    default = place / REPORT if is_traced_run(place) else page_name("analysis", view.name)
     out = Path(args.output or default)
     found = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
@@ -184,11 +184,11 @@ def _find_fastest(view: "LogView", place: Path) -> None:
         BadInput: it is no run of ours, or its car and track are unknown.
     """
     from deepracer_exp.analysis.against_fastest import question_of
-    from deepracer_exp.runs.own_recording import is_own_run
+    from deepracer_exp.runs.recording import is_traced_run
 
     from .tracks import search_fastest
 
-    question = question_of(view, place) if is_own_run(place) else None
+    question = question_of(view, place) if is_traced_run(place) else None
     if question is None:
         raise BadInput(
             f"--fastest: {place}: car and track are not known; accepted: a run of ours on one track"

@@ -33,7 +33,7 @@ def compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
     from deepracer_exp.analysis.lap_replay import laps_of_log
     from deepracer_exp.analysis.log_tables import Table, headline
     from deepracer_exp.analysis.log_view import prepare
-    from deepracer_exp.runs.own_recording import read_log
+    from deepracer_exp.runs.recording import read_log
 
     named: list[tuple[str | None, LogView]] = []
     whole: list[LogView] = []
@@ -71,7 +71,7 @@ def against_log(args: argparse.Namespace, name: str, place: Path, stores: Stores
     from deepracer_exp.analysis.lap_replay import laps_of_log
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.aws.logs.reader import read_recording
-    from deepracer_exp.runs.own_recording import read_log
+    from deepracer_exp.runs.recording import read_log
 
     recording = read_recording(place)
     view = prepare_races(recording, args.track)

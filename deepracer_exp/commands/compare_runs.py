@@ -194,7 +194,7 @@ def _generations(records: "Sequence[RunRecord]") -> "Chart | None":
     from deepracer_exp.analysis.charts.runs import generations
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.runs.lineage import read_lineage
-    from deepracer_exp.runs.own_recording import read_log
+    from deepracer_exp.runs.recording import read_log
 
     parents = {record.name: lineage.parent for record in records if (lineage := read_lineage(record.path))}
     names = {record.name for record in records}

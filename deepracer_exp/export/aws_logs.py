@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.aws.logs.recording import Recording
 from deepracer_exp.aws.logs.sim_trace import LOG_LAYOUTS
 from deepracer_exp.aws.models.hyperparameters import hyperparameters_text
 from deepracer_exp.aws.models.model_metadata import model_metadata_text
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, count, writing
+from deepracer_exp.runs.recording import RunRecording
 
 from .aws_files import hyperparameters_of, services_metadata, write_files
 
@@ -39,7 +39,7 @@ _PLACES = {
 }
 
 
-def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, layout: str) -> list[str]:
+def write_aws_logs(log: RunRecording, experiment: Experiment, folder: Path, layout: str) -> list[str]:
     """Write the training of our own run in the layout of the console or of deepracer-for-cloud; return notes on it.
 
     The service's iterations consist of whole episodes, always equally many: tools derive the iteration from the
@@ -51,6 +51,7 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     Raises:
         BadInput: no episode is finished, or the folder is not empty or cannot be written.
     """
+    recording = log.recording
     numbered = _number(recording.steps, experiment.car.control_period_s)
     # The service's names of jobs: the time in 14 digits, a hyphen, the rest.
     dated = re.fullmatch(r"(\d{8})-(\d{6})-(.+)", recording.name)
@@ -62,20 +63,20 @@ def write_aws_logs(recording: Recording, experiment: Experiment, folder: Path, l
     texts = {
         "model/model_metadata.json": metadata,
         "ip/hyperparameters.json": hyperparameters,
-        _PLACES[layout]["metrics"].format(job=job): _metrics_text(numbered, recording.evaluations),
+        _PLACES[layout]["metrics"].format(job=job): _metrics_text(numbered, log.evaluations),
         f"logs/training/training-{job}-sagemaker.log": _trainer_log(head, numbered, recording.updates),
     }
     if recording.reward_source is not None:
         texts["reward_function.py"] = recording.reward_source
     if layout == "console":
         texts |= {"model_metadata.json": metadata, "hyperparameters.json": hyperparameters}
-    log = folder / f"logs/training/training-{job}-robomaker.log"
+    text_log = folder / f"logs/training/training-{job}-robomaker.log"
     with writing(folder, "another folder with -o"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise BadInput(f"--output {folder}: is not empty; accepted: a new or an empty folder")
         write_files(texts, folder)
-        _write_trace(numbered, folder / _PLACES[layout]["trace"], log, head)
+        _write_trace(numbered, folder / _PLACES[layout]["trace"], text_log, head)
     rows, episodes = count(len(numbered.rows), "row"), count(len(numbered.episodes), "episode")
     what = f"{rows}, {episodes}, {count(numbered.iterations, 'iteration')}, as {layout} has them"
     return [what, *_notes(numbered, experiment)]

@@ -22,7 +22,7 @@ from deepracer_exp.files import atomic_write, read_text
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
 from deepracer_exp.runs.files import EXPORTS, REWARD
-from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.runs.result import read_result
 from deepracer_exp.validation.aws_rules import text_findings
 
@@ -127,9 +127,9 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _aws_logs(run: StoredRun, config: ExportConfig, folder: Path) -> _Written:
-    recording = read_own_recording(run.path)
-    notes = write_aws_logs(recording, run.experiment, folder, config.layout)
-    return [folder], [*notes, *map(str, recording.problems)]
+    log = read_run_recording(run.path)
+    notes = write_aws_logs(log, run.experiment, folder, config.layout)
+    return [folder], [*notes, *map(str, log.recording.problems)]
 
 
 def _aws_model(run: StoredRun, config: ExportConfig, folder: Path) -> _Written:

@@ -403,9 +403,9 @@ def _write_page(run_dir: Path, car: CarConfig) -> str | None:
         from deepracer_exp.analysis.log_view import prepare
         from deepracer_exp.analysis.page import Glimpse
         from deepracer_exp.analysis.reward_terms import run_terms
-        from deepracer_exp.runs.own_recording import read_own_recording
+        from deepracer_exp.runs.recording import read_run_recording
 
-        view, terms = run_terms(prepare(read_own_recording(run_dir)), car, just_trained=True)
+        view, terms = run_terms(prepare(read_run_recording(run_dir)), car, just_trained=True)
         strip: list[Glimpse] = []
         if sees_pictures(read_config(run_dir)):
             from deepracer_exp.evaluation.sight import run_glimpses

@@ -16,6 +16,7 @@ from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
 from deepracer_exp.stopping.judge import LOG_RULE
 
@@ -29,6 +30,12 @@ SECTORS = sectors_of(COURSE)
 def of(view: LogView, rule: str, target_s: float | None = None) -> Finding:
     (found,) = (one for one in findings(view, target_s) if one.rule == rule)
     return found
+
+
+def run_of(view: LogView, **more: object) -> RunRecording:
+    """Return the recording of a view as that of a run of ours."""
+    best = RunResult(measure="race_score", rank=(0.0, 0.0), iteration=10, completion=90.0, lap_time_s=None)
+    return RunRecording(recording=view.recording, **{"best": best, **more})
 
 
 def training(completions: list[float], episodes: int = LEAST_EPISODES, **more: list[float]) -> LogView:
@@ -380,21 +387,20 @@ def test_a_run_of_ours_is_judged_by_its_own_rules_and_its_decision_is_what_the_r
     view = training(LEARNED, evaluated=FALLING)
     overrides = ["stopping.converged.patience=40", "stopping.overfitting.patience=20"]
     stopping = compose_experiment(overrides)[1].mapping["stopping"]
-    own = replace(view, recording=replace(view.recording, stopping=stopping))
+    own = replace(view, run=run_of(view, stopping=stopping))
     assert "at least 41 are needed" in of(own, "converged").sentence
     assert of(own, "overfits").sentence.startswith("No sign of overfitting")  # not before iteration 41
     decision = {"rule": "overfitting", "why": "held-out fell", "values": {"a": 1.0}, "thresholds": {}}
-    ended = replace(view, recording=replace(view.recording, decision=decision))
+    ended = replace(view, run=run_of(view, decision=decision))
     assert "ended it (overfitting): held-out fell." in of(ended, "converged").sentence
     assert "overfits" not in [one.rule for one in findings(ended)]
 
 
 def test_a_run_of_ours_is_advised_to_take_a_checkpoint_that_it_has() -> None:
-    best = RunResult(measure="race_score", rank=(0.0, 0.0), iteration=10, completion=90.0, lap_time_s=None)
     for completions, rule in ((LEARNED, "overfits"), ([*LEARNED, 0.4, 0.4, 0.4], "converged")):
         view = training(completions, evaluated=FALLING)
         assert "000010" not in of(view, rule).sentence
-        own = replace(view, recording=replace(view.recording, best=best))
+        own = replace(view, run=run_of(view))
         assert "checkpoint 000010 (the best by race score (usual and held-out))" in of(own, rule).sentence
         assert "enough laps" not in "".join(one.caption for one in charts_of(own))
 
@@ -413,7 +419,7 @@ def charts_of(view: LogView) -> list[Chart]:
 )
 def test_the_figure_says_of_convergence_what_the_finding_says(decision) -> None:
     view = training([0.2] * LOG_RULE.patience)
-    view = replace(view, recording=replace(view.recording, decision=decision))
+    view = replace(view, run=None if decision is None else run_of(view, decision=decision))
     (chart,) = (one for one in charts_of(view) if one.name == "training_progress")
     words = "too short to say" if decision is None else "stopping rule ended it"
     assert words in chart.caption

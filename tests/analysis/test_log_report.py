@@ -15,6 +15,7 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
 from tests.browser import needs_chromium
 from tests.page_html import Html
@@ -214,7 +215,7 @@ def test_a_recording_without_a_step_has_no_page_and_the_old_one_stays(tmp_path):
 
 def test_the_sensors_of_a_log_are_named_but_no_default_ones_of_a_run_of_ours(view):
     best = RunResult(measure="race_score", rank=(0.0, 0.0), iteration=10, completion=90.0, lap_time_s=None)
-    own = dataclasses.replace(view, recording=dataclasses.replace(view.recording, best=best))
+    own = dataclasses.replace(view, run=RunRecording(recording=view.recording, best=best))
     spaces = [dict(facts(one))["Action space"] for one in (view, own)]
     assert spaces[0] == f"{spaces[1]}; sensors FRONT_FACING_CAMERA"
 

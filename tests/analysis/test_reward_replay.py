@@ -15,7 +15,7 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs.files import read_config
-from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.tracks.track import Track
 
 from .conftest import CONSOLE
@@ -36,7 +36,7 @@ def replay_reward(view: LogView, reward: str, **more) -> ReplayedRewards:
 @pytest.fixture(scope="module")
 def own(trained) -> LogView:
     run = trained("algorithm.frames_per_iteration=2048", "budget.env_steps=8192").folder
-    return prepare(read_own_recording(run))
+    return prepare(read_run_recording(run))
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
     run = trained(*overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car
-    replayed = reward_replay.replay_reward(prepare(read_own_recording(run)), source, car)
+    replayed = reward_replay.replay_reward(prepare(read_run_recording(run)), source, car)
     np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=1e-9)
     both = {False, True} if "track.direction=alternate" in overrides else {False}
     assert set(replayed.waypoints["reversed"]) == both

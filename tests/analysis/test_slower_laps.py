@@ -10,7 +10,8 @@ from deepracer_exp.analysis.charts.training import training_progress
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.slower_laps import SERIES, SlowerLaps, slower_laps
-from deepracer_exp.aws.logs.recording import EVALUATION_COLUMNS, METRICS_COLUMNS
+from deepracer_exp.aws.logs.recording import METRICS_COLUMNS, Recording
+from deepracer_exp.runs.recording import EVALUATION_COLUMNS, RunRecording
 from deepracer_exp.runs.result import RunResult
 
 from .made_up import Drive, made_up_recording, typed
@@ -122,8 +123,12 @@ def test_most_trainings_that_lose_a_twentieth_of_their_speed_are_reported() -> N
 
 def slowing(**more: object) -> LogView:
     """Prepare a log whose laps become slower while the reward, which is progress, stays."""
+    return prepare(replace(slowing_recording(), **more))
+
+
+def slowing_recording() -> Recording:
     drives = [Drive(speed_mps=3.0 - 0.06 * k, iteration=k) for k in range(12) for _ in range(5)]
-    return prepare(replace(made_up_recording(drives), **more))
+    return made_up_recording(drives)
 
 
 def sentence(view: LogView) -> str:
@@ -151,7 +156,7 @@ def test_a_log_with_evaluations_is_judged_by_them() -> None:
     assert not any(one.rule == "laps_slower" for one in findings(slowing(metrics=evaluated(SLOWED_S[::-1]))))
 
 
-def own(times_s: list[float], **more: object) -> LogView:
+def own(times_s: list[float], recording: Recording | None = None, **more: object) -> LogView:
     """Prepare a run of ours with evaluations."""
     rows = pd.DataFrame({"iteration": range(len(times_s)), "lap_time_s": times_s})
     rows = rows.assign(completion=100.0, lap_share=1.0, held_out_completion=90.0)
@@ -159,7 +164,9 @@ def own(times_s: list[float], **more: object) -> LogView:
     best = RunResult(
         measure="race_score", rank=(1.0, -6.0), iteration=0, completion=100.0, lap_time_s=times_s[0]
     )
-    return slowing(evaluations=typed(rows, EVALUATION_COLUMNS), best=best, **more)
+    evaluations = typed(rows, EVALUATION_COLUMNS)
+    recording = recording or slowing_recording()
+    return prepare(RunRecording(recording=recording, evaluations=evaluations, best=best, **more))
 
 
 def test_a_run_of_ours_names_the_checkpoint_to_take_instead() -> None:
@@ -169,7 +176,7 @@ def test_a_run_of_ours_names_the_checkpoint_to_take_instead() -> None:
 
 
 def test_laps_of_several_tracks_are_not_mixed() -> None:
-    several = own(SLOWED_S[::-1], track=None)
+    several = own(SLOWED_S[::-1], replace(slowing_recording(), track=None))
     assert several.iterations["eval_lap_time_s"].isna().all()
     assert sentence(several).startswith("The exploring laps")
 

@@ -11,7 +11,7 @@ from deepracer_exp.aws.logs import blocks as log_blocks
 from deepracer_exp.aws.logs import sim_trace
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.text_log import TrainingLog, read_training_logs
-from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.runs.trace import read_trace
 
 from . import made_up_logs as made
@@ -95,9 +95,9 @@ def test_the_last_iterations_of_our_own_run_are_read(trained, most_steps):
     counts = np.bincount(trace["iteration"])
     assert len(counts) > 2
     most_steps(len(trace))
-    assert not read_own_recording(folder).problems
+    assert not read_run_recording(folder).recording.problems
     most_steps(int(counts[-2:].sum()))
-    last = read_own_recording(folder)
+    last = read_run_recording(folder).recording
     assert (
         last.steps["iteration"].tolist()
         == trace.loc[trace["iteration"] >= len(counts) - 2, "iteration"].tolist()

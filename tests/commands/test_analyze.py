@@ -9,7 +9,7 @@ import pytest
 
 from deepracer_exp.analysis import log_report
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs import own_recording
+from deepracer_exp.runs import recording as run_recording
 from tests.aws.made_up_logs import drives, log_text
 from tests.page_html import Html
 
@@ -51,7 +51,7 @@ def test_runs_are_found_as_by_other_commands(run_dir, call, monkeypatch, what):
         found.append(place)
         raise BadInput("found")
 
-    monkeypatch.setattr(own_recording, "read_log", stop)
+    monkeypatch.setattr(run_recording, "read_log", stop)
     ended = call("analyze", what.format(name=run_dir.name, begin=run_dir.name[:11]))
     assert [(ended.cwd / place).resolve() for place in found] == [run_dir.resolve()]
 

@@ -14,7 +14,7 @@ from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.runs.files import read_record
-from deepracer_exp.runs.own_recording import read_own_recording
+from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.stopping.replay import replay
 from deepracer_exp.training.callbacks import write_pictures
 from tests.waiting import wait_until
@@ -107,7 +107,7 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
     assert str((ended.folder / "checkpoints" / "best").readlink()) == name
     assert f"best checkpoint by race score (usual and held-out): {name}, " in ended.stdout
     assert f"completion {best['eval_completion']:.1f}%" in ended.stdout
-    found = findings(prepare(read_own_recording(ended.folder)))
+    found = findings(prepare(read_run_recording(ended.folder)))
     (submit,) = [one.sentence for one in found if one.rule == "submit"]
     assert submit.startswith(f"Race with checkpoint {name}, the best by race score (usual and held-out): ")
     compared = call("checkpoints", ended.folder.name)
@@ -138,6 +138,6 @@ def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(trained, tmp_path):
 
 def test_the_page_counts_the_episodes_that_the_summary_counts(trained):
     ended = trained("budget.iterations=1")
-    view = prepare(read_own_recording(ended.folder))
+    view = prepare(read_run_recording(ended.folder))
     assert len(view.episodes) > ended.summary["episodes"] > 0  # some were still being driven at the end
     assert f" in {ended.summary['episodes']} finished episodes and 1 iteration" in headline(view)

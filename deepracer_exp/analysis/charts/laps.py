@@ -123,7 +123,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     scale, colors = "complete laps, per cent of the episodes", (0.0, max(float(share.max()), 1.0))
     layers.append(colored_points(x, y, share, scale, value_range=colors, hover=hover))
     which = "No iteration has enough laps to be judged by them."
-    if view.recording.best is not None:
+    if view.run is not None:
         which = "A run of ours races with its best kept checkpoint."
     elif len(view.candidates):
         judged = " by their evaluations" if view.candidates["evaluated"].any() else ""

@@ -23,7 +23,7 @@ def training_progress(view: LogView) -> Chart | None:
     table = view.iterations
     if not len(table):
         return None
-    found = convergence(table, view.action_count, view.recording.stopping)
+    found = convergence(table, view.action_count, view.stopping)
     at = None if found is None else found.iteration
     converged = [] if at is None else [mark(at, "converged", FAINT)]
     progress = curve(table, "completion_mean", BLUE, "mean of the episodes")
@@ -55,7 +55,7 @@ def training_progress(view: LogView) -> Chart | None:
             ("Entropy of the policy", "nats", curve(table, "entropy", PURPLE, "mean over the update"))
         )
     when = "It has not converged yet." if at is None else f"It converged at iteration {at}."
-    if view.recording.decision is not None:
+    if view.decision is not None:
         when = "The run's stopping rule ended it."
     elif found is None:
         when = "It is too short to say whether it has converged."

@@ -3,14 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
-
-if TYPE_CHECKING:
-    from deepracer_exp.runs.result import RunResult
 
 TRAINING = "training"
 """Name of the stream, and kind of job, of a training's episodes."""
@@ -71,20 +68,6 @@ METRICS_COLUMNS: Mapping[str, tuple[str, str]] = {
     "resets": ("float64", "how often the car was put back; NaN where not logged"),
 }
 """Columns of `Recording.metrics`: type and meaning with unit."""
-EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
-    "iteration": ("int32", "policy update after which the policy was evaluated, counted as in the steps"),
-    "completion": ("float64", "per cent of the lap, mean over the trials"),
-    "held_out_completion": (
-        "float64",
-        "the same on conditions held out of the training; NaN where not evaluated",
-    ),
-    "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
-    "lap_time_s": ("float64", "s, mean of the complete laps; NaN without one"),
-    "zigzag_per_m": ("float64", "changes of steering a metre of straight; NaN where not measured"),
-    "zigzag_deg": ("float64", "degrees to either side in these changes; NaN without one"),
-    "zigzag_lost_s": ("float64", "s a lap lost in these; NaN where not measured"),
-}
-"""Columns of `Recording.evaluations`: type and meaning with unit."""
 
 
 def readable(name: str) -> str:
@@ -140,9 +123,6 @@ class Recording:
     """One row an epoch of a policy update, `UPDATE_COLUMNS`."""
     metrics: pd.DataFrame
     """One row an episode, from the service's metrics files, `METRICS_COLUMNS`."""
-    evaluations: pd.DataFrame = field(default_factory=lambda: typed_table(EVALUATION_COLUMNS))
-    """One row an evaluation between the iterations, `EVALUATION_COLUMNS`; of our own runs only: the service logs their
-    episodes in `metrics` instead."""
     metadata: ModelMetadata | None
     """Action space and sensors."""
     hyperparameters: Mapping[str, Any] | None
@@ -153,12 +133,6 @@ class Recording:
     problems: tuple[LogProblem, ...]
     files: tuple[Path, ...]
     """The files read; members of an archive have paths below the archive's."""
-    best: "RunResult | None" = None
-    """The best checkpoint of a run of ours; None for the service, which keeps a checkpoint of every iteration."""
-    stopping: Mapping[str, Any] | None = None
-    """The group `stopping` of a run of ours."""
-    decision: Mapping[str, Any] | None = None
-    """The decision of its stopping rule, as in summary.json; None without one, or for a log of the service."""
     checkpoints: Mapping[int, str] = field(default_factory=dict)
     """Name of the service's checkpoint that drove each iteration, from its text logs or, if every step before it is
     recorded, their number: `309_Step-8349`."""

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.aws.logs.recording import (
-    EVALUATION_COLUMNS,
     METRICS_COLUMNS,
     STEP_COLUMNS,
     UPDATE_COLUMNS,
@@ -15,7 +14,7 @@ from deepracer_exp.aws.logs.recording import (
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.own_recording import is_own_run, read_own_recording
+from deepracer_exp.runs.recording import EVALUATION_COLUMNS, is_traced_run, read_run_recording
 from deepracer_exp.runs.trace import read_trace
 
 OWN = ("stream", "worker", "wall_clock")
@@ -33,7 +32,7 @@ def folder(copied):
 
 
 def test_the_steps_are_the_rows_of_the_trace(trained):
-    steps = read_own_recording(trained().folder).steps
+    steps = read_run_recording(trained().folder).recording.steps
     assert steps.groupby("episode")["iteration"].nunique().max() > 1
     assert kinds(steps) == {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
     trace = read_trace(trained().folder / "trace")
@@ -48,7 +47,8 @@ def test_the_steps_are_the_rows_of_the_trace(trained):
 
 def test_iterations_of_updates_evaluations_and_trace_are_those_of_the_metrics(trained):
     run = trained()
-    recording = read_own_recording(run.folder)
+    log = read_run_recording(run.folder)
+    recording = log.recording
     assert kinds(recording.updates) == {name: kind for name, (kind, _) in UPDATE_COLUMNS.items()}
     assert (
         recording.updates["iteration"].tolist()
@@ -59,15 +59,15 @@ def test_iterations_of_updates_evaluations_and_trace_are_those_of_the_metrics(tr
     for name in ("policy_loss", "value_loss", "kl", "entropy", "lr"):
         assert recording.updates[name].tolist() == [row[name] for row in run.metrics]
     evaluated = [row for row in run.metrics if row["eval_completion"] is not None]
-    assert list(recording.evaluations) == list(EVALUATION_COLUMNS)
-    assert recording.evaluations["iteration"].tolist() == [row["iteration"] for row in evaluated]
-    assert recording.evaluations["completion"].tolist() == [row["eval_completion"] for row in evaluated]
+    assert list(log.evaluations) == list(EVALUATION_COLUMNS)
+    assert log.evaluations["iteration"].tolist() == [row["iteration"] for row in evaluated]
+    assert log.evaluations["completion"].tolist() == [row["eval_completion"] for row in evaluated]
     assert list(recording.metrics) == list(METRICS_COLUMNS)
     assert recording.metrics.empty
 
 
 def test_what_was_trained_with_is_reported_in_the_services_words(trained):
-    recording = read_own_recording(trained().folder)
+    recording = read_run_recording(trained().folder).recording
     assert recording.problems == ()
     assert recording.hyperparameters["batch_size"] == 256
     assert recording.hyperparameters["discount_factor"] == 0.97
@@ -82,7 +82,7 @@ def test_what_was_trained_with_is_reported_in_the_services_words(trained):
 )
 def test_the_action_space_is_that_of_the_environment(trained, overrides):
     experiment, _ = compose_experiment(["experiment=tiny", *overrides])
-    recording = read_own_recording(trained(*overrides).folder)
+    recording = read_run_recording(trained(*overrides).folder).recording
     assert recording.metadata == metadata_of(build_action_space(experiment.action_space))
     assert recording.steps["action"].isna().all() == (not overrides)
 
@@ -94,7 +94,7 @@ def test_a_file_of_the_trace_that_cannot_be_read_is_left_out_and_reported(folder
         file.write_bytes(file.read_bytes()[:-100])
     else:
         pd.DataFrame({"episode": np.arange(10)}).to_parquet(file)
-    recording = read_own_recording(folder)
+    recording = read_run_recording(folder).recording
     assert set(recording.steps["iteration"]) == {1, 3, 4}
     (problem,) = recording.problems
     assert problem.file == str(file)
@@ -105,7 +105,7 @@ def test_a_file_of_the_trace_that_cannot_be_read_is_left_out_and_reported(folder
 def test_a_line_of_the_metrics_cut_off_by_a_kill_is_reported(folder):
     file = folder / "metrics.jsonl"
     file.write_text(file.read_text()[:-40])
-    recording = read_own_recording(folder)
+    recording = read_run_recording(folder).recording
     assert recording.updates["iteration"].tolist() == [1, 2, 3]
     (problem,) = recording.problems
     assert (problem.file, problem.line) == (str(file), 4)
@@ -115,9 +115,10 @@ def test_missing_files_beside_the_trace_are_reported(folder):
     missing = [folder / name for name in ("config.yaml", "metrics.jsonl", "reward_function.py")]
     for file in missing:
         file.unlink()
-    recording = read_own_recording(folder)
+    log = read_run_recording(folder)
+    recording = log.recording
     assert len(recording.steps) == 4096
-    assert len(recording.updates) == len(recording.evaluations) == 0
+    assert len(recording.updates) == len(log.evaluations) == 0
     assert (
         recording.metadata is recording.hyperparameters is recording.reward_source is recording.track is None
     )
@@ -125,12 +126,12 @@ def test_missing_files_beside_the_trace_are_reported(folder):
 
 
 def test_without_a_trace_there_is_nothing_to_read(folder):
-    assert is_own_run(folder)
+    assert is_traced_run(folder)
     for path in (folder / "trace").iterdir():
         path.write_bytes(b"nothing")
     with pytest.raises(BadInput, match="nothing of the trace can be read"):
-        read_own_recording(folder)
+        read_run_recording(folder)
     shutil.rmtree(folder / "trace")
-    assert not is_own_run(folder)
+    assert not is_traced_run(folder)
     with pytest.raises(BadInput, match=r"no \*-iteration.parquet; accepted: the folder of a run"):
-        read_own_recording(folder)
+        read_run_recording(folder)

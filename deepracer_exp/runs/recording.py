@@ -1,8 +1,9 @@
-"""A run of ours as a recording, in the schema that all recordings share."""
+"""The recording of a run of ours: in the schema that all logs share, and what only a run has."""
 
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from pydantic import TypeAdapter, ValidationError
 from deepracer_exp.aws.logs import sim_trace
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recording import (
-    EVALUATION_COLUMNS,
     METRICS_COLUMNS,
     STEP_COLUMNS,
     TRAINING,
@@ -35,18 +35,49 @@ from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config,
 from .result import IN_TRAINING, RunResult, read_result
 from .trace import trace_files
 
+EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
+    "iteration": ("int32", "policy update after which the policy was evaluated, counted as in the steps"),
+    "completion": ("float64", "per cent of the lap, mean over the trials"),
+    "held_out_completion": (
+        "float64",
+        "the same on conditions held out of the training; NaN where not evaluated",
+    ),
+    "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
+    "lap_time_s": ("float64", "s, mean of the complete laps; NaN without one"),
+    "zigzag_per_m": ("float64", "changes of steering a metre of straight; NaN where not measured"),
+    "zigzag_deg": ("float64", "degrees to either side in these changes; NaN without one"),
+    "zigzag_lost_s": ("float64", "s a lap lost in these; NaN where not measured"),
+}
+"""Columns of `Recording.evaluations`: type and meaning with unit."""
+
 _CONSTANT = {"stream": TRAINING, "worker": 0, "wall_clock": np.nan}
 _READ = [name for name in STEP_COLUMNS if name not in _CONSTANT]
 _SCHEMA = pa.schema([SCHEMA.field(name) for name in _READ])
 _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
 
-def is_own_run(folder: Path) -> bool:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunRecording:
+    """The recording of a run of ours, with what no log of the service has."""
+
+    recording: Recording
+    best: RunResult
+    """The run's best checkpoint, as its summary names it."""
+    evaluations: pd.DataFrame = field(default_factory=lambda: typed_table(EVALUATION_COLUMNS))
+    """One row an evaluation between the iterations, `EVALUATION_COLUMNS`; the service logs the episodes of its
+    evaluations in `Recording.metrics`."""
+    stopping: Mapping[str, Any] | None = None
+    """The run's group `stopping`; None where its configuration cannot be read."""
+    decision: Mapping[str, Any] | None = None
+    """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
+
+
+def is_traced_run(folder: Path) -> bool:
     """Return whether a folder is that of a run of ours with its trace."""
     return is_run(folder) and (folder / TRACE).is_dir()
 
 
-def read_log(path: Path) -> Recording:
+def read_log(path: Path) -> Recording | RunRecording:
     """Read a run of ours, or what the service or its relatives have recorded.
 
     Raises:
@@ -57,10 +88,10 @@ def read_log(path: Path) -> Recording:
             f"{path}: has no trace: `deepracer-exp runs clean` removed it, or the run never drove; accepted: a run "
             "with its trace, or logs of the service"
         )
-    return read_own_recording(path) if is_own_run(path) else read_recording(path)
+    return read_run_recording(path) if is_traced_run(path) else read_recording(path)
 
 
-def read_own_recording(folder: Path) -> Recording:
+def read_run_recording(folder: Path) -> RunRecording:
     """Read a run of ours.
 
     The rows are those of its trace in the order of iterations, the last `MOST_STEPS` of them; the rows of one
@@ -76,19 +107,22 @@ def read_own_recording(folder: Path) -> Recording:
     config = _config(folder, problems, files)
     updates, evaluated = _metrics(folder, problems, files)
     best = _best(folder, problems)
-    return Recording(
+    recording = Recording(
         name=folder.resolve().name,
         steps=steps,
         updates=updates,
         metrics=typed_table(METRICS_COLUMNS),
-        evaluations=evaluated,
         metadata=_metadata(folder, config, problems),
         hyperparameters=_hyperparameters(config),
         reward_source=_text(folder / REWARD, problems, files) or None,
         track=_track(config),
         problems=tuple(problems),
         files=tuple(files),
+    )
+    return RunRecording(
+        recording=recording,
         best=best,
+        evaluations=evaluated,
         stopping=config.get("stopping"),
         decision=_decision(folder),
     )
