@@ -18,6 +18,7 @@ from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .actor_critic import ActorCritic
+from .inner_loop import InnerLoop
 from .schedules import Schedule, build_schedule
 from .smoothness import Smoothness
 
@@ -161,6 +162,8 @@ class PPO(Algorithm):
             device=device,
         )
         self._smoothness: Smoothness | None = None
+        fits = device == _CPU and InnerLoop.fits(actor_critic)
+        self._compiled = InnerLoop(actor_critic, self._optimizer, config) if fits else None
 
     def smooth(self, commands: Tensor | None) -> None:
         """Add the loss of `algorithm.smoothness`; a subclass's constructor need not know of it.
@@ -171,6 +174,12 @@ class PPO(Algorithm):
         self._smoothness = Smoothness(
             self._learner, self.config.smoothness, commands, self._seed, self._device
         )
+
+    @property
+    def _inner_loop(self) -> InnerLoop | None:
+        """What makes the gradient steps of `loss`; None: autograd."""
+        is_ours = type(self).loss is PPO.loss and self._smoothness is None
+        return self._compiled if is_ours else None
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch; override it for a loss of your own.
@@ -194,9 +203,8 @@ class PPO(Algorithm):
         for group in self._optimizer.param_groups:
             group["lr"] = lr
         config = self.config
-        self._loss.entropy_coeff.fill_(
-            config.entropy_coeff * (1 + (config.entropy_end_factor - 1) * fraction)
-        )
+        entropy_coeff = config.entropy_coeff * (1 + (config.entropy_end_factor - 1) * fraction)
+        self._loss.entropy_coeff.fill_(entropy_coeff)
         if self._learner is not self.networks:
             self._learner.load_state_dict(self.networks.state_dict())
             batch = batch.to(self._device, non_blocking_pin=self._device.type == "cuda")
@@ -204,13 +212,15 @@ class PPO(Algorithm):
         count = steps.shape[0]
         size = min(self._batch_size, count)
         minibatches = count // size
-        results = [
-            self._gradient_step(minibatch)
-            for _ in range(self._epochs)
-            for minibatch in steps[self._shuffled(count)[: minibatches * size]].split(size)
-        ]
+        orders = (self._shuffled(count)[: minibatches * size] for _ in range(self._epochs))
+        loop = self._inner_loop
+        if loop is None:
+            table = torch.stack(
+                [self._gradient_step(part) for order in orders for part in steps[order].split(size)]
+            )
+        else:
+            table = torch.cat([self._epoch(loop, steps, order, size, lr, entropy_coeff) for order in orders])
         # One transfer for all metrics; only the test for finite numbers waits for each gradient step.
-        table = torch.stack(results)
         policy_loss, value_loss, entropy, clip_fraction, _, grad_norm = table.mean(0).tolist()
         kl = table[-minibatches:, 4].mean().item()
         self.schedule.observe(kl)
@@ -313,6 +323,23 @@ class PPO(Algorithm):
         keys = ("loss_objective", "loss_critic", "entropy", "clip_fraction")
         return torch.stack([*(losses[key].detach() for key in keys), kl, grad_norm])
 
+    def _epoch(
+        self,
+        loop: InnerLoop,
+        steps: TensorDictBase,
+        order: Tensor,
+        size: int,
+        lr: float,
+        entropy_coeff: float,
+    ) -> Tensor:
+        """Do what `_gradient_step` does for each minibatch of an epoch, and return the same of each."""
+        columns = [steps[key] for key in ("observation", "action", "action_log_prob")]
+        columns += [steps[key].squeeze(-1) for key in ("advantage", "value_target")]
+        made = loop.run([column.index_select(0, order) for column in columns], size, lr, entropy_coeff)
+        if len(made) * size < len(order):
+            self._gradient_step(steps[order.split(size)[len(made)]])  # names what is not finite
+        return made
+
     def _fail(self, losses: TensorDictBase) -> NoReturn:
         """Raise RunFailed with the first thing that is not finite."""
         for key, name in _LOSS_NAMES.items():
@@ -357,6 +384,10 @@ class Distillation(PPO):
             (1, config.teacher_batch_size) if self._imitates else (config.epochs, config.batch_size)
         )
         return super().update(batch, iteration, fraction)
+
+    @property
+    def _inner_loop(self) -> InnerLoop | None:
+        return None if self._imitates or self._smoothness is not None else self._compiled
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses as PPO does."""

@@ -1,0 +1,340 @@
+"""The inner loop of clipped PPO for perceptrons of features, compiled.
+
+A gradient step on some hundred steps of features is small: TorchRL, TensorDict and autograd need four times as long as
+the products it consists of. Here the derivatives of `ClipPPOLoss` stand as formulas, and an epoch's gradient steps are
+one call. Pictures, shared trunks, networks and losses of the user's own and `algorithm.smoothness` are differentiated
+by autograd, see `PPO`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+from torch import Tensor, nn
+
+from deepracer_exp.config.learning import AlgorithmConfig
+
+from .actor_critic import ActorCritic
+
+Floats = NDArray[np.float32]
+
+_ACTIVATIONS: dict[type[nn.Module], int] = {nn.ReLU: 0, nn.Tanh: 1, nn.ELU: 2, nn.SiLU: 3}
+_LEAST_LOG_STD = math.log(1e-4)
+"""Below it, the standard deviation of the library's `AddStateIndependentNormalScale` stays as it is."""
+_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+_BETA1, _BETA2 = 0.9, 0.999
+_NO_SCALE: Floats = np.zeros(0, np.float32)
+COLUMNS = ("policy loss", "value loss", "entropy", "clip fraction", "kl", "gradient norm")
+"""What is returned for each gradient step: the value loss is weighted by `critic_coeff`, entropy and `kl` are in nats,
+and the norm is that before clipping."""
+
+# Sums may be reordered; NaN and infinity must stay what they are, since they end a run.
+_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
+
+
+class InnerLoop:
+    """Makes the gradient steps of an epoch, for a policy and a value network that share nothing."""
+
+    def __init__(self, networks: ActorCritic, optimizer: torch.optim.Adam, config: AlgorithmConfig) -> None:
+        """Use the parameters of the networks and the moments of the optimizer, which stay theirs.
+
+        Args:
+            networks: They fit, see `fits`.
+            optimizer: Of `networks.parameters()`, without weight decay.
+            config: Losses, clipping and their weights.
+        """
+        self._networks, self._optimizer, self._config = networks, optimizer, config
+        layers, self._log_std = _policy_layers(networks)
+        self._layers: tuple[nn.Module, nn.Module] = layers, networks.value_head.module
+        self._blas = ThreadpoolController()
+        self.gradients: dict[Tensor, Floats] = {
+            parameter: np.zeros(parameter.shape, np.float32) for parameter in networks.parameters()
+        }
+        """Of the last gradient step, after clipping."""
+
+    @staticmethod
+    def fits(networks: ActorCritic) -> bool:
+        """Return whether the networks are perceptrons that share nothing."""
+        return networks.trunk is None and all(
+            isinstance(layers, nn.Sequential)
+            and {type(layer) for layer in layers} <= {nn.Linear, *_ACTIVATIONS}
+            and [type(layer) is nn.Linear for layer in layers] == [n % 2 == 0 for n in range(len(layers))]
+            for layers in (_policy_layers(networks)[0], networks.value_head.module)
+        )
+
+    def run(self, columns: Sequence[Tensor], size: int, lr: float, entropy_coeff: float) -> Tensor:
+        """Make the gradient steps of an epoch in place.
+
+        Args:
+            columns: Shuffled observation [N, features], action ([N, 2], or int64 [N] of a discrete policy),
+                log-probability when it was collected, advantage and value target, each [N].
+            size: Steps of a minibatch; N is a multiple of it.
+            lr: Learning rate.
+            entropy_coeff: Weight of the entropy bonus.
+
+        Returns:
+            [gradient steps, `COLUMNS`]. It ends before the first step whose loss or gradient is not finite.
+        """
+        config = self._config
+        policy, value = (self._arrays(layers, size) for layers in self._layers)
+        log_std, by_log_std = _NO_SCALE, _NO_SCALE
+        if self._log_std is not None:
+            log_std, by_log_std = self._log_std.detach().numpy(), self.gradients[self._log_std]
+        moments, taken = self._moments()
+        with self._blas.limit(limits=1, user_api="blas"):
+            table, made = _epoch(
+                tuple(column.numpy() for column in columns), size, policy, value, log_std, by_log_std, moments,
+                (lr, entropy_coeff, config.critic_coeff, config.clip_epsilon, config.max_grad_norm or math.inf),
+                config.loss_type == "huber", taken, self._optimizer.defaults["eps"],
+            )  # fmt: skip
+        for parameter in self._networks.parameters():
+            self._optimizer.state[parameter]["step"] += made
+        return torch.from_numpy(table[:made])
+
+    def _arrays(self, layers: nn.Module, rows: int) -> tuple[Any, ...]:
+        """Return weights, biases, their gradients, outputs, slopes and gradients by outputs, and the activation."""
+        linear = [layer for layer in layers.children() if isinstance(layer, nn.Linear)]
+        kinds = [_ACTIVATIONS[type(layer)] for layer in layers.children() if type(layer) in _ACTIVATIONS]
+        return (
+            tuple(layer.weight.detach().numpy() for layer in linear),
+            tuple(layer.bias.detach().numpy() for layer in linear),
+            tuple(self.gradients[layer.weight] for layer in linear),
+            tuple(self.gradients[layer.bias] for layer in linear),
+            *(tuple(np.empty((rows, layer.out_features), np.float32) for layer in linear) for _ in range(3)),
+            kinds[0] if kinds else 0,
+        )
+
+    def _moments(self) -> tuple[tuple[Any, ...], int]:
+        """Return (parameters, gradients, first moments, second moments), flat, and the gradient steps made so far."""
+        state = self._optimizer.state
+        rows = []
+        for parameter, gradient in self.gradients.items():
+            if not state[parameter]:
+                zeros = torch.zeros_like(parameter)
+                state[parameter] = {"step": torch.tensor(0.0), "exp_avg": zeros, "exp_avg_sq": zeros.clone()}
+            own = state[parameter]
+            tensors = (parameter.detach(), torch.from_numpy(gradient), own["exp_avg"], own["exp_avg_sq"])
+            rows.append(tuple(tensor.view(-1).numpy() for tensor in tensors))
+        return tuple(zip(*rows, strict=True)), int(own["step"])
+
+
+def _policy_layers(networks: ActorCritic) -> tuple[nn.Module, nn.Parameter | None]:
+    """Return the policy's layers and, of a continuous policy, the logarithm of its standard deviation."""
+    policy = networks.policy_head[0].module
+    scale = (
+        getattr(policy[-1], "state_independent_scale", None) if isinstance(policy, nn.Sequential) else None
+    )
+    return (policy, None) if scale is None else (policy[0], scale)
+
+
+@njit(cache=True, nogil=True)  # reordered, the test for finite numbers would find NaN finite
+def _epoch(columns, size, policy, value, log_std, by_log_std, moments, numbers, huber, taken, epsilon):  # type: ignore[no-untyped-def]
+    """Make the gradient steps; return the table of `COLUMNS` and how many rows of it were made."""
+    observation, action, log_prob, advantage, target = columns
+    lr, entropy_coeff, critic_coeff, clip_epsilon, max_norm = numbers
+    minibatches = len(observation) // size
+    table = np.zeros((minibatches, len(COLUMNS)), np.float32)
+    for number in range(minibatches):
+        rows = slice(number * size, (number + 1) * size)
+        row = table[number]
+        outputs = _forward(observation[rows], policy)
+        _differentiate(
+            outputs, action[rows], log_prob[rows], advantage[rows], log_std, by_log_std, clip_epsilon,
+            entropy_coeff, policy[6][-1], row,
+        )  # fmt: skip
+        _backward(observation[rows], policy)
+        outputs = _forward(observation[rows], value)
+        row[1] = _value_loss(outputs, target[rows], huber, critic_coeff, value[6][-1])
+        _backward(observation[rows], value)
+        norm = _norm(moments[1])
+        row[5] = norm
+        if not np.isfinite(norm + row[0] + row[1] + row[2]):
+            return table, number
+        # As torch.nn.utils.clip_grads_with_norm_ does.
+        share = min(1.0, max_norm / (norm + 1e-6))
+        _adam(moments, np.float32(share), lr, taken + number + 1, epsilon)
+    return table, minibatches
+
+
+@_compiled
+def _norm(gradients):  # type: ignore[no-untyped-def]
+    square = 0.0
+    for number in range(len(gradients)):
+        for value in gradients[number]:
+            square += value * value
+    return math.sqrt(square)
+
+
+@_compiled
+def _forward(inputs, network):  # type: ignore[no-untyped-def]
+    """Fill outputs and slopes of the layers, and return the last outputs."""
+    weights, biases, _, _, outputs, slopes, _, activation = network
+    for number in range(len(weights)):
+        out, bias = outputs[number], biases[number]
+        if number == 0:
+            np.dot(inputs, weights[number].T, out)
+        else:
+            np.dot(outputs[number - 1], weights[number].T, out)
+        if number == len(weights) - 1:
+            out += bias
+        else:
+            _activate(out, bias, slopes[number], activation)
+    return outputs[-1]
+
+
+@_compiled
+def _activate(values, bias, slopes, activation):  # type: ignore[no-untyped-def]
+    """Add a bias, apply the activation and write its slope."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for row in range(values.shape[0]):
+        for unit in range(values.shape[1]):
+            value = values[row, unit] + bias[unit]
+            if activation == 0:
+                slope = one if value > zero else zero
+                value = value * slope if value == value else value
+            elif activation == 1:
+                value = np.tanh(value)
+                slope = one - value * value
+            elif activation == 2:
+                slope = one if value > zero else np.exp(value)
+                value = value if value > zero else slope - one
+            else:
+                share = one / (one + np.exp(-value))
+                slope = share * (one + value * (one - share))
+                value = value * share
+            values[row, unit], slopes[row, unit] = value, slope
+
+
+@_compiled
+def _backward(inputs, network):  # type: ignore[no-untyped-def]
+    """Fill the gradients of weights and biases, given those by the last outputs."""
+    weights, _, by_weights, by_biases, outputs, slopes, by_outputs, _ = network
+    for number in range(len(weights) - 1, -1, -1):
+        gradient = by_outputs[number]
+        by_bias = by_biases[number]
+        by_bias[:] = 0.0
+        for row in range(gradient.shape[0]):
+            for unit in range(gradient.shape[1]):
+                by_bias[unit] += gradient[row, unit]
+        if number == 0:
+            np.dot(gradient.T, inputs, by_weights[number])
+        else:
+            np.dot(gradient.T, outputs[number - 1], by_weights[number])
+            before, slope = by_outputs[number - 1], slopes[number - 1]
+            np.dot(gradient, weights[number], before)
+            for row in range(before.shape[0]):
+                for unit in range(before.shape[1]):
+                    before[row, unit] *= slope[row, unit]
+
+
+@_compiled
+def _differentiate(  # type: ignore[no-untyped-def]
+    outputs,
+    action,
+    log_prob,
+    advantage,
+    log_std,
+    by_log_std,
+    clip_epsilon,
+    entropy_coeff,
+    by_outputs,
+    row,
+):
+    """Differentiate the clipped loss and the entropy bonus by the policy's outputs and the logarithm of its scale.
+
+    Source of the loss: Schulman et al. 2017, arXiv 1707.06347, equation 7.
+    """
+    count, size = outputs.shape
+    low, high = math.log1p(-clip_epsilon), math.log1p(clip_epsilon)
+    loss = entropy = clipped = kl = 0.0
+    if action.ndim == 2:
+        by_log_std[:] = -entropy_coeff
+        scale = np.maximum(log_std, np.float32(_LEAST_LOG_STD))
+        for axis in range(size):
+            entropy += scale[axis] + 0.5 + _HALF_LOG_2PI
+    for step in range(count):
+        now = 0.0
+        if action.ndim == 2:
+            for axis in range(size):
+                apart = (action[step, axis] - outputs[step, axis]) * math.exp(-scale[axis])
+                now -= 0.5 * apart * apart + scale[axis] + _HALF_LOG_2PI
+        else:
+            largest = outputs[step].max()
+            total = 0.0
+            for index in range(size):
+                total += math.exp(outputs[step, index] - largest)
+            normal = largest + math.log(total)
+            now = outputs[step, action[step]] - normal
+        log_ratio = now - log_prob[step]
+        ratio = math.exp(log_ratio)
+        limited = min(max(log_ratio, low), high)
+        gain = ratio * advantage[step]
+        least = math.exp(limited) * advantage[step]
+        inside = limited == log_ratio
+        by_log_prob = -gain / count if inside or gain <= least else 0.0
+        loss -= min(gain, least)
+        clipped += not inside
+        # E[r - 1 - log r] for r = new / old probability: never negative, and far less noisy than E[-log r].
+        kl += ratio - 1.0 - log_ratio
+        if action.ndim == 2:
+            for axis in range(size):
+                shrink = math.exp(-scale[axis])
+                apart = (action[step, axis] - outputs[step, axis]) * shrink
+                by_outputs[step, axis] = by_log_prob * apart * shrink
+                by_log_std[axis] += by_log_prob * (apart * apart - 1.0)
+        else:
+            own = 0.0
+            for index in range(size):
+                log_p = outputs[step, index] - normal
+                own -= math.exp(log_p) * log_p
+            entropy += own / count
+            for index in range(size):
+                log_p = outputs[step, index] - normal
+                p = math.exp(log_p)
+                by_outputs[step, index] = p * ((log_p + own) * entropy_coeff / count - by_log_prob)
+            by_outputs[step, action[step]] += by_log_prob
+    if action.ndim == 2:
+        for axis in range(size):
+            if log_std[axis] < _LEAST_LOG_STD:
+                by_log_std[axis] = 0.0
+    row[0], row[2], row[3], row[4] = loss / count, entropy, clipped / count, kl / count
+
+
+@_compiled
+def _value_loss(values, target, huber, weight, by_values):  # type: ignore[no-untyped-def]
+    """Differentiate the loss of the values by them, and return it."""
+    count, total = len(target), 0.0
+    for step in range(count):
+        error = values[step, 0] - target[step]
+        if huber and abs(error) >= 1.0:
+            total += abs(error) - 0.5
+            slope = 1.0 if error > 0 else -1.0
+        else:
+            total += (0.5 if huber else 1.0) * error * error
+            slope = error * (1.0 if huber else 2.0)
+        by_values[step, 0] = slope * weight / count
+    return total / count * weight
+
+
+@_compiled
+def _adam(moments, share, lr, step, epsilon):  # type: ignore[no-untyped-def]
+    """Scale the gradients and step along them. Source: Kingma and Ba 2015, arXiv 1412.6980, algorithm 1."""
+    length = np.float32(lr / (1.0 - _BETA1**step))
+    unbias = np.float32(1.0 / math.sqrt(1.0 - _BETA2**step))
+    kept, kept_square = np.float32(_BETA1), np.float32(_BETA2)
+    new, new_square, least = np.float32(1.0 - _BETA1), np.float32(1.0 - _BETA2), np.float32(epsilon)
+    all_parameters, all_gradients, all_first, all_second = moments
+    for number in range(len(all_parameters)):
+        parameters, gradients = all_parameters[number], all_gradients[number]
+        first, second = all_first[number], all_second[number]
+        for index in range(len(parameters)):
+            gradient = gradients[index] * share
+            gradients[index] = gradient
+            first[index] = kept * first[index] + new * gradient
+            second[index] = kept_square * second[index] + new_square * gradient * gradient
+            parameters[index] -= length * first[index] / (np.sqrt(second[index]) * unbias + least)
